@@ -1,4 +1,4 @@
-"""The daemon: what a process is while it serves."""
+"""The daemon: runs the service in this process until it is asked to stop."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ __all__ = ["EXIT_THREAD_DIED", "run"]
 _log = logging.getLogger(__name__)
 
 SWITCH_INTERVAL_S = 0.0005
-"""How long a thread may keep the interpreter while a query waits for it; Python's own 5 ms would be half the budget."""
+"""How long a thread may keep the interpreter while a query waits. Python's default of 5 ms would be half of the time
+that a query may take."""
 
 
 def run(config: Config, reread: Callable[[], Config] | None = None) -> int:

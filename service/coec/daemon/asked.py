@@ -1,4 +1,4 @@
-"""What the process is asked from outside: to stop, to read its configuration again."""
+"""The signals by which the process is asked to stop, or to read its configuration again."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from types import FrameType
 
 
 class Signals:
-    """What the process was asked from outside."""
+    """Which signals have come: SIGHUP sets `reread`, every other one `stop`."""
 
     def __init__(self) -> None:
         self.stop = threading.Event()
         self.reread = threading.Event()
 
     def receive(self, number: int, _frame: FrameType | None) -> None:
-        """A signal handler."""
+        """The signal handler."""
         (self.reread if number == signal.SIGHUP else self.stop).set()
 
 
 @contextmanager
 def received() -> Iterator[Signals]:
-    """Signals of the process while the daemon serves."""
+    """Handles the signals of the process within the block, and restores the earlier handlers after it."""
     signals = Signals()
     numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     before = {number: signal.signal(number, signals.receive) for number in numbers}

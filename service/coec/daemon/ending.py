@@ -1,4 +1,4 @@
-"""Steps of an orderly end: each is tried, and none waits for longer than it may."""
+"""Steps of an orderly end: each one is tried, and none waits longer than its time limit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ _log = logging.getLogger(__name__)
 
 
 def attempt(name: str, step: Callable[[], object]) -> object:
-    """A step of the end. What it raises is logged; None then."""
+    """Runs one step of the end and returns its result. If it raises, the exception is logged, and the result is
+    None."""
     try:
         return step()
     except Exception:
@@ -27,7 +28,7 @@ def stopped(threads: Sequence[ServiceThread], timeout_s: float) -> bool:
 
 
 def joined(threads: Sequence[ServiceThread], timeout_s: float) -> bool:
-    """Wait for threads that were asked to stop; False, and a line in the log, when one does not within the time."""
+    """Waits for threads that were asked to stop. If one does not stop within the time, logs that and returns False."""
     deadline_s = time.monotonic() + timeout_s
     late = [thread.name for thread in threads if not thread.join(max(deadline_s - time.monotonic(), 0.0))]
     if late:

@@ -1,6 +1,6 @@
-"""The daemon: builds the objects, starts the threads, looks after them, orders the end. Nothing else.
+"""The daemon: builds the objects, starts the threads, watches them, and ends them in order. Nothing else.
 
-Any thread that dies takes the process down, after `health` has said why: no silent half-life.
+If any thread dies, `health` says why and the process ends, so that the service never goes on with a part missing.
 """
 
 from __future__ import annotations
@@ -81,28 +81,28 @@ TOKENS_HIDDEN = Reason(
 )
 
 CERTIFICATE = "authority.certificate"
-"""Place of what is read from files, which change while the configuration does not."""
+"""Name under which a reload lists the certificate: its files may change while the configuration does not."""
 
 TICK_S = 1.0
 
 GIVE_BACK_S = 5.0
-"""Between two times at which memory that nobody uses goes back: what frames come to use again meanwhile need not be
-cleared by the system first."""
+"""Time between two returns of unused memory to the system, s. Memory that new frames use again within this time need
+not be cleared by the system first."""
 
 STALLED_S = 20.0
-"""A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed, and a start is
-given no more time."""
+"""A thread that gives no beat for so long is stuck, s. The watchdog of the service manager is then no longer fed, and a
+start gets no more time."""
 
-# Together with the worker, which is killed, these bound the end of the service below 15 s.
+# With these time limits, and because the worker is killed, the service ends in less than 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, RIG_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 0.5, 1.5
 QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
 
 
 class Daemon:
-    """The composition of the service."""
+    """Composes the service from its parts."""
 
     def __init__(self, config: Config, notifier: Notifier) -> None:
-        """Build everything; nothing runs yet, but the Zenoh session is open.
+        """Builds everything and opens the Zenoh session. No thread runs yet.
 
         Raises:
             ConfigError: a rig, an endpoint or a certificate cannot be used.
@@ -148,7 +148,7 @@ class Daemon:
         self._lidars = LidarEdges(config.lidar_edges, self._intake, self._worker, self._budget, self._rig)
         self._lidars.grow(config.pairs)
         self._rig.listen(self._rig_answers.hear, self._intake.inbox.wake)
-        while self._rig.work(0.0):  # a reply exists before the first question
+        while self._rig.work(0.0):  # so that a reply exists before the first question
             pass
         awaited = self._room.open(config, self._outside)
         self._commands: dict[str, Commands | AwaitedCommands] = {
@@ -195,7 +195,7 @@ class Daemon:
         finally:
             if not self._stop():
                 logging.shutdown()
-                os._exit(status)  # a thread of Zenoh is stuck, and would keep the process for good
+                os._exit(status)  # a thread of Zenoh is stuck and would keep the process alive for ever
         return status
 
     # --- start, tick, stop ------------------------------------------------------------------------------------------
@@ -232,21 +232,21 @@ class Daemon:
         )
 
     def _run(self, pairs: Iterable[Pair]) -> None:
-        """Start pairs that are built, and listen to what they have that no other has."""
+        """Starts pairs that are built, and subscribes to their streams that no earlier pair has."""
         for pair in pairs:
             for thread in (pair.decider.thread, pair.recorder.thread):
                 thread.start()
         self._intake.listen(lambda stream, take: self._bus.subscribe(self._ros_side.input_of(stream), take))
 
     def _admit(self) -> None:
-        """Build and start the pairs of which everything has been found."""
+        """Builds and starts the awaited pairs whose configuration is complete by now."""
         found = self._room.found()
         if not found:
             return
         whole = completed(self._config, found)
         self._worker.use(whole.model_dump_json())
         fresh = {name: Pair(config, whole, self._outside) for name, config in found.items()}
-        self._pairs = {**self._pairs, **fresh}  # before the configuration that names them
+        self._pairs = {**self._pairs, **fresh}  # first, because the configuration names them
         self._config = whole
         self._lidars.grow(whole.pairs)
         for name, pair in fresh.items():
@@ -259,8 +259,8 @@ class Daemon:
         _log.info("pairs that were awaited are served", extra={"fields": fields})
 
     def _tick(self) -> int:
-        """Once a second: look at every thread, renew what is served, keep no memory that nobody uses. Returns an exit
-        status, 0 to go on."""
+        """Runs once a second: looks at every thread, renews what is served, and returns unused memory to the system.
+        Returns an exit status; 0: go on."""
         if time.monotonic() - self._given_back_s >= GIVE_BACK_S:
             allocator.give_back()
             self._given_back_s = time.monotonic()
@@ -297,7 +297,8 @@ class Daemon:
         return 0
 
     def _stop(self) -> bool:
-        """The orderly end; False when the session did not close in time. A step that raises does not skip the next."""
+        """Ends everything in order; False if the session did not close in time. If a step raises, the next ones still
+        run."""
         _log.info("stopping")
         if self._state != "failing":
             self._state = "stopping"
@@ -347,14 +348,14 @@ class Daemon:
         joined([self._scribe.thread], SCRIBE_STOP_S)
 
     def _finish_windows(self) -> None:
-        """Once the intake has ended: nobody else may touch them."""
+        """Finishes the open windows if the intake has ended. While it runs, only its thread may touch them."""
         if self._intake.thread.join(0.0):
             for pair in self._pairs.values():
                 attempt("finish a window", pair.finish_window)
 
     def _reload(self, reread: Callable[[], Config] | None) -> None:
-        """SIGHUP: read the configuration again and take what can be taken without a restart; a file that could not be
-        started with changes nothing."""
+        """On SIGHUP: reads the configuration again and takes over what can change without a restart. A file with which
+        the service could not start changes nothing."""
         if reread is None:
             _log.warning("no configuration file to read again")
             return
@@ -363,7 +364,7 @@ class Daemon:
         try:
             fresh = reload_of(self._config, self._room.complete(reread()))
             rules = self._rules_of(fresh.config.authority, self._rules.listener)
-        except Exception as error:  # whatever is wrong with a file, what runs goes on
+        except Exception as error:  # whatever is wrong with the file, the running service goes on
             self._configuration = told.model_copy(update={"read_ns": time.time_ns(), "refused": str(error)})
             expected = isinstance(error, CoecError)
             _log.error(f"the configuration on the disk is refused, the old one stays: {error}", exc_info=not expected)
@@ -385,7 +386,7 @@ class Daemon:
             self._notifier.ready()
 
     def _rules_of(self, config: AuthorityConfig, before: Listener | None) -> Rules:
-        """Who may give commands, by the files as they are now; conversations begun `before` go on.
+        """Who may give commands, according to the files as they are now. Conversations of the listener `before` go on.
 
         Raises:
             ConfigError: a file cannot be used.
@@ -396,11 +397,11 @@ class Daemon:
         return Rules(authority, Listener(credentials) if before is None else before.renewed(credentials))
 
     def _take(self, config: Config, rules: Rules) -> None:
-        """Go on with another configuration, in which only what can be taken differs, and with these rules of it."""
+        """Goes on with another configuration and its rules. It differs only in what can change without a restart."""
         before, self._config = self._config, config
         self._rules = rules
-        self._reception.use(rules)  # also where nothing differs: certificates are renewed in place
-        self._door.use(config.metrics)  # also where nothing differs: its port may be free by now
+        self._reception.use(rules)  # even if nothing differs, because certificates are renewed in place
+        self._door.use(config.metrics)  # even if nothing differs, because its port may be free by now
         if config == before:
             return
         logs.configure(config.log.level, config.log.format)
@@ -423,7 +424,7 @@ class Daemon:
         self._ros_outputs.wake()
 
     def _troubles(self) -> tuple[Reason, ...]:
-        """What ails every pair alike."""
+        """Troubles that concern every pair alike."""
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
         hidden = TOKENS_HIDDEN if self._presence.hidden else None
@@ -440,8 +441,8 @@ class Daemon:
         return [*self._prompt_threads(), self._scribe.thread, *waiting, *door, *recorders]
 
     def _prompt_threads(self) -> list[ServiceThread]:
-        """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
-        restart would make it quicker, and none is asked for."""
+        """The threads that never wait for a disk. Only these must beat: a thread that waits for a slow disk may stand
+        still as long as the disk takes. `health` reports that, and a restart would not make the disk quicker."""
         own = [self._intake.thread, self._rig.thread, *(pair.decider.thread for pair in self._pairs.values())]
         of_ros = (*self._room.threads, *self._ros_outputs.threads)
         return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *of_ros, *own]
@@ -487,7 +488,7 @@ class Daemon:
         )
 
     def _told(self) -> ros.View:
-        """What ROS is told of."""
+        """The present state, from which the messages to ROS are made."""
         serials = {pair.name: pair.camera.hardware_id for pair in self._config.every_pair}
         return ros.View(
             self._state,
@@ -504,7 +505,7 @@ class Daemon:
         return {answers.name: answers.health_reply for answers in self._answering()}
 
     def _answering(self) -> list[PairAnswers | AwaitedAnswers]:
-        """Those who answer for a pair, the ones that are awaited last."""
+        """The answers of every pair: running pairs first, then the awaited ones."""
         return [*(pair.answers for pair in self._pairs.values()), *self._room.answers.values()]
 
     def _metrics(self) -> bytes:
@@ -523,14 +524,14 @@ class Daemon:
 
 
 def _snippets_of(config: Config) -> SnippetStore | None:
-    """Where the seconds around events are kept; None where none are asked for."""
+    """The store for the seconds around events; None if the configuration asks for none."""
     if config.snippets.memory_bytes == 0:
         return None
     return SnippetStore(config.state.directory / "snippets", config.snippets.max_bytes, config.state.min_free_bytes)
 
 
 def _insecure(doors: Sequence[str]) -> Reason | None:
-    """What there is to say of endpoints that let in whoever comes."""
+    """The trouble to report if endpoints accept anybody (`doors`); None if there is no such endpoint."""
     if not doors:
         return None
     text = (

@@ -1,4 +1,4 @@
-"""The state directory is one daemon's."""
+"""Locks the state directory, so that only one daemon uses it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from coec.errors import UnavailableError
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """The state directory, made if need be, and nobody else's while the daemon serves.
+    """Makes the state directory if it does not exist, and locks it against other daemons within the block.
 
     Raises:
-        UnavailableError: it cannot be made or written, or another daemon uses it.
+        UnavailableError: the directory cannot be made or written, or another daemon uses it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

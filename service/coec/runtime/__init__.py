@@ -1,1 +1,1 @@
-"""The running service, in the order of a frame's way: ingest, recording, worker, decisions, api."""
+"""The running service. A frame passes its packages in this order: ingest, recording, worker, decisions, api."""

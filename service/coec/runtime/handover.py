@@ -1,4 +1,4 @@
-"""Work that one thread wants done on another: begun in time, or not at all."""
+"""Hands work from one thread to another, which begins it in time or not at all."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ T = TypeVar("T")
 
 
 class BusyError(CoecError):
-    """The other thread did not get to it in time; nothing was done."""
+    """The other thread did not begin the work in time, so nothing was done; or the work has begun and not ended."""
 
     reply_code = "busy"
 
 
 class Handover(Generic[T]):
-    """One piece of work. Whoever owns the state calls `run`, whoever wants it done waits for `result`."""
+    """One piece of work. The thread that owns the state calls `run`; the thread that wants the work waits in
+    `result`."""
 
     def __init__(self, work: Callable[[], T]) -> None:
         self._work = work
         self._future: Future[T] = Future()
 
     def run(self) -> None:
-        """Do it, unless nobody waits for it any more. What it raises is raised in `result`."""
+        """Does the work, unless nobody waits for it any more. An exception of the work is raised in `result`."""
         if not self._future.set_running_or_notify_cancel():
             return
         try:
@@ -36,10 +37,10 @@ class Handover(Generic[T]):
                 raise
 
     def result(self, timeout_s: float) -> T:
-        """What the work returned. Work that has begun is waited for once more.
+        """Waits up to `timeout_s` for what the work returns. If it has begun by then, waits once more as long.
 
         Raises:
-            BusyError: it was not begun within `timeout_s`, and will not be; or it was begun and has not ended.
+            BusyError: the work was not begun within `timeout_s` and will not be; or it was begun and has not ended.
         """
         try:
             return self._future.result(timeout_s)

@@ -1,4 +1,4 @@
-"""What the pairs of a vehicle have in common."""
+"""What all pairs of a vehicle share."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from coec.schemas.keys import Keys
 
 
 def given(pair: str) -> Nominal:
-    """Of a pair whose configuration gives its nominal calibration."""
+    """Default of `Outside.nominal`: the pair's configuration gives its nominal calibration."""
     del pair
     return Nominal()
 
 
 def fits(pair: str) -> tuple[Reason, ...]:
-    """Of a pair that has nothing against any other."""
+    """Default of `Outside.rig_troubles`: the pair contradicts no other."""
     del pair
     return ()
 
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """Everything that a pair shares. All that can be called may be called from any thread.
+    """Everything that a pair shares with the others. The callables may be called from any thread.
 
     Attributes:
         intake: takes the samples of all pairs.
-        show: `show(pair, drawn, pose)` tells of a pair of the stream that is being checked at an extrinsic (4, 4).
-        topics: those that the vehicle's ROS publishes now.
-        nominal: where a pair's nominal calibration comes from.
-        rig_troubles: what does not fit between a pair and the others of the vehicle, by its name.
-        snippets: where the seconds around an event are kept; None: they are not.
+        show: `show(pair, drawn, pose)` reports a pair of frames that is being checked at an extrinsic (4, 4).
+        topics: the topics that the vehicle's ROS publishes now.
+        nominal: where the nominal calibration of a pair, given by name, comes from.
+        rig_troubles: in what a pair, given by name, contradicts the vehicle's other pairs.
+        snippets: store for the seconds around an event; None: they are not kept.
     """
 
     keys: Keys

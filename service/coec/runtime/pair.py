@@ -1,9 +1,13 @@
-"""One camera-LiDAR pair: what it is made of, and how it starts and ends. No logic.
+"""One camera-LiDAR pair: its parts, and how it starts and ends. No logic.
 
-Three threads, each the only writer of its part: the intake's, which all pairs of a vehicle share (samples, pairs, what
-becomes of each), the recorder's (files) and the one that decides (answers, commands, ages). What crosses from one to
-another goes through the inbox, the recorder's queue and the mailbox; what is asked of the worker comes back through the
-mailbox, too.
+Three threads work for a pair, and each is the only writer of its part:
+
+- the intake's thread, which all pairs of a vehicle share, owns samples, pairs of frames, and what each is used for,
+- the recorder's thread owns files,
+- the decider's thread owns answers, commands and ages.
+
+The threads reach each other through the inbox (intake), the recorder's queue and the mailbox (decider). The worker's
+results come back through the mailbox, too.
 """
 
 from __future__ import annotations
@@ -34,11 +38,11 @@ _log = logging.getLogger(__name__)
 
 
 class Pair:
-    """One pair. `stream` is on the thread of the intake, `recorder` and `decider` have one each; `answers` and
-    `commands` are for any thread."""
+    """One pair. `stream` runs on the intake's thread, `recorder` and `decider` each on their own. Any thread may use
+    `answers` and `commands`."""
 
     def __init__(self, pair: PairConfig, config: Config, outside: Outside) -> None:
-        """Build the pair and recall its state.
+        """Builds the pair and recalls its state from the disk.
 
         Raises:
             ConfigError: the rig cannot be built.
@@ -97,8 +101,8 @@ class Pair:
         self.decider.tell_now()
 
     def use(self, pair: PairConfig, stale_after_s: float, told: str) -> None:
-        """Go on with other settings, of which only what `reload.RELOADED` names differs; `told` goes into the history.
-        For the main thread. Each part takes its own where it owns it."""
+        """Goes on with other settings, which differ only in what `reload.RELOADED` names. `told` is the entry for the
+        history. Called on the main thread; each part takes over its settings on the thread that owns them."""
         self._questions.use(pair)
         self.answers.use(pair)
         self.commands.use(pair)
@@ -117,12 +121,13 @@ class Pair:
         return SnippetRecorder(plan.rig, plan.metadata, outside.snippets, losses, packed=plan.packed)
 
     def finish_window(self) -> None:
-        """End the open window; for the end of the service, after the intake's thread has ended."""
+        """Ends the open window when the service ends; called after the intake's thread has ended."""
         self.stream.finish_snippet()
         self.stream.finish_pairs()
         self._chooser.finish()
 
 
 def _ring_bytes(config: Config) -> int:
-    """Of one pair's ring: as much again is in memory while a snippet is written."""
+    """Size of one pair's ring: half of the pair's share, because as much again is in memory while a snippet is
+    written."""
     return config.snippets.memory_bytes // (2 * max(len(config.every_pair), 1))

@@ -1,7 +1,7 @@
-"""What of a changed configuration a running service takes, and what waits for its next start.
+"""Which changes of its configuration a running service takes over, and which wait for its next start.
 
-A value is taken only where everything that depends on it can go on without a break: limits, rules, the length of
-windows. What streams, files, networks or sessions were opened with stays until they are opened anew.
+A changed value is taken over only if everything that depends on it can go on without a break: limits, rules, the length
+of windows. Values with which streams, files, networks or sessions were opened stay until those are opened anew.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ RELOADED: Mapping[str, str] = {
     "pairs.*.policy.*": "with the next answer that is judged",
     "pairs.*.tracker.*": "with the next answer that is judged",
 }
-"""Values that are taken, as patterns of their places, and when. All others wait for a restart."""
+"""Patterns of the places whose values are taken over, and when. All others wait for a restart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reload:
-    """What a configuration that was read again comes to.
+    """The outcome of reading the configuration again.
 
     Attributes:
-        config: what holds from now on.
-        taken, waiting: places of values that differ from before, as `pairs.front.policy.apply`: those that hold now,
-            and those that wait for a restart.
+        config: the configuration that holds from now on.
+        taken, waiting: places of the changed values, such as `pairs.front.policy.apply`: those that hold now, and those
+            that wait for a restart.
     """
 
     config: Config
@@ -57,10 +57,10 @@ class Reload:
 
 
 def reload_of(running: Config, read: Config) -> Reload:
-    """What of `read` a service with `running` takes.
+    """What a service with the configuration `running` takes over from `read`.
 
     Raises:
-        ConfigError: `read` could not be started with: nothing of it is to be taken.
+        ConfigError: a service could not start with `read`, so nothing of it may be taken over.
     """
     settings_of(read.zenoh, read.limits)
     for pair in read.pairs:
@@ -83,30 +83,31 @@ def reload_of(running: Config, read: Config) -> Reload:
 
 
 def _network_of(pair: OpenPairConfig) -> None:
-    """A file is at least there; what it holds is for the worker to open, which this process does without."""
+    """Checks only that the file exists: the worker opens networks, this process never does."""
     model = pair.calibration.depth.model
     if model.endswith(".onnx") and not Path(model).is_file():
         raise ConfigError(f"pair {pair.name}, calibration.depth.model: there is no file {model}")
 
 
 def settings_hash(pair: PairConfig) -> str:
-    """Of everything that decides about a pair: stands in its windows, and in its history where it changed."""
+    """Hash of all settings that decide about a pair. It stands in the pair's windows, and in its history when it
+    changes."""
     return config_hash(pair.window, pair.calibration, pair.monitor, pair.policy, pair.tracker)
 
 
 def differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
-    """Places at which two configurations differ, both in JSON-like values."""
+    """Places at which two configurations differ; both are given as JSON-like values."""
     return tuple(".".join(names) for names in _differences(_by_name(old), _by_name(new)))
 
 
 def _by_name(document: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration with its pairs by their names."""
+    """A configuration with its lists of pairs as dictionaries by name."""
     lists = {name: {pair["name"]: pair for pair in document[name]} for name in ("pairs", "awaited")}
     return {**document, **lists}
 
 
 def _differences(old: Any, new: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Places at which two documents differ; what only one of them has is one place."""
+    """Places at which two documents differ. A part that only one of them has is a single place."""
     if isinstance(old, dict) and isinstance(new, dict):
         for name in dict.fromkeys((*old, *new)):
             yield from _differences(old.get(name), new.get(name), (*names, name))
@@ -115,7 +116,7 @@ def _differences(old: Any, new: Any, names: tuple[str, ...] = ()) -> Iterator[tu
 
 
 def _is_reloaded(names: tuple[str, ...]) -> bool:
-    """Chunk by chunk: the name of a pair may hold dots."""
+    """Whether a pattern of `RELOADED` matches, name by name, because the name of a pair may hold dots."""
     for pattern in RELOADED:
         chunks = pattern.split(".")
         if len(chunks) == len(names) and all(map(fnmatch.fnmatchcase, names, chunks)):
@@ -124,7 +125,7 @@ def _is_reloaded(names: tuple[str, ...]) -> bool:
 
 
 def _put(old: dict[str, Any], new: dict[str, Any], names: tuple[str, ...]) -> None:
-    """Take one value over."""
+    """Copies one value from `new` to `old`."""
     for name in names[:-1]:
         old, new = old[name], new[name]
     old[names[-1]] = new[names[-1]]

@@ -1,6 +1,7 @@
-"""The pairs whose configuration leaves out what the bus tells: listened for, answered for, and handed over when found.
+"""Awaited pairs, whose configuration leaves out what the bus will tell. The service listens for the missing parts,
+answers for these pairs meanwhile, and hands each over when everything is found.
 
-For the daemon's main thread; what is heard is looked at by the thread of `NominalWatch`.
+Used on the daemon's main thread; the thread of `NominalWatch` looks at what is heard.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 
 class _Shared:
-    """What is heard on one topic or key, for all pairs that wait for it: it is listened to once."""
+    """One subscription to a topic or key, shared by all pairs that wait for it."""
 
     def __init__(self) -> None:
         self._takers: dict[str, Callable[[Sample], None]] = {}
@@ -45,7 +46,7 @@ class _Shared:
         self._takers = {**self._takers, name: take}
 
     def leave(self, name: str) -> bool:
-        """A pair waits no more; whether none does, and nobody listens now."""
+        """A pair waits no longer. If it was the last, ends the subscription and returns True."""
         waited = name in self._takers
         self._takers = {other: take for other, take in self._takers.items() if other != name}
         if not waited or self._takers:
@@ -54,23 +55,24 @@ class _Shared:
         return True
 
     def take(self, sample: Sample) -> None:
-        """Something came. On the network's thread."""
+        """Hands a sample to every pair that waits; called on the network's thread."""
         for taker in self._takers.values():
             taker(sample)
 
 
 class WaitingRoom:
-    """Of a vehicle.
+    """The awaited pairs of a vehicle.
 
     Attributes:
-        answers: of each pair that is awaited still; replaced as a whole, for threads that go through them.
+        answers: answers of each pair that is still awaited. The dictionary is replaced as a whole, so that other
+            threads may iterate over it.
     """
 
     def __init__(self, config: Config, folder: Path) -> None:
-        """`config` is as it was read, `folder` the state directory, in which earlier findings lie.
+        """`config` is the configuration as it was read, `folder` the state directory, which holds earlier findings.
 
         Raises:
-            ConfigError: what an awaited pair is given cannot be used.
+            ConfigError: what the configuration gives for an awaited pair cannot be used.
         """
         for pair in config.awaited:
             check_given(pair)
@@ -85,11 +87,11 @@ class WaitingRoom:
 
     @property
     def threads(self) -> tuple[ServiceThread, ...]:
-        """Those that run: none where nobody is awaited."""
+        """The running threads; none if no pair is awaited."""
         return (self._watch.thread,) if self._asked else ()
 
     def complete(self, config: Config) -> Config:
-        """A configuration as it was read, with what was found so far of the pairs that ask for the same as before."""
+        """The configuration as it was read, completed by what has been found for pairs that still ask for the same."""
         return completed(config, {name: found.pair for name, found in self._kept.found(config).items()})
 
     def nominal(self, pair: str) -> Nominal:
@@ -97,19 +99,19 @@ class WaitingRoom:
         return self._watch.nominal(pair)
 
     def origins(self) -> dict[str, dict[str, str]]:
-        """By pair and place, where what was found comes from."""
+        """Where each found value comes from, by pair and place in the configuration."""
         told = {name: dict(self.nominal(name).origins) for name in self._asked}
         return {name: origins for name, origins in told.items() if origins}
 
     def open(self, config: Config, outside: Outside) -> Mapping[str, AwaitedAnswers]:
-        """Answer for those that are awaited still in this configuration."""
+        """Makes answers for the pairs that are still awaited in this configuration."""
         self._outside = outside
         self.answers = {pair.name: AwaitedAnswers(pair, config.vehicle, outside) for pair in config.awaited}
         return self.answers
 
     def listen(self, bus: Bus, side: RosSide) -> None:
-        """Listen for what is left out; to `/tf_static` and `CameraInfo` for as long as the service runs. `side` tells
-        how."""
+        """Subscribes to what the configuration leaves out; `side` knows the keys. `/tf_static` and `CameraInfo` stay
+        subscribed for as long as the service runs."""
         for thread in self.threads:
             thread.start()
         if any(needs_transforms(pair) for pair in self._asked.values()):
@@ -129,7 +131,7 @@ class WaitingRoom:
                     shared.end = bus.subscribe(side.input_of(stream), shared.take)
 
     def found(self) -> dict[str, PairConfig]:
-        """Pairs of which everything is known by now, and that can be built; each once."""
+        """Pairs of which everything is known by now and that can be built. Each is returned once."""
         good: dict[str, PairConfig] = {}
         for name, found in self._watch.ready().items():
             if name not in self.answers:
@@ -153,12 +155,12 @@ class WaitingRoom:
         self._watch.end(name, found)
 
     def refuse(self, name: str, why: str) -> None:
-        """What was found of a pair cannot be used; it is awaited again, until something else is heard."""
+        """What was found for a pair cannot be used. The pair is awaited again until something else is heard."""
         _log.error(f"what was found of a pair cannot be used: {why}", extra={"fields": {"pair": name}})
         self._watch.end(name, Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {why}."))
 
     def renew(self) -> None:
-        """Renew what is answered; once a second."""
+        """Renews the answers; called once a second."""
         for answers in self.answers.values():
             answers.renew()
 

@@ -1,1 +1,1 @@
-"""From a sample to a pair: inbox, sensors, intake, pairs, the clock of the sensors, statistics."""
+"""From a sample to a pair of frames: inbox, sensors, intake, pairs, the clock of the sensors, statistics."""

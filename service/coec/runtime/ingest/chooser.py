@@ -1,7 +1,7 @@
-"""What becomes of each pair, one after the other: part of a window, part of a check, or nothing.
+"""Decides what each pair of frames is used for, one after the other: a window, a check, or nothing.
 
-Sensor time alone decides, and what was asked earlier: before a pair is looked at, every answer that is due by its stamp
-has taken effect. So a drive that is replayed, at any rate, on any machine, cuts the same windows and checks.
+The decision depends only on sensor time and on earlier questions: before a pair is looked at, every answer that is due
+by its stamp has taken effect. So a replay of a drive gives the same windows and checks, at any rate and on any machine.
 """
 
 from __future__ import annotations
@@ -25,58 +25,60 @@ from coec.runtime.ingest.sensor_clock import SensorClock
 _log = logging.getLogger(__name__)
 
 CHECKS_WAITING = 4
-"""Checks that may wait for the answer to a window, 15 MB each: of the period in which it is awaited there is one, and
-one more for each further window that ends meanwhile."""
+"""How many checks may wait for the answer to a window, 15 MB each: one for the period in which that answer is awaited,
+and one more for each further window that ends meanwhile."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Served:
-    """An extrinsic (4, 4) that is or was served; `epoch` counts them."""
+    """An extrinsic (4, 4) that is or was served; `epoch` counts the extrinsics that were served."""
 
     epoch: int
     T_camera_lidar: Matrix4
 
 
 class Asks(Protocol):
-    """What the chooser wants to know of others; see `runtime.decisions.questions`."""
+    """What the chooser asks of the rest of the service; see `runtime.decisions.questions`."""
 
     @property
     def stretch(self) -> float:
-        """By how much slices are to be longer than configured, at least 1."""
+        """Factor by which slices are to be longer than configured, at least 1."""
 
     def affords(self, stamp_ns: int, *, suspected: bool) -> bool:
-        """Whether a check may be asked for at a sensor time; it has to be asked for then. What is `suspected` comes
-        before what is not."""
+        """Whether the budget allows a check at a sensor time. If it does, the caller must ask for that check. Checks of
+        `suspected` pairs come first."""
 
     def window_wanted(self, stamp_ns: int) -> int | None:
-        """Since which sensor time the rig wants pairs for a window, before a pair of this stamp; told once. None: it
-        wants none."""
+        """Sensor time since which the rig wants pairs for a window, asked before a pair of this stamp; returned once.
+        None: it wants no window."""
 
     def window_turn_s(self, stamp_ns: int) -> float:
-        """How much later than at once a window that the rig wants may end, s, so that the budget pays for those before
-        it. It is then taken to be on its way."""
+        """By how much the end of a window that the rig wants may be delayed, s, so that the budget can pay for the
+        windows before it. The window then counts as being on its way."""
 
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
-        """Is `served` right, by these pairs? Asked at a sensor time, once it is known to be afforded."""
+        """Asks at a sensor time whether `served` is right according to these pairs. Only after `affords`."""
 
     def window(self, window_id: str, stamp_ns: int) -> int:
-        """What does a window say that ends at a sensor time? From when on its answer counts, sensor time."""
+        """Asks for the result of a window that ends at a sensor time. Returns from which sensor time the answer
+        counts."""
 
     def prefetch(self, frame: bytes) -> None:
-        """The depth of a camera frame (native msgpack) will be needed."""
+        """Announces that the depth of a camera frame (native msgpack) will be needed."""
 
     @property
     def unanswered(self) -> int:
-        """Checks and windows whose answer has not come."""
+        """Number of checks and windows whose answer has not come."""
 
     def waits(self, stamp_ns: int) -> bool:
-        """Whether an answer is due before a pair of this stamp, and has not come."""
+        """Whether an answer is due before a pair of this stamp and has not come."""
 
     def settle(self, stamp_ns: int) -> None:
-        """Let the answers take effect that are due before a pair of this stamp."""
+        """Lets the answers take effect that are due before a pair of this stamp."""
 
     def bring_forward(self, stamp_ns: int) -> None:
-        """Whatever waits is due before a pair of this stamp: the first of a new time."""
+        """Makes all outstanding answers due before a pair of this stamp, which is the first after a step back of sensor
+        time."""
 
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
@@ -86,10 +88,10 @@ class Writes(Protocol):
     """What the chooser hands to the recorder."""
 
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
-        """A pair was chosen."""
+        """A pair was chosen for a window."""
 
     def add_between(self, window_id: str, pair: FramePair) -> None:
-        """A pair, thinned, is to be recorded beside those."""
+        """A thinned pair is to be recorded beside the chosen ones."""
 
     def end(self, ended: SliceEnded) -> None:
         """A slice ended."""
@@ -100,15 +102,15 @@ class Chosen:
     """What was chosen so far.
 
     Attributes:
-        selected: pairs in the open slice.
-        rejections: pairs that were looked at for a window and refused, by reason.
-        quality: of the image looked at last; None before the first.
-        frozen: whether images have repeated since the last that was chosen.
-        checks: checks that were asked for.
-        not_afforded: checks that never got their turn.
-        last_ns: stamp of the pair looked at last; None before the first.
+        selected: number of pairs in the open slice.
+        rejections: number of pairs that were looked at for a window and refused, by reason.
+        quality: quality of the latest image that was looked at; None before the first.
+        frozen: whether images have repeated since the last chosen one.
+        checks: number of checks that were asked for.
+        not_afforded: number of checks that never got their turn.
+        last_ns: stamp of the latest pair that was looked at; None before the first.
         steps_back: how often sensor time has stepped back.
-        unanswered: checks and windows whose answer has not come.
+        unanswered: number of checks and windows whose answer has not come.
     """
 
     selected: int = 0
@@ -137,7 +139,7 @@ class Chooser:
         first_slice_s: float,
         kept: KeptPairs | None = None,
     ) -> None:
-        """`served` is the extrinsic at which pairs are looked at until another is adopted; `kept` are pairs of an
+        """`served` is the extrinsic at which pairs are looked at until another is adopted. `kept` are pairs of an
         earlier run that belong to the first window."""
         self._asks = asks
         self._recorder = recorder
@@ -184,8 +186,9 @@ class Chooser:
         return self._cutter.slice_end_ns
 
     def must_wait(self, stamp_ns: int) -> bool:
-        """Whether a pair of this stamp may not be looked at yet. With the first pair of a new time whatever waits in
-        the old one is due; a slice that is over by then has ended before it is looked at."""
+        """Whether a pair of this stamp may not be looked at yet, because an answer is missing. The first pair after a
+        step back of sensor time makes all outstanding answers due. A slice that is over by this stamp is ended
+        first."""
         if self._has_stepped_back(stamp_ns):
             self._asks.bring_forward(stamp_ns)
         elif not self.end_slice_by(stamp_ns):
@@ -193,7 +196,7 @@ class Chooser:
         return self._asks.waits(stamp_ns)
 
     def choose(self, pair: FramePair) -> None:
-        """Look at the next pair: is it one for the window, one for a check?"""
+        """Looks at the next pair and uses it for the window, for a check, or not at all."""
         stepped_back = self._has_stepped_back(pair.stamp_ns)
         if stepped_back:
             self._asks.bring_forward(pair.stamp_ns)
@@ -205,7 +208,7 @@ class Chooser:
         if stepped_back:
             self._begin_new_time(pair.stamp_ns)
         self._last_ns = pair.stamp_ns
-        # The steady clock plays no part: this one only tells at which rate pairs come.
+        # No steady clock is given, because this `SensorClock` only measures the rate at which pairs come.
         self._pace.observe(pair.stamp_ns, 0.0)
         self._follow_stretch()
         self._follow_rig(pair.stamp_ns)
@@ -233,11 +236,11 @@ class Chooser:
             self._ask_checks(pair.stamp_ns)
 
     def end_slice_by(self, now_ns: int) -> bool:
-        """It is so late, sensor time: the open slice ends if it is over. False while an answer that counts by its end
-        has not come.
+        """Ends the open slice if it is over at this sensor time. Returns False while an answer that counts by the end
+        of the slice has not come.
 
-        Whether a pair tells the time or silence, the slice ends at its own end, and what its window says counts from
-        the same time on."""
+        The slice ends at its own end, whether a pair or silence tells the time; so the answer to its window counts from
+        the same time on in both cases."""
         if not self._slice_is_over(now_ns):
             return True
         end_ns = self._cutter.slice_end_ns
@@ -247,31 +250,31 @@ class Chooser:
         return True
 
     def finish(self) -> SliceEnded | None:
-        """End the open slice here and now."""
+        """Ends the open slice at once."""
         for event in self._cutter.finish():
             self._end(event, self._last_ns or 0)
             return event
         return None
 
     def use(self, window: WindowConfig) -> None:
-        """The next slice is to be cut by this."""
+        """Cuts the next slice by these settings."""
         self._window, self._stretch = window, 1.0
         self._cutter.use(window)
 
     # --- effects of answers -----------------------------------------------------------------------------------------
 
     def adopt(self, served: Served) -> None:
-        """Pairs are looked at with another extrinsic from now on."""
+        """Looks at pairs with another extrinsic from now on."""
         if served.epoch > self._served.epoch:
             self._served = served
 
     def alarm(self, since_ns: int) -> None:
-        """A window is wanted soon, of pairs since this sensor time."""
+        """A suspicion arose: a window of pairs since this sensor time is wanted soon."""
         self._suspected = True
         self._urgency.alarm(since_ns)
 
     def keep(self, kept: KeptPairs) -> None:
-        """The camera moved within a window; its pairs after that belong to the next one."""
+        """The camera moved within a window; the pairs after the move belong to the next window."""
         self._cutter.keep(kept)
 
     def calm(self) -> None:
@@ -297,7 +300,7 @@ class Chooser:
         return end_ns is not None and now_ns >= end_ns
 
     def _end_slice(self) -> None:
-        """End the open slice at its end, with all answers known that count by then."""
+        """Ends the open slice at its end; the answers that count by then take effect first."""
         end_ns = self._cutter.slice_end_ns
         if end_ns is None:
             return
@@ -309,7 +312,7 @@ class Chooser:
             self._urgency.ended(ended, self._cutter, self._pace.rate_hz)
 
     def _follow_stretch(self) -> None:
-        """Slices are longer where the budget does not suffice for all windows, as the periods of checks are."""
+        """Makes slices longer if the budget does not suffice for all windows, just as periods of checks get longer."""
         stretch = self._asks.stretch
         if stretch != self._stretch:
             self._stretch = stretch
@@ -317,13 +320,15 @@ class Chooser:
             self._cutter.use(self._window.model_copy(update={"slice_s": slice_s}))
 
     def _follow_rig(self, stamp_ns: int) -> None:
-        """A sensor of the pair was named: what puts it right waits for a window of each of its pairs."""
+        """If the rig has named a sensor of this pair as moved, hurries a window: the repair waits for a window of each
+        pair of that sensor."""
         since_ns = self._asks.window_wanted(stamp_ns)
         if since_ns is not None and not self._urgency.is_waiting:
             self._urgency.wanted(since_ns, self._asks.window_turn_s(stamp_ns))
 
     def _await_turn(self, check: tuple[FramePair, ...]) -> None:
-        """There are pairs for a check. Those of a period before that still wait for their turn are too old then."""
+        """Queues pairs for a check. Pairs of an earlier period that still wait for their turn are dropped as too
+        old."""
         if self._waits_its_turn:
             self._not_afforded += len(self._unasked)
             self._losses.add("monitor", "check_not_afforded", len(self._unasked))
@@ -333,8 +338,8 @@ class Chooser:
         self._unasked.append(check)
 
     def _ask_checks(self, stamp_ns: int) -> None:
-        """Have the latest pairs checked at what is served, when it is their turn. While a window is about to change
-        that, they wait: they would be judged at what is no longer served."""
+        """Has the latest pairs checked at the served extrinsic when it is their turn. Not called while a window is to
+        change that extrinsic, because the check would judge one that is no longer served."""
         self._waits_its_turn = False
         while self._unasked:
             if not self._asks.affords(stamp_ns, suspected=self._suspected):
@@ -349,7 +354,7 @@ class Chooser:
             self._asks.prefetch(encode_camera(event.pair.camera))
 
     def _end(self, event: SliceEnded, stamp_ns: int) -> None:
-        """A slice ended, at this sensor time: what it holds goes to the disk, and from there to the worker."""
+        """A slice ended at this sensor time: its pairs go to the disk, and from there to the worker."""
         if event.complete:
             self._window_due_ns = self._asks.window(event.window_id, stamp_ns)
         fields = {"window": event.window_id, "pairs": event.pairs, "complete": event.complete}

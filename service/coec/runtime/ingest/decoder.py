@@ -1,4 +1,4 @@
-"""From a sample to a frame: which decoder, whose frame, what size, which number; everything refused is counted."""
+"""From a sample to a frame: chooses the decoder and checks frame id, size and number. Every refusal is counted."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _log = logging.getLogger(__name__)
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 
 WRONG_TYPE = "wrong_type"
-"""Cause of a loss: a message that makes no frame of the stream."""
+"""Cause of a loss: the message is of a type that gives no frame of the stream."""
 
 ORIGIN_PERIOD_NS = 10**9
-"""Of sensor time, between two looks at where points were measured from: 1 ms each."""
+"""Sensor time between two checks of the origin from which points were measured, ns. Each check takes 1 ms."""
 
 EXPLAINED = frozenset(
     {
@@ -54,14 +54,14 @@ EXPLAINED = frozenset(
         Refusal.IMAGE_UNKNOWN_FORMAT,
     }
 )
-"""Causes that the log explains by the sentence of the error, which is ours."""
+"""Causes for which the log shows the sentence of the error. It is safe to show because coec wrote it, not a sender."""
 
 NUMBERED = b"\xa8sequence"
-"""How a native frame that has a number is told from what is no frame without decoding it: the name of the field, found
-in some 10 ms in the largest message. One that is not recognised is counted as lost on its way, too."""
+"""Name of the field by which a native frame with a number is recognised without decoding; the search takes some 10 ms
+in the largest message. A frame that is not recognised is also counted as lost on its way."""
 
 NOBODY = b""
-"""Id of whoever does not say who it is."""
+"""Id of a sender that does not name itself."""
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 
@@ -71,8 +71,9 @@ class StreamCounts:
     """Samples that came, and frames that were made of them.
 
     Attributes:
-        taking_turns: ids of several senders that send at a time; none where it is one, or nobody says who it is.
-        stamped_by_sender: the latest frame had no stamp, and has that of the clock of whoever sent it.
+        taking_turns: ids of the senders if several send at the same time; else empty, also if none names itself.
+        stamped_by_sender: the latest frame came without a stamp and got the time at which it was sent, by the sender's
+            clock.
     """
 
     received: int
@@ -82,7 +83,7 @@ class StreamCounts:
 
 
 class SampleReader:
-    """Frames of the samples of one stream, as they come."""
+    """Decodes the samples of one stream to frames."""
 
     def __init__(self, kind: str, stream: AnyStreamConfig, limits: LimitsConfig) -> None:
         """`kind` is what the stream brings: `CAMERA`, `LIDAR` or `EGO`."""
@@ -92,10 +93,11 @@ class SampleReader:
         self._moving = MovingFrame(stream.parent, stream.child) if isinstance(stream, OpenEgoConfig) else None
 
     def frame(self, sample: Sample) -> Frame | None:
-        """The frame in a sample; None where it holds transforms of other frames than the vehicle's, or the first ones.
+        """The frame in a sample; None if it holds only transforms of other frames than the vehicle's, or the first
+        transforms.
 
         Raises:
-            DecodeError: there is none, or one of another kind.
+            DecodeError: the sample holds no frame, or one of another kind.
         """
         configured = self._stream
         encoding, _, schema = sample.encoding.partition(";")
@@ -124,12 +126,12 @@ class Decoder:
     """Decodes and checks the samples of one stream.
 
     Attributes:
-        timed_by: of the latest sweep, see `LidarFrame`.
+        timed_by: how the point times of the latest sweep were read, see `LidarFrame`.
     """
 
     def __init__(self, kind: str, stream: KnownStreamConfig, limits: LimitsConfig, losses: LossCounter) -> None:
-        """`kind` is what the stream brings, `CAMERA`, `LIDAR` or `EGO`, and the place at which its losses are
-        counted."""
+        """`kind` is what the stream brings, `CAMERA`, `LIDAR` or `EGO`. Its losses are counted at the place of this
+        name."""
         self._kind = kind
         self._stream = stream
         self._samples = SampleReader(kind, stream, limits)
@@ -151,7 +153,7 @@ class Decoder:
         return StreamCounts(self._received, self._accepted, self._senders.taking_turns, self._stamped_by_sender)
 
     def overrun(self, sample: Sample) -> None:
-        """A sample went before it was decoded. Any thread."""
+        """A sample was dropped before it was decoded. For any thread."""
         self._losses.add(self._kind, "overrun")
         told = Attachment.parse(sample.attachment)
         if told is not None:
@@ -160,8 +162,8 @@ class Decoder:
             self._overruns.append(NOBODY)
 
     def frame(self, sample: Sample) -> Frame | None:
-        """The frame in a sample, or None when it was refused (and counted), or holds none: transforms of other frames
-        than the vehicle's. Never raises for what a sender sent."""
+        """The frame in a sample. None if it was refused (and counted), or holds only transforms of other frames than
+        the vehicle's. Never raises, whatever a sender sent."""
         self._received += 1
         while self._overruns:
             self._senders.counted(self._overruns.popleft())
@@ -180,7 +182,7 @@ class Decoder:
             self._losses.add(self._kind, error.reason, detail=str(error) if error.reason in EXPLAINED else "")
             return None
         except Exception:
-            # A fault of a decoder must cost the message, not the service.
+            # A fault of a decoder may cost the message, not the service.
             _log.exception("a decoder failed", extra={"fields": {"sensor": self._stream.sensor, "stream": self._kind}})
             self._losses.add(self._kind, "decoder_fault")
             return None
@@ -190,7 +192,8 @@ class Decoder:
         return frame
 
     def _told(self, sample: Sample) -> Attachment | None:
-        """What the sender tells beside the message; a message beside which something else lies is taken, too."""
+        """The attachment of the sender; its number is counted. A message with an unreadable attachment is still
+        taken."""
         told = Attachment.parse(sample.attachment)
         if told is not None:
             self._number(told.gid, told.sequence)
@@ -204,7 +207,7 @@ class Decoder:
             self._losses.add(self._kind, "sequence_gap", lost)
 
     def _stamped(self, frame: Frame, told: Attachment | None) -> Frame:
-        """A frame without a stamp gets the sender's: when it was sent, not when the sensor saw."""
+        """A frame without a stamp gets the time at which it was sent, instead of that of the measurement."""
         without = frame.stamp_ns == 0 and told is not None and told.source_ns > 0
         self._stamped_by_sender = without
         return replace(frame, stamp_ns=told.source_ns) if told is not None and without else frame
@@ -218,7 +221,8 @@ class Decoder:
         return frame
 
     def _from_origin(self, cloud: LidarFrame, lidar: LidarConfig) -> LidarFrame:
-        """The sweep in the LiDAR's own frame, from which its ranges must have been measured."""
+        """The sweep in the LiDAR's own frame, after checking that its ranges were measured from the origin of that
+        frame."""
         if cloud.frame_id != (lidar.cloud_frame_id or lidar.frame_id):
             raise DecodeError("frame_id", "not the frame id of the configuration")
         sweep = from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
@@ -228,8 +232,9 @@ class Decoder:
         return sweep
 
     def _contradiction(self, sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
-        """Of the first sweep of each period of sensor time, and of all while one was found: frames of drivers change
-        with their configuration, not from sweep to sweep."""
+        """What in a sweep contradicts the configured origin; None: nothing. Looks at the first sweep of each period of
+        sensor time, and at every sweep while there is a contradiction: the frame in which a driver sends changes with
+        its configuration, not from sweep to sweep."""
         period = sweep.stamp_ns // ORIGIN_PERIOD_NS
         if period == self._looked_in and not self._contradicted:
             return None

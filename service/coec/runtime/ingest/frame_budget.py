@@ -1,4 +1,4 @@
-"""How many bytes of frames are in memory, wherever they are held: whoever keeps them, nobody can keep more."""
+"""Limits the bytes of frames in memory, wherever in the process the frames are held."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 
 
 class FrameBudget:
-    """Of the frames of one pair. One thread admits; frames may end on any.
+    """The budget of a vehicle's frames. One thread admits frames; they may be freed on any thread.
 
-    A frame counts from the moment at which it is admitted until nobody holds it any more: not the pairing, not those
-    that wait for a judgement, the disk or the worker.
+    A frame counts from its admission until nothing holds it any more: not the pairing, and no queue for a judgement,
+    the disk or the worker.
     """
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
         self._bytes = 0
-        # A frame may end in the middle of `admit`, when Python looks for garbage: no lock could be taken there.
+        # The garbage collector may free a frame in the middle of `admit`, where no lock could be taken.
         self._ended: deque[int] = deque()
 
     @property
     def bytes(self) -> int:
-        """Of all frames that are held."""
+        """Bytes of all frames that are held."""
         while self._ended:
             self._bytes -= self._ended.popleft()
         return self._bytes
 
     def admit(self, frame: CameraFrame | LidarFrame | EgoMotion) -> bool:
-        """Count a frame; False, and it is not counted, where there is no room for it."""
+        """Counts a frame if there is room for it; else returns False."""
         size = frame_bytes(frame)
         if self.bytes + size > self._max_bytes:
             return False
@@ -39,7 +39,7 @@ class FrameBudget:
 
 
 def frame_bytes(frame: CameraFrame | LidarFrame | EgoMotion) -> int:
-    """Of its images and its points: all that matters."""
+    """Bytes of the images and points of a frame; everything else is negligible."""
     match frame:
         case CameraFrame():
             return sum(len(image.data) for image in (frame.image, frame.depth) if image is not None)

@@ -1,4 +1,4 @@
-"""The last seconds of a pair at full rate, in memory, and what is cut out of them around an event."""
+"""Keeps the last seconds of a pair at full rate in memory, and cuts out a snippet around an event."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coec.runtime.ingest.frame_budget import frame_bytes
 NS_PER_S = 1_000_000_000
 
 SILENT_S = 3.0
-"""Without a frame for so long (steady clock) nothing more is to be waited for."""
+"""After this time without a frame (steady clock, s) no more frames of an event are awaited."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,9 +22,9 @@ class Snippet:
     """Frames around an event, in the order in which they came.
 
     Attributes:
-        event: what happened, as `health` calls it.
-        stamp_ns: sensor time of the frame that came last before it was told.
-        T_camera_lidar: (4, 4), what was served then.
+        event: what happened, by the name that `health` uses.
+        stamp_ns: sensor time of the last frame before the event was reported.
+        T_camera_lidar: (4, 4), the extrinsic that was served then.
     """
 
     event: str
@@ -43,11 +43,11 @@ class _Open:
 
 
 class FrameRing:
-    """Belongs to the thread of the intake. Holds at most `max_bytes` of frames, of which an event leaves room for those
-    to come: half of it is for what was before."""
+    """Belongs to the thread of the intake. Holds at most `max_bytes` of frames: half is for those before an event, so
+    that there is room for those that follow."""
 
     def __init__(self, config: SnippetsConfig, max_bytes: int, deliver: Callable[[Snippet], None]) -> None:
-        """`deliver(snippet)` takes the frames over; it must not wait."""
+        """`deliver(snippet)` takes over the frames; it must not wait."""
         self._before_ns, self._after_ns = round(config.before_s * NS_PER_S), round(config.after_s * NS_PER_S)
         self._max_bytes = max_bytes
         self._deliver = deliver
@@ -58,7 +58,7 @@ class FrameRing:
 
     @property
     def bytes(self) -> int:
-        """Of the frames that are held."""
+        """Bytes of the frames that are held."""
         return self._bytes
 
     def push(self, frame: Frame, monotonic_s: float) -> None:
@@ -66,7 +66,7 @@ class FrameRing:
         size, self._came_s = frame_bytes(frame), monotonic_s
         opened = self._open
         if opened is not None:
-            later_ns = frame.stamp_ns - opened.stamp_ns  # far below zero where the time has stepped back
+            later_ns = frame.stamp_ns - opened.stamp_ns  # far below zero after sensor time has stepped back
             if not -self._before_ns <= later_ns <= self._after_ns or self._bytes + size > self._max_bytes:
                 self.finish()
         self._frames.append((frame, size))
@@ -75,17 +75,18 @@ class FrameRing:
             self._forget(frame.stamp_ns)
 
     def event(self, name: str, T_camera_lidar: Matrix4) -> None:
-        """Something happened, while this (4, 4) is served. Another event before the end of the first belongs to it."""
+        """An event happened while this extrinsic (4, 4) is served. A further event before the end of the first belongs
+        to the same snippet."""
         if self._open is None and self._frames:
             self._open = _Open(name, self._frames[-1][0].stamp_ns, T_camera_lidar)
 
     def look(self, monotonic_s: float) -> None:
-        """Time has passed: an event after which nothing comes is over."""
+        """Time has passed: ends an open snippet if no frame has come for `SILENT_S`."""
         if self._open is not None and monotonic_s - self._came_s > SILENT_S:
             self.finish()
 
     def finish(self) -> None:
-        """Hand over what there is of an event; nothing otherwise."""
+        """Delivers the frames of the open event; does nothing if there is none."""
         opened, self._open = self._open, None
         if opened is None:
             return
@@ -95,7 +96,7 @@ class FrameRing:
         self._deliver(Snippet(opened.event, opened.stamp_ns, opened.T_camera_lidar, frames))
 
     def _forget(self, now_ns: int) -> None:
-        """What is too old, of another time, or too much."""
+        """Drops frames that are too old, from before a step back of sensor time, or too many."""
         while self._frames and (
             2 * self._bytes > self._max_bytes or not 0 <= now_ns - self._frames[0][0].stamp_ns <= self._before_ns
         ):

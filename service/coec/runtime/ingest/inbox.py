@@ -1,5 +1,5 @@
-"""Where samples wait between the network's threads and the ingest thread: bounded in number for each stream, and in
-bytes for all."""
+"""The queue of samples between the network's threads and the ingest thread, bounded in number for each stream and in
+bytes for all streams together."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """What came on a stream: samples that wait, and how long ago the last one came; None before the first."""
+    """What came on a stream: how many samples wait, and how long ago the last one came (None before the first)."""
 
     waiting: int
     age_s: float | None
@@ -59,16 +59,17 @@ class _Waiting:
 class Inbox:
     """The streams of one reader. `put` takes microseconds and never blocks on the reader; one thread takes.
 
-    What is too much goes: of a stream with too many samples its oldest; of too many bytes in all the oldest of the
-    stream that holds most, so that large messages on one stream push nothing out of another.
+    Surplus samples are dropped. A stream with too many samples loses its oldest. If all streams together hold too many
+    bytes, the stream that holds most loses its oldest, so that large messages on one stream push nothing out of
+    another.
     """
 
     def __init__(self, depths: dict[str, int], max_bytes: int, on_overrun: Callable[[Parcel], None]) -> None:
         """
         Args:
             depths: by stream, how many samples may wait.
-            max_bytes: of all samples that wait. The latest sample of all is taken whatever its size.
-            on_overrun: called with each sample that had to go.
+            max_bytes: limit for all waiting samples together. The latest sample is taken whatever its size.
+            on_overrun: called with each sample that is dropped.
         """
         self._waiting = {stream: _Waiting(depth) for stream, depth in depths.items()}
         self._max_bytes = max_bytes
@@ -89,22 +90,22 @@ class Inbox:
             self._on_overrun(overrun)
 
     def receiver(self, stream: str) -> Callable[[Sample], None]:
-        """`put` of one stream."""
+        """`put` for one stream."""
         return partial(self.put, stream)
 
     def open(self, stream: str, depth: int) -> None:
-        """One more stream, of which so many samples may wait."""
+        """Adds a stream, of which `depth` samples may wait."""
         with self._condition:
             self._waiting = {**self._waiting, stream: _Waiting(depth)}
 
     def call(self, run: Callable[[], None]) -> None:
-        """Have `run` called by the reader, before the samples that wait."""
+        """Has the reader call `run`, before it takes the waiting samples."""
         with self._condition:
             self._calls.append(Call(run))
             self._condition.notify()
 
     def arrivals(self, monotonic_s: float) -> dict[str, Arrivals]:
-        """By stream, at this time of the steady clock."""
+        """What came, by stream; ages are counted at this time of the steady clock."""
         with self._condition:
             return {
                 stream: Arrivals(len(waiting.parcels), None if came_s is None else max(monotonic_s - came_s, 0.0))
@@ -113,7 +114,7 @@ class Inbox:
             }
 
     def waiting(self) -> set[str]:
-        """Streams of which samples wait."""
+        """The streams that have waiting samples."""
         with self._condition:
             return {stream for stream, waiting in self._waiting.items() if waiting.parcels}
 
@@ -123,7 +124,7 @@ class Inbox:
             self._condition.notify()
 
     def take(self, timeout_s: float) -> Parcel | Call | None:
-        """The next call, else the sample that came first; None when nothing came within `timeout_s` or on `wake`."""
+        """The next call, else the oldest sample; None if nothing came within `timeout_s`, or after `wake`."""
         with self._condition:
             taken = self._pop()
             if taken is None:
@@ -132,13 +133,13 @@ class Inbox:
             return taken
 
     def _make_room(self, stream: str, size: int) -> list[Parcel]:
-        """Take out what has to go for a sample of `size` bytes."""
+        """Takes out the samples that have to make room for a new one of `size` bytes."""
         gone = []
         own = self._waiting[stream]
         if len(own.parcels) == own.depth:
             gone.append(own.take())
         while sum(waiting.bytes for waiting in self._waiting.values()) + size > self._max_bytes:
-            # The new sample counts as its stream's: who sends the large ones makes room for them.
+            # The new sample counts for its stream, so that a stream with large samples makes room for them itself.
             held = {name: waiting.bytes + size * (name == stream) for name, waiting in self._waiting.items()}
             full = [name for name, waiting in self._waiting.items() if waiting.parcels]
             if not full:

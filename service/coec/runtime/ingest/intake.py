@@ -1,9 +1,9 @@
-"""The thread that takes the samples of a vehicle, on one page: sample -> frame, once -> every pair that it is of, and
-of each the pair whose turn it is to the chooser.
+"""The thread that takes the samples of a vehicle, on one page. It decodes each sample once to a frame and hands the
+frame to every camera-LiDAR pair that uses it. Of each of these it gives the next pair of frames to the chooser.
 
-One thread for all: what it does holds the interpreter nearly all the while, so that more of them would only pass the
-same second around; frames are handed on without a lock; and the order in which samples came is the order for every
-pair. Nothing here waits: not for the disk, not for the worker, not for another pair.
+There is one thread for all, for three reasons. Its work holds the interpreter nearly all the time, so that more threads
+would only share the same second. Frames are handed on without a lock. And every pair sees the samples in the order in
+which they came. Nothing here waits: not for the disk, not for the worker, not for another pair.
 """
 
 from __future__ import annotations
@@ -22,49 +22,50 @@ from coec.runtime.ingest.pair_buffer import WaitingFrames
 from coec.runtime.ingest.sensor import SensorStream, read_alike
 
 ALL_FRAMES = 1.5
-"""Bytes of all frames that a vehicle may have in memory, in those that may be held: the others wait for their partner,
-the disk or the worker, 25 pairs of 2.5 MB."""
+"""How many bytes of frames a vehicle may have in memory, as a multiple of `limits.max_held_bytes`. The additional half
+is for frames that wait for their partner, the disk or the worker: 25 pairs of 2.5 MB."""
 
 TIGHT = 1.3
-"""The same, above which pairs wait for no answer any more: better looked at too early than that no frame is let in.
-What is left is half a second of eight cameras and three LiDARs; below it, 75 MB of one pair's checks are no matter."""
+"""The same ratio, above which pairs no longer wait for an answer: to look at pairs too early is better than to refuse
+new frames. The rest up to `ALL_FRAMES` holds half a second of eight cameras and three LiDARs. Below it, 75 MB for the
+checks of one pair do no harm."""
 
 TICK_S = 0.1
-"""Between two looks at the clocks while samples come; whoever reads the reports looks once a second."""
+"""Time between two looks at the clocks while samples come, s. The reports are read once a second."""
 
 IDLE_S = 0.25
-"""Longest wait for a sample: how soon silence is noticed."""
+"""Longest wait for a sample, s: so soon silence is noticed."""
 
 
 class Takes(Protocol):
-    """A pair, as far as it takes part, see `pair_stream`; or two LiDARs."""
+    """What the intake needs of a camera-LiDAR pair (see `pair_stream`), or of an edge between two LiDARs."""
 
     @property
     def sensors(self) -> Mapping[str, SensorStream]:
-        """Its streams, by the names that they have here."""
+        """The streams of the pair, by the names that the pair gives them."""
 
     def taker(self, name: str) -> Callable[[Frame], None]:
-        """Who takes the frames of one of its streams."""
+        """The function that takes the frames of one of its streams."""
 
     def may_choose(self) -> bool:
-        """Whether a pair has come that may be looked at now."""
+        """Whether a pair of frames has come that may be looked at now."""
 
     def choose_next(self) -> bool:
-        """Look at the pair whose turn it is, if it may be looked at; whether one was."""
+        """Looks at the next pair of frames if that may be looked at; returns whether it did."""
 
     def tick(self, *, waiting: bool) -> None:
-        """Time has passed; samples of its streams are waiting, or none."""
+        """Time has passed; `waiting`: samples of its streams are in the inbox."""
 
 
 class Intake:
-    """Of one vehicle. `join` and `sensors_of` are for the main thread, `inbox` and `arrivals` for any.
+    """The intake of one vehicle. `join` and `sensors_of` are for the main thread, `inbox` and `arrivals` for any.
 
     Attributes:
-        waiting_frames: those of the pairs that have come and wait to be looked at.
+        waiting_frames: frames of the pairs that have come and wait to be looked at.
     """
 
     def __init__(self, limits: LimitsConfig, kept_bytes: int = 0) -> None:
-        """`kept_bytes`: of frames that are kept whatever becomes of them, beyond those of the limits."""
+        """`kept_bytes`: memory for frames that are kept in any case (for snippets), in addition to the limits."""
         self._limits = limits
         self._sensors: dict[tuple[str, str], SensorStream] = {}
         self._by_number: dict[str, SensorStream] = {}
@@ -86,15 +87,15 @@ class Intake:
 
     @property
     def sensors(self) -> tuple[SensorStream, ...]:
-        """All of them."""
+        """All streams."""
         return tuple(self._sensors.values())
 
     def sensors_of(self, pair: PairConfig) -> dict[str, SensorStream]:
-        """The streams of a pair by kind: those that other pairs have, too, and new ones."""
+        """The streams of a pair by kind: shared with other pairs where they read the same, else new."""
         return {kind: self.sensor(kind, stream) for kind, stream in pair.streams.items()}
 
     def sensor(self, kind: str, stream: KnownStreamConfig) -> SensorStream:
-        """A stream of this kind: the one that others have, too, or a new one."""
+        """A stream of this kind: an existing one that reads the same, else a new one."""
         alike = read_alike(kind, stream)
         if alike not in self._sensors:
             sensor = SensorStream(kind, f"{kind}-{len(self._sensors)}", stream, self._limits)
@@ -117,7 +118,7 @@ class Intake:
     # --- on any -----------------------------------------------------------------------------------------------------
 
     def arrivals(self, sensors: Mapping[str, SensorStream]) -> dict[str, Arrivals]:
-        """What came on these streams, by the names that they have here."""
+        """What came on these streams, by the names that the caller gives them."""
         came = self.inbox.arrivals(time.monotonic())
         return {name: came[sensor.number] for name, sensor in sensors.items()}
 
@@ -132,7 +133,8 @@ class Intake:
             sensor.takers = (*sensor.takers, pair.taker(name))
 
     def turn(self, idle_s: float) -> bool:
-        """Take what came first, and look at a pair of each that has one; whether anything came within `idle_s`."""
+        """Takes the oldest sample, then looks at one pair of frames for each camera-LiDAR pair that has one. Returns
+        whether there was any work within `idle_s`."""
         in_turn = any(pair.may_choose() for pair in self._pairs)
         item = self.inbox.take(0.0 if in_turn else idle_s)
         if isinstance(item, Call):

@@ -1,5 +1,5 @@
-"""Pairs that have come and wait until what was seen before them is judged: bounded in bytes, over all pairs of a
-vehicle, and in time."""
+"""The queue of pairs of frames that wait until earlier ones are judged. It is bounded in time, and in bytes over all
+pairs of a vehicle."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from coec.runtime.ingest.frame_budget import frame_bytes
 
 
 class WaitingFrames:
-    """The frames of all buffers of a vehicle, each counted once however many pairs it is of; one thread uses it."""
+    """The frames in all buffers of a vehicle, each counted once however many pairs it belongs to; one thread uses
+    it."""
 
     def __init__(self, max_bytes: int, is_tight: Callable[[], bool]) -> None:
-        """`is_tight()` says whether frames, wherever they are held, leave little room for the next."""
+        """`is_tight()` says whether all frames in memory leave little room for new ones."""
         self._max_bytes = max_bytes
         self._is_tight = is_tight
         self._holders: Counter[int] = Counter()
@@ -22,7 +23,7 @@ class WaitingFrames:
         self._buffers: list[PairBuffer] = []
 
     def join(self, buffer: PairBuffer) -> None:
-        """One more buffer holds frames of these."""
+        """Adds a buffer."""
         self._buffers.append(buffer)
 
     def add(self, frame: CameraFrame | LidarFrame) -> None:
@@ -32,15 +33,16 @@ class WaitingFrames:
             self._bytes += frame_bytes(frame)
 
     def remove(self, frame: CameraFrame | LidarFrame) -> None:
-        """A buffer holds a frame no more."""
+        """A buffer no longer holds a frame."""
         self._holders[id(frame)] -= 1
         if not self._holders[id(frame)]:
             del self._holders[id(frame)]
             self._bytes -= frame_bytes(frame)
 
     def has_to_go(self, buffer: PairBuffer) -> bool:
-        """Whether a buffer must let go: there are too many, or others hold so many that the next ones would be refused;
-        and none holds more pairs. Who waits for long pushes nobody else on."""
+        """Whether a buffer must let a pair go: there are too many bytes of frames, or so many elsewhere in memory that
+        new ones would be refused, and no other buffer holds more pairs. So a pair that waits for long does not push on
+        the others."""
         too_many = self._bytes > self._max_bytes or self._is_tight()
         return too_many and len(buffer) == max(map(len, self._buffers))
 
@@ -60,7 +62,7 @@ class PairBuffer:
 
     @property
     def next_ns(self) -> int:
-        """Stamp of the pair whose turn it is."""
+        """Stamp of the oldest pair."""
         return self._pairs[0].stamp_ns
 
     def add(self, pair: FramePair) -> None:
@@ -70,17 +72,17 @@ class PairBuffer:
         self._frames.add(pair.lidar)
 
     def take(self) -> FramePair:
-        """The pair whose turn it is."""
+        """Takes out the oldest pair."""
         pair = self._pairs.popleft()
         self._frames.remove(pair.camera)
         self._frames.remove(pair.lidar)
         return pair
 
     def has_waited(self, monotonic_s: float) -> bool:
-        """The next pair has to wait: whether it has done so for too long by now, or with too many."""
+        """The oldest pair has to wait. Whether it has waited too long by now, or too many frames wait."""
         self._since_s = monotonic_s if self._since_s is None else self._since_s
         return self._frames.has_to_go(self) or monotonic_s - self._since_s > self._max_wait_s
 
     def may_go(self) -> None:
-        """The next pair need not wait."""
+        """The oldest pair need not wait."""
         self._since_s = None

@@ -1,4 +1,4 @@
-"""The pairs of one camera and one LiDAR: frames -> pair, and each pair in its turn to the chooser."""
+"""Forms pairs from the frames of one camera and one LiDAR, and gives each pair in its turn to the chooser."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ from coec.runtime.timings import QUICK_S, Histogram
 T = TypeVar("T")
 
 GRACE_NS = NS_PER_S
-"""Sensor time after the end of a slice before silence ends it: late pairs may still be on their way."""
+"""Sensor time that must pass after the end of a slice before silence ends it, ns: late pairs may still be on their
+way."""
 
 QUIET_TICKS = 3
-"""Ticks without a frame before a stream may be silent. A tick may be late by whatever the process slept: what came
-meanwhile needs another to get here."""
+"""Ticks without a frame before a stream may count as silent. If the process slept, a tick is late, and frames that came
+meanwhile need another tick to arrive here."""
 
 
 class PairStream:
-    """Takes the frames of one pair, on the thread of the intake. `ask`, `call`, `arrivals` and `losses` are for any
-    thread, `report` is what that thread last told of the pair.
+    """Takes the frames of one camera-LiDAR pair, on the intake's thread. `ask`, `call`, `arrivals` and `losses` are for
+    any thread. `report` is the intake thread's latest report on the pair.
 
     Attributes:
-        sensors: the streams, by kind; other pairs may have them, too.
-        waiting_took: of each pair, from when it was certain until it was looked at.
+        sensors: the streams, by kind; other pairs may share them.
+        waiting_took: how long each pair waited from when it was certain until it was looked at.
     """
 
     def __init__(
@@ -53,8 +54,8 @@ class PairStream:
         losses: LossCounter,
         ring: FrameRing | None = None,
     ) -> None:
-        """`has_room()` says whether the recorder would take a chosen pair now; `losses` are the pair's own; `ring`
-        keeps the last seconds, if they are wanted."""
+        """`has_room()` says whether the recorder would take a chosen pair now. `losses` counts those of this pair.
+        `ring` keeps the last seconds, if they are wanted."""
         self._intake = intake
         self.sensors: Mapping[str, SensorStream] = intake.sensors_of(pair)
         self.report = StreamStatistics()
@@ -74,7 +75,7 @@ class PairStream:
         intake.join(self)
 
     def losses(self) -> dict[tuple[str, str], int]:
-        """Of the pair and of its streams, by place and cause."""
+        """Losses of the pair and of its streams, by place and cause."""
         counted = self._losses.snapshot()
         for sensor in self.sensors.values():
             counted |= sensor.losses.snapshot()
@@ -85,11 +86,10 @@ class PairStream:
         return self._intake.arrivals(self.sensors)
 
     def ask(self, work: Callable[[], T], timeout_s: float) -> T:
-        """Have `work` done between two samples, once every pair that has come was looked at, and wait for what it
-        returns.
+        """Has `work` done between two samples, after every pair that has come was looked at, and waits for its result.
 
         Raises:
-            BusyError: it was not begun within `timeout_s`: nothing was done.
+            BusyError: the work was not begun within `timeout_s`, and nothing was done; or it has not ended.
         """
 
         def everything_first() -> T:
@@ -101,7 +101,7 @@ class PairStream:
         return handed.result(timeout_s)
 
     def call(self, effect: Callable[[], None]) -> None:
-        """Have an effect of a decision run on this thread, between two samples."""
+        """Has the effect of a decision run on the intake's thread, between two samples."""
         self._intake.inbox.call(effect)
 
     def adopt(self, served: Served) -> None:
@@ -126,24 +126,24 @@ class PairStream:
             self._ring.event(name, T_camera_lidar)
 
     def finish_snippet(self) -> None:
-        """Wait for nothing more that belongs to an event; on this thread, or after its end."""
+        """Ends the open snippet without waiting for further frames; on this thread, or after its end."""
         if self._ring is not None:
             self._ring.finish()
 
     def finish_pairs(self) -> None:
-        """Look at every pair that has come, whatever it waits for. For the thread of the intake, or after its
-        end."""
+        """Looks at every pair that has come, even if it should wait for an answer. For the thread of the intake, or
+        after its end."""
         self._hold(self._pairer.flush())
         while self._held:
             self._choose()
 
     def taker(self, name: str) -> Callable[[Frame], None]:
-        """Who takes the frames of one of its streams: they tell themselves which."""
+        """`push` for every stream, because each frame says what it is."""
         del name
         return self.push
 
     def push(self, frame: Frame) -> None:
-        """The next frame of one of its streams came."""
+        """Takes the next frame of one of the streams."""
         self._quiet_ticks = 0
         if self._ring is not None:
             self._ring.push(frame, time.monotonic())
@@ -151,7 +151,7 @@ class PairStream:
         self.take(self._pairer.push(frame))
 
     def take(self, pairs: list[FramePair]) -> None:
-        """Pairs came: they tell the time, and wait their turn."""
+        """Takes new pairs: their stamps tell the time, and they wait for their turn."""
         for pair in pairs:
             self._clock.observe(pair.stamp_ns, time.monotonic())
         self._hold(pairs)
@@ -168,15 +168,15 @@ class PairStream:
             self._held.add(pair)
 
     def choose_next(self) -> bool:
-        """Look at the pair whose turn it is, if it may be looked at; whether one was."""
+        """Looks at the oldest waiting pair if it may be looked at; returns whether it did."""
         if not self.may_choose():
             return False
         self._choose()
         return True
 
     def may_choose(self) -> bool:
-        """Whether the next pair has come, and all is judged that has to be before it is looked at; or it has waited for
-        too long, or with too many."""
+        """Whether a pair waits and may be looked at: everything that has to be judged before it is judged, or it has
+        waited too long, or too many frames wait."""
         if not self._held:
             return False
         if self._has_room() and not self._chooser.must_wait(self._held.next_ns):
@@ -185,8 +185,8 @@ class PairStream:
         return self._held.has_waited(time.monotonic())
 
     def tick(self, *, waiting: bool) -> None:
-        """Time has passed; samples of its streams are `waiting` to be taken, or none. End a slice in silence, and renew
-        the report."""
+        """Time has passed; `waiting`: samples of the streams are in the inbox. Ends a slice in silence, and renews the
+        report."""
         self._quiet_ticks = 0 if waiting else self._quiet_ticks + 1
         if self._quiet_ticks > QUIET_TICKS:
             self._end_in_silence()
@@ -195,14 +195,14 @@ class PairStream:
         self.tell()
 
     def _end_in_silence(self) -> None:
-        """Let the slice end by extrapolated time when the streams have stopped."""
+        """Ends the slice by extrapolated time if the streams have stopped."""
         end_ns = self._chooser.slice_end_ns
         if end_ns is None or self._held:
             return
         now_ns = self._clock.silent_now_ns(time.monotonic())
         if now_ns is None or now_ns < end_ns + GRACE_NS:
             return
-        # They are certain because nothing came for long: now is not when they came.
+        # The flushed pairs came earlier and are certain only by the silence, so they do not set the clock.
         pairs = self._pairer.flush()
         self._hold(pairs)
         last_ns = pairs[-1].stamp_ns if pairs else self._chooser.chosen.last_ns
@@ -211,8 +211,9 @@ class PairStream:
             self._chooser.end_slice_by(end_ns)
 
     def _look_back(self, stamp_ns: int) -> None:
-        """A frame came: one of the slice that was taken to be over tells that what came before it was no silence. Then
-        frames were held up for so long that the window is another than that of a replay, and that is counted."""
+        """Checks, when a frame comes, whether a slice that ended in silence ended too early. If the frame belongs to
+        that slice, the streams were not silent but held up. The window then differs from that of a replay, and that is
+        counted."""
         if self._silence is None:
             return
         last_ns, end_ns = self._silence
@@ -221,7 +222,7 @@ class PairStream:
             self._losses.add("window", "ended_too_early", detail="frames that were held up came after the slice ended")
 
     def tell(self) -> None:
-        """Renew the report."""
+        """Renews the report."""
         silent = self._clock.is_silent(time.monotonic())
         rate_hz = self._clock.rate_hz
         self.report = StreamStatistics(

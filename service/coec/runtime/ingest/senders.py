@@ -1,4 +1,4 @@
-"""Who sends on one stream, as far as messages say so, and what the numbers of each tell about loss."""
+"""The senders of one stream, as far as messages name them, and how many messages of each were lost."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections import OrderedDict, deque
 from coec.runtime.ingest.sequence_numbers import SequenceNumbers
 
 REMEMBERED = 8
-"""Senders whose numbers are followed: the one that sends, and some that may have sent before it."""
+"""How many senders' numbers are followed: that of the present sender and of some earlier ones."""
 
 RECENT = 64
-"""Messages over which it shows whether senders take turns: two seconds of a camera."""
+"""Recent messages that show whether senders take turns: two seconds of a camera."""
 
 
 class Senders:
-    """Of one stream; one thread uses it. Whoever does not say who it is has the empty id.
+    """The senders of one stream; one thread uses it. A sender that does not name itself has the empty id.
 
-    A sender that ends and comes back has another id, so that one change of senders is no surprise; where it changes
-    again within `RECENT` messages, two send at a time.
+    A sender that restarts has a new id, so one change of senders is normal. If the sender changes again within `RECENT`
+    messages, two are sending at the same time.
     """
 
     def __init__(self) -> None:
@@ -26,11 +26,11 @@ class Senders:
         self._changes = 0
 
     def counted(self, sender: bytes) -> None:
-        """A message of theirs had come, was lost here, and was counted then."""
+        """A message of this sender came, was lost in this process, and has been counted already."""
         self._of(sender).counted()
 
     def lost_by(self, sender: bytes, number: int) -> int:
-        """How many messages of theirs are known to be lost on their way now that the one of this number has come."""
+        """How many messages of this sender are now known to be lost on their way, given that this number has come."""
         changed = bool(self._recent) and self._recent[-1][0] != sender
         if len(self._recent) == RECENT:
             self._changes -= self._recent[0][1]
@@ -40,7 +40,7 @@ class Senders:
 
     @property
     def taking_turns(self) -> tuple[bytes, ...]:
-        """Ids of those that send at a time; none where it is one."""
+        """Ids of the senders that send at the same time; empty if there is only one."""
         return tuple(sorted({sender for sender, _ in self._recent})) if self._changes > 1 else ()
 
     def _of(self, sender: bytes) -> SequenceNumbers:

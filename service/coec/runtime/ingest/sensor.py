@@ -1,4 +1,4 @@
-"""A stream of a sensor: taken, decoded and counted once, however many pairs it is of."""
+"""A stream of a sensor. Each sample is taken, decoded and counted once, however many pairs use the stream."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ MOTIONS_WAITING = 512
 """Ego-motion samples that may wait: 2.5 s at 200 Hz."""
 
 READ_WITHOUT = frozenset({"name", "mask", "hardware_id", "info_topic", "sweep", "T_lidar_ego"})
-"""Settings of a stream that change nothing of how its samples are read: streams that differ in no other are one."""
+"""Settings that do not change how the samples of a stream are read. Streams that differ only in these are one."""
 
 
 def read_alike(kind: str, stream: KnownStreamConfig) -> tuple[str, str]:
-    """What two streams have in common whose samples are the same frames."""
+    """A key that is equal for two streams if their samples give the same frames."""
     return kind, stream.model_dump_json(exclude=set(READ_WITHOUT))
 
 
 class SensorStream:
-    """One of them. `counts` and `losses` are for any thread, the rest is the ingest thread's.
+    """One stream. `counts` and `losses` are for any thread, everything else is for the ingest thread.
 
     Attributes:
-        kind: what it brings.
-        number: by which its samples are told apart from those of others.
-        took: decoding of each sample.
-        takers: who gets the frames, in the order in which they came.
+        kind: what the stream brings: camera frames, LiDAR sweeps or ego-motion.
+        number: name of the stream in the inbox.
+        took: how long the decoding of each sample took.
+        takers: functions that get each frame, in the order in which the frames came.
     """
 
     def __init__(self, kind: str, number: str, config: KnownStreamConfig, limits: LimitsConfig) -> None:
@@ -51,11 +51,11 @@ class SensorStream:
 
     @property
     def depth(self) -> int:
-        """Samples that may wait."""
+        """How many samples may wait."""
         return MOTIONS_WAITING if self.kind == EGO else FRAMES_WAITING
 
     def take(self, sample: Sample, budget: FrameBudget) -> None:
-        """Decode a sample that has come; whoever takes the frames gets the same one."""
+        """Decodes a sample and hands the same frame to every taker."""
         begun_s = time.monotonic()
         frame = self.decoder.frame(sample)
         self.took.add(time.monotonic() - begun_s, self.kind)

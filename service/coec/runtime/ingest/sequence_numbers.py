@@ -1,20 +1,20 @@
-"""What the numbers of the frames of a stream tell about loss.
+"""Counts the frames of a stream that were lost on their way, by gaps in their numbers.
 
-A number that is left out is lost once it has become late: a frame that was only overtaken comes within a few others. It
-is then no loss of the network's, and what becomes of it is counted where that is decided: once.
+A missing number counts as lost once it is late, because a frame that was only overtaken comes within a few others. An
+overtaken frame is no loss of the network: if it is dropped later, the part that drops it counts it, once.
 """
 
 from __future__ import annotations
 
 MAX_GAP = 100_000
-"""A larger step is a sender that started to count anew: at 100 Hz this would be a quarter of an hour of loss."""
+"""A larger step means that the sender counts anew: at 100 Hz this gap would be a quarter of an hour of loss."""
 
 LATE_FRAMES = 16
-"""Frames that may overtake another: 1.6 s at 10 Hz, the depth of the inbox."""
+"""How many frames may overtake another: 1.6 s at 10 Hz, the depth of the inbox."""
 
 
 class SequenceNumbers:
-    """Of one stream; one thread uses it."""
+    """The numbers of one sender; one thread uses it."""
 
     def __init__(self) -> None:
         self._newest: int | None = None
@@ -23,13 +23,13 @@ class SequenceNumbers:
         self._since_counted = 0
 
     def counted(self) -> None:
-        """A frame that had come was lost here, and was counted then: its number is left out, too. Whoever sent it may
-        not have numbered it, so that no gap of much later is taken for its."""
+        """A frame came, was lost in this process, and has been counted already, so its gap is not counted again. The
+        frame may have had no number at all; therefore only a gap soon afterwards is taken for its gap."""
         self._counted += 1
         self._since_counted = 0
 
     def lost_by(self, number: int) -> int:
-        """How many frames are known to be lost on their way now that the one of this number has come."""
+        """How many frames are now known to be lost on their way, given that this number has come."""
         lost = self._left_out_by(number)
         known = min(lost, self._counted)
         self._since_counted += 1
@@ -43,7 +43,7 @@ class SequenceNumbers:
             return 0
         self._newest = number
         if newest is None or not newest < number <= newest + MAX_GAP:
-            # A new count: what the old one left out does not come any more.
+            # The sender counts anew: numbers that are missing from the old count do not come any more.
             lost = len(self._awaited)
             self._awaited.clear()
             return lost

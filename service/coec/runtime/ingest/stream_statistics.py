@@ -1,4 +1,4 @@
-"""What the streams of a pair look like, as the thread that takes them last said."""
+"""The latest report of the intake's thread about the streams of a pair."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ class StreamStatistics:
 
     Attributes:
         streams: samples and frames, by stream.
-        unpaired: frames that ended in no pair, by `<stream>_<cause>`.
-        pairs: that were formed.
-        held: of these, how many wait to be looked at.
-        chosen: what was chosen of the others.
+        unpaired: number of frames that got into no pair, by `<stream>_<cause>`.
+        pairs: number of pairs that were formed.
+        held: how many of these pairs wait to be looked at.
+        chosen: what was chosen from the others.
         rate_hz: pairs per second of sensor time; 0 when the streams have stopped, None before the second pair.
-        pace: seconds of sensor time that pass in a second; None before the second pair.
+        pace: seconds of sensor time per second; None before the second pair.
         sync_error_s: how much later than its sweep the latest camera frame was taken.
         timed_by: how the times of the latest sweep's points were read, see `LidarFrame`.
     """

@@ -1,4 +1,4 @@
-"""Reading windows of which nothing is known, a few MB at a time, by a thread that has other things to do."""
+"""Reads windows that the store does not know yet, a few MB at a time, on a thread that has other work to do."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _log = logging.getLogger(__name__)
 
 
 ROUND_S = 0.1
-"""After this a round ends, however little was read: pairs may be waiting to be written, and the thread has to beat."""
+"""After this time a round ends, however little was read: pairs may wait to be written, and the thread must beat."""
 
 PIECE_BYTES = 2**16
-"""Read at once: 0.7 s on a disk that gives 100 kB/s."""
+"""Bytes that are read at once: 0.7 s on a disk that gives 100 kB/s."""
 
 
 @dataclass(slots=True)
 class _Reading:
-    """The file that is being read; it stays the same file when another takes its name.
+    """The file that is being read. It stays open, even if another file takes its name.
 
     Attributes:
-        begun: what the file system said of it at the beginning.
+        begun: status of the file at the beginning.
     """
 
     path: Path
@@ -43,11 +43,11 @@ class _Reading:
 
 
 class DigestReader:
-    """Reads what the store does not know of the windows of one pair: those that came by another way than its recorder
-    and its worker, or whose line in the index was lost. Owned by one thread."""
+    """Reads the windows of one pair that the store does not know: those that neither its recorder nor its worker wrote,
+    or whose line in the index was lost. Owned by one thread."""
 
     def __init__(self, store: WindowStore, pair: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock`: seconds that never go back."""
+        """`clock`: a clock in seconds that never goes back."""
         self._clock = clock
         self._store = store
         self._pair = pair
@@ -55,8 +55,8 @@ class DigestReader:
         self._unreadable: set[str] = set()
 
     def read(self, max_bytes: int) -> bool:
-        """Go on by at most so many bytes, fewer when the disk is slow; the latest window comes first. False when there
-        is nothing to read."""
+        """Reads on by at most `max_bytes`, fewer if the disk is slow. The latest window comes first. False: there is
+        nothing to read."""
         if self._reading is None:
             unread = self._store.unread(self._pair)
             self._unreadable.intersection_update(unread)
@@ -71,13 +71,13 @@ class DigestReader:
         return True
 
     def close(self) -> None:
-        """Leave the file that is being read."""
+        """Closes the file that is being read."""
         if self._reading is not None:
             self._reading.stream.close()
             self._reading = None
 
     def _guarded(self, path: Path, step: Callable[[], None]) -> None:
-        """A file that the disk does not give is left alone until the next start, one that has gone is no matter."""
+        """Runs a step. A file that cannot be read is left alone until the next start; one that has gone is ignored."""
         try:
             step()
         except FileNotFoundError:
@@ -107,7 +107,7 @@ class DigestReader:
         status, begun = os.fstat(reading.stream.fileno()), reading.begun
         self.close()
         if (status.st_size, status.st_mtime_ns) != (begun.st_size, begun.st_mtime_ns):
-            return  # somebody writes into it: it is read once more
+            return  # somebody is writing into the file, so it is read again
         version = WindowVersion(
             size_bytes=status.st_size,
             modified_ns=status.st_mtime_ns,
@@ -120,7 +120,8 @@ class DigestReader:
 
 
 def _result_in(path: Path) -> CalibrationResult | None:
-    """None also for a damaged window, which is listed all the same: whoever wants to look into it can have it."""
+    """The result in a window's file; None if it has none or is damaged. A damaged window is listed all the same, so
+    that people can look into it."""
     try:
         return read_result(path)
     except WindowError as error:

@@ -1,4 +1,4 @@
-"""The thread that writes windows: what fails here costs a window, never the service."""
+"""The thread that writes windows. A failure here costs a window, never the service."""
 
 from __future__ import annotations
 
@@ -27,25 +27,27 @@ from coec.runtime.timings import QUICK_S, Histogram
 _log = logging.getLogger(__name__)
 
 PAIRS_WAITING = 8
-"""Pairs that may wait for the disk, some MB each."""
+"""How many pairs may wait for the disk, some MB each."""
 
 BETWEEN_WAITING = 32
-"""Thinned pairs that may, a third of a MB each: a disk that does not answer for half a minute holds nothing up."""
+"""How many thinned pairs may wait for the disk, a third of a MB each. A disk that does not answer for half a minute
+then holds nothing up."""
 
 UNSOLVED_RESUMED = 4
-"""Windows of earlier runs that are still solved after a start, newest first."""
+"""How many unsolved windows of earlier runs are solved after a start, newest first."""
 
 POLL_S = 0.2
-"""Between two looks at the folder: so late is what the list says of files that others put there."""
+"""Time between two looks at the folder, s: by so much the list lags behind files that others put there."""
 
 STUCK_S = 2.0
-"""Without a sign of life of the thread: it gives one several times a second, and between two writes."""
+"""Without a beat of the thread for this time, s, the disk counts as stuck. The thread beats several times a second, and
+between two writes."""
 
 DIGEST_BYTES = 4 * 2**20
-"""Of a window that is read for its digest in one round, between pairs that come: 8 ms of hashing at 500 MB/s."""
+"""Bytes of a window that are read for its digest in one round, between pairs: 8 ms of hashing at 500 MB/s."""
 
 DIGEST_PAUSE_S = 0.02
-"""Between such rounds: the disk belongs to the pairs, and 4 GB of windows are read in less than a minute."""
+"""Pause between such rounds, s: the disk is left to the pairs, and 4 GB of windows still take less than a minute."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +75,7 @@ class _Open:
 
 @dataclass(frozen=True, slots=True)
 class RecordingPlan:
-    """What every window of a pair has in common; clouds and raw images are compressed if they are to be `packed`."""
+    """What all windows of a pair have in common. `packed`: clouds and raw images are compressed."""
 
     rig: Rig
     configuration: CalibrationConfig
@@ -83,11 +85,11 @@ class RecordingPlan:
 
 
 class Recorder:
-    """Writes the windows of one pair on a thread of its own, and looks after what earlier runs left.
+    """Writes the windows of one pair on a thread of its own, and completes what earlier runs left unfinished.
 
     Attributes:
-        recorded: windows that got to the disk.
-        writing_took: of each pair into its window.
+        recorded: number of windows that got to the disk.
+        writing_took: how long it took to write each pair into its window.
     """
 
     def __init__(
@@ -99,10 +101,10 @@ class Recorder:
         on_lost: Callable[[str], None],
         snippets: SnippetRecorder | None = None,
     ) -> None:
-        """`on_recorded(window_id, path, live)` is called on the recorder's thread for each finished window, and with
-        `live` False for unsolved ones of earlier runs; `on_lost(window_id)` for each that ended and came to nothing.
-        A window cannot be removed before `on_recorded` returns: who needs it for longer holds it in the store.
-        `snippets` are written between the pairs."""
+        """`on_recorded(window_id, path, live)` is called on the recorder's thread for each finished window; `live` is
+        False for unsolved windows of earlier runs. A window cannot be removed before `on_recorded` returns; if it is
+        needed for longer, hold it in the store. `on_lost(window_id)` is called for each window that ended without
+        being recorded. `snippets` are written between the pairs."""
         self._plan = plan
         self._configuration = plan.configuration
         self._store = store
@@ -125,7 +127,7 @@ class Recorder:
 
     @property
     def trouble(self) -> Reason | None:
-        """Why windows do not get to the disk; None while they do."""
+        """Why windows cannot be recorded; None while they can."""
         silent_s = self.thread.silence_s
         if self._trouble is None and silent_s > STUCK_S:
             text = f"The disk has not answered for {silent_s:.0f} s: no window can be recorded."
@@ -134,33 +136,33 @@ class Recorder:
 
     @property
     def latest(self) -> Path | None:
-        """The latest finished window; None when there is none on the disk."""
+        """The latest finished window; None if there is none on the disk."""
         return self._latest
 
     @property
     def waiting(self) -> int:
-        """Chosen pairs that wait for the disk."""
+        """Number of chosen pairs that wait for the disk."""
         return self._adds
 
     @property
     def has_room(self) -> bool:
-        """Whether a chosen pair and one between would be taken now."""
+        """Whether `add` and `add_between` would take a pair now."""
         return self._adds < PAIRS_WAITING and self._betweens < BETWEEN_WAITING
 
     def use(self, configuration: CalibrationConfig) -> None:
-        """Windows that begin from now on, in the order of what is queued, are to be calibrated with this: the limits of
-        the rig were learned anew, or do not fit it."""
+        """Queues another configuration for the windows that begin after it in the queue. Called when the limits of the
+        rig were learned anew, or do not fit the rig."""
         with self._condition:
             self._queue.append(configuration)
             self._condition.notify()
 
     def follow(self, plan: RecordingPlan) -> None:
-        """The next window is to be recorded by this; how it is to be calibrated is for `use` to say."""
+        """Records the next window by this plan. Its configuration of the calibration is ignored; `use` sets that."""
         self._plan = plan
 
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
-        """Queue a chosen pair; never waits for the disk. `T_camera_lidar` (4, 4) is where a search will start if this
-        is the first pair of its window."""
+        """Queues a chosen pair; never waits for the disk. `T_camera_lidar` (4, 4) is where the search will start if
+        this is the first pair of its window."""
         with self._condition:
             overrun = self._adds >= PAIRS_WAITING
             if not overrun:
@@ -171,7 +173,7 @@ class Recorder:
             self._losses.add("window", "recorder_overrun")
 
     def add_between(self, window_id: str, pair: FramePair) -> None:
-        """Queue a pair, thinned, that is recorded beside the chosen ones of a window; likewise."""
+        """Queues a thinned pair to be recorded beside the chosen ones of a window; never waits for the disk."""
         with self._condition:
             overrun = self._betweens >= BETWEEN_WAITING
             if not overrun:
@@ -182,13 +184,13 @@ class Recorder:
             self._losses.add("window", "recorder_overrun")
 
     def end(self, ended: SliceEnded) -> None:
-        """Queue the end of a window; it is finished when it holds enough pairs, else abandoned."""
+        """Queues the end of a window. It is finished if it holds enough pairs, else abandoned."""
         with self._condition:
             self._queue.append(ended)
             self._condition.notify()
 
     def request_stop(self) -> None:
-        """Write what waits, finish or abandon the open window, and end the thread."""
+        """Has the thread write what waits, finish or abandon the open window, and end."""
         self.thread.request_stop()
         with self._condition:
             self._condition.notify()
@@ -225,8 +227,8 @@ class Recorder:
             self._snippets.close()
 
     def _read(self) -> bool:
-        """Go on with windows of which nothing is known, and see by that what others have done in the folder; False when
-        there is nothing to read."""
+        """Reads on in windows that the store does not know; this also notices what others have done in the folder.
+        False: there is nothing to read."""
         try:
             return self._digests.read(DIGEST_BYTES)
         except OSError as error:
@@ -291,12 +293,12 @@ class Recorder:
             self._lose(item.window_id, error)
 
     def _write_between(self, item: _AddBetween) -> None:
-        """Only a window that has a pair is on the disk."""
+        """Writes a thinned pair if its window is open; a window without a chosen pair is not on the disk."""
         if self._open is not None and self._open.window_id == item.window_id:
             self._open.writer.add_between(item.pair)
 
     def _start(self, item: _Add) -> _Open:
-        plan = self._plan  # another may come meanwhile
+        plan = self._plan  # `follow` may replace it meanwhile
         self._store.make_room(self.thread.beat)
         writer = WindowWriter(
             self._store.path(item.window_id),
@@ -330,8 +332,8 @@ class Recorder:
         self._finished(recorded)
 
     def _add_kept(self, kept: KeptPairs, into: _Open) -> None:
-        """Copy the pairs that another window keeps for this one. They are on the disk, so that to keep them costs no
-        memory, and what is cut short by a restart is still there."""
+        """Copies the pairs that another window keeps for this one. They are on the disk, so keeping them costs no
+        memory, and they survive a restart."""
         before = into.pairs
         try:
             into.writer.note_kept(kept.window_id, kept.since_ns)
@@ -352,15 +354,15 @@ class Recorder:
         self._hand_over(recorded.window_id, recorded.path, live=True)
 
     def _close_stray(self) -> None:
-        """Abandon the open window: it ended with too few pairs."""
+        """Abandons the open window, because it ended with too few pairs."""
         if self._open is not None:
             self._open.writer.abandon()
             self._open = None
-            self._trouble = None  # what there was of it could be written
+            self._trouble = None  # the pairs that it had could be written
             self._losses.add("window", "too_few_pairs")
 
     def _lose(self, window_id: str, error: Exception) -> None:
-        """Give the window up; the next one tries again."""
+        """Gives up the window after an error; the next window tries again."""
         self._lost = window_id
         self._trouble = Reason("recording_failed", f"The last window could not be recorded: {error}")
         self._losses.add("window", "recording_failed", detail=str(error))

@@ -1,7 +1,7 @@
-"""The folder of snippets: what is there, what has to go, bytes of a file.
+"""The folder of snippets: lists them, removes the oldest, and reads bytes of a file.
 
-Beside each file lies what is said of it (`.json`), so that a list opens no recording. Bounded by bytes, and nothing
-begins where the disk has too little room: windows come first.
+Beside each recording lies a description (`.json`), so that a listing opens no recording. The folder is bounded in
+bytes. No snippet is begun if the disk has too little room, because windows come first.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from coec.schemas.replies import SnippetInfo
 _log = logging.getLogger(__name__)
 
 SNIPPET = ".snippet"
-"""At the end of a snippet's id, where a window's has a digit."""
+"""End of a snippet's id. A window's id ends in a digit."""
 
 TOLD = ".json"
 
 TOLD_BYTES = 4096
-"""Of what is said of a snippet, at most: some 250 are written."""
+"""Largest description of a snippet that is read, bytes; some 250 are written."""
 
 PIECE_BYTES = 2**20
-"""Read at once of a file whose digest is not known."""
+"""Bytes that are read at once of a file whose digest is not known."""
 
 
 def snippet_id(pair: str, stamp_ns: int) -> str:
-    """Id of what a pair saw around an event, by the sensor time of the event."""
+    """Id of the snippet of a pair, by the sensor time of the event."""
     return f"{pair}-{stamp_ns}{SNIPPET}"
 
 
 class SnippetStore:
-    """The snippets of all pairs. Safe to use from several threads; `listing` waits for no disk."""
+    """The snippets of all pairs. Safe to use from several threads; `listing` does not wait for the disk."""
 
     def __init__(self, folder: Path, max_bytes: int, min_free_bytes: int) -> None:
         """Makes the folder.
@@ -87,10 +87,10 @@ class SnippetStore:
         return read_piece(self.path(name), "the snippet", offset, length)
 
     def add(self, info: SnippetInfo) -> None:
-        """A snippet was recorded: it is listed once a restart would list it, too.
+        """Lists a snippet that was recorded, once its description is on the disk and a restart would list it, too.
 
         Raises:
-            OSError: what is said of it could not be written; it is found by its file at the next start.
+            OSError: the description could not be written; the next start finds the snippet by its file.
         """
         durable.replace(self._told(info.snippet_id), to_json(info))
         with self._lock:
@@ -98,10 +98,10 @@ class SnippetStore:
             self._found[info.snippet_id] = info
 
     def make_room(self, size_bytes: int) -> None:
-        """For a snippet of this size: remove the oldest while there are too many bytes.
+        """Makes room for a snippet of this size: removes the oldest ones while there are too many bytes.
 
         Raises:
-            RecordingError: it is larger than all may be, or the disk has too little room.
+            RecordingError: the snippet is larger than the limit for all, or the disk has too little room.
         """
         if size_bytes > self._max_bytes:
             raise RecordingError(f"a snippet of {size_bytes >> 20} MiB is more than snippets.max_bytes allows")
@@ -121,8 +121,8 @@ class SnippetStore:
             )
 
     def take_up(self, pair: str, progress: Callable[[], None]) -> None:
-        """Look after what earlier runs left of a pair: finish what was cut off, read what is not told. `progress` is
-        called now and then.
+        """Completes what earlier runs left of a pair: finishes files that were cut off, and reads those without a
+        description. `progress` is called now and then.
 
         Raises:
             RecordingError, OSError: the disk refuses.
@@ -134,7 +134,7 @@ class SnippetStore:
             name = path.name.removesuffix(SUFFIX)
             if _pair_of(name) != pair or name in self._found:
                 continue
-            with suppress(CoecError):  # what is damaged stays for whoever wants to look into it
+            with suppress(CoecError):  # a damaged file stays, so that people can look into it
                 self.add(_read_anew(path, name, progress))
 
     def _oldest_beyond(self, size_bytes: int) -> str | None:
@@ -157,7 +157,7 @@ class SnippetStore:
 
 
 def _pair_of(name: str) -> str:
-    """The pair of a snippet's id; empty where it is none."""
+    """The pair in a snippet's id; empty if `name` is no such id."""
     pair, _, stamp = name.removesuffix(SNIPPET).rpartition("-")
     return pair if name.endswith(SNIPPET) and stamp.isascii() and stamp.isdecimal() else ""
 

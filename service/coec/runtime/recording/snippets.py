@@ -1,5 +1,5 @@
-"""What a pair saw around an event, on its way to the disk: a few frames at a time, by a thread that has other things to
-do. What fails here costs the snippet."""
+"""Writes to the disk what a pair saw around an event, a few frames at a time, on a thread that has other work to do. A
+failure here costs only the snippet."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from coec.schemas.replies import SnippetInfo
 _log = logging.getLogger(__name__)
 
 ROUND_S = 0.1
-"""After this a round ends: pairs of a window may be waiting to be written, and the thread has to beat."""
+"""After this time a round ends: pairs of a window may wait to be written, and the thread must beat."""
 
 ROUND_BYTES = 4 * 2**20
-"""The same, of frames: 30 ms at 150 MB/s."""
+"""After so many bytes of frames a round ends, too: 30 ms at 150 MB/s."""
 
 STOP_S = 2.0
-"""For what is left when the service ends: some 200 MB on a disk that is well."""
+"""Time for writing the rest when the service ends, s: some 200 MB on a healthy disk."""
 
 OVERHEAD = 1.1
-"""Bytes of a file to those of its frames, at most: headers, camera info, odometry, index."""
+"""Largest ratio of the bytes of a file to those of its frames; the rest is headers, camera info, odometry, index."""
 
 
 @dataclass(slots=True)
@@ -48,13 +48,12 @@ class _Open:
 
 
 class SnippetRecorder:
-    """Records the snippets of one pair, one at a time. `give` is for any thread; everything else is the recorder's."""
+    """Records the snippets of one pair, one at a time. `give` is for any thread, everything else for the recorder's."""
 
     def __init__(
         self, rig: Rig, metadata: Mapping[str, str], store: SnippetStore, losses: LossCounter, *, packed: bool
     ) -> None:
-        """`metadata`: what is said in every file, for example `vehicle`; clouds and raw images are compressed if they
-        are to be `packed`."""
+        """`metadata` goes into every file, for example `vehicle`. `packed`: clouds and raw images are compressed."""
         self._rig = rig
         self._metadata = metadata
         self._store = store
@@ -66,7 +65,7 @@ class SnippetRecorder:
         self._open: _Open | None = None
 
     def give(self, snippet: Snippet) -> None:
-        """Have a snippet written. While another is, it is lost: memory for two at a time is not there."""
+        """Has a snippet written. While another one is being written it is lost, because there is no memory for two."""
         with self._lock:
             busy, self._busy = self._busy, True
             if not busy:
@@ -75,14 +74,14 @@ class SnippetRecorder:
             self._losses.add("window", "snippet_overrun")
 
     def take_up(self, progress: Callable[[], None]) -> None:
-        """Look after what earlier runs left; `progress` is called now and then."""
+        """Completes what earlier runs left unfinished; `progress` is called now and then."""
         try:
             self._store.take_up(self._rig.pair, progress)
         except (RecordingError, OSError) as error:
             self._losses.add("window", "snippet_salvage_failed", detail=str(error))
 
     def write(self) -> bool:
-        """Go on a little; False when there is nothing to write."""
+        """Writes on for one round; False: there is nothing to write."""
         if not self._given and self._open is None:
             return False
         end_s, room = time.monotonic() + ROUND_S, ROUND_BYTES
@@ -99,7 +98,7 @@ class SnippetRecorder:
         return True
 
     def close(self) -> None:
-        """Write what there is, for a while, and finish the file; for the end of the service."""
+        """Writes for at most `STOP_S` and finishes the file; for the end of the service."""
         end_s = time.monotonic() + STOP_S
         while time.monotonic() < end_s and self.write():
             pass

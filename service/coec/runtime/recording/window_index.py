@@ -1,4 +1,5 @@
-"""What was read of the windows on the disk, kept so that no file is read twice: the digest above all."""
+"""The index of the windows on the disk. It keeps what was read of them, above all the digest, so that no file is read
+twice."""
 
 from __future__ import annotations
 
@@ -18,17 +19,17 @@ from coec.schemas.replies import Decision
 _log = logging.getLogger(__name__)
 
 LINES = 1000
-"""Of the file, 250 bytes each; from twice as many it is written anew, if not that many windows exist."""
+"""Lines of the index file, 250 bytes each. At twice as many it is written anew, unless that many windows exist."""
 
 
 class WindowVersion(Part):
-    """One version of a window's file: with its result it is another than without.
+    """One version of a window's file: adding the result to it makes another version.
 
     Attributes:
-        size_bytes, modified_ns: as the file system says; they tell one version from another.
-        sha256: of the whole file, hexadecimal.
-        pairs: how many it holds; None when that cannot be read.
-        decision: of the result that it holds; None when it holds none.
+        size_bytes, modified_ns: as the file system reports them; they tell versions apart.
+        sha256: digest of the whole file, hexadecimal.
+        pairs: number of pairs in the file; None if that cannot be read.
+        decision: decision of the result in the file; None if it holds no result.
     """
 
     size_bytes: int
@@ -39,7 +40,7 @@ class WindowVersion(Part):
 
 
 class IndexedWindow(Part):
-    """A line of the index. `order` counts the recordings, whatever any clock says."""
+    """A line of the index. `order` counts the recordings and depends on no clock."""
 
     window_id: str
     order: int
@@ -47,21 +48,21 @@ class IndexedWindow(Part):
 
 
 class WindowIndex:
-    """A line for each version of a window that was read; the last of a window counts. Not safe from several threads,
-    but for `flush`.
+    """A line for each version of a window that was read; the last line of a window counts. Only `flush` is safe from
+    several threads.
 
-    A line that is lost costs that the window is read again, and that it is taken for the latest: the index is written
-    at once, but no window is refused because it cannot be.
+    The index is written at once, but a window is recorded even if its line cannot be written. If a line is lost, the
+    window is read again and is taken for the latest.
     """
 
     def __init__(self, path: Path) -> None:
-        """`path`: a file of lines; need not exist."""
+        """`path`: the index file; it need not exist."""
         self._known: dict[str, IndexedWindow] = {}
         self._log = Log(path, LINES, lambda: [to_json(known) for known in tuple(self._known.values())])
         self._waiting: deque[bytes] = deque()
         self._writing = threading.Lock()
         lines: list[bytes] = []
-        with contextlib.suppress(OSError):  # then it begins anew
+        with contextlib.suppress(OSError):  # then the index begins anew
             lines = self._log.load()
         for line in lines:
             with contextlib.suppress(ValidationError):
@@ -70,22 +71,22 @@ class WindowIndex:
         self._next = 1 + max((known.order for known in self._known.values()), default=0)
 
     def get(self, window_id: str) -> IndexedWindow | None:
-        """What is known of the latest version that was read; None: nothing."""
+        """The line of the latest version that was read; None: there is none."""
         return self._known.get(window_id)
 
     def next_order(self) -> int:
-        """The place behind all recordings so far."""
+        """The next place in the order of recordings."""
         order, self._next = self._next, self._next + 1
         return order
 
     def put(self, known: IndexedWindow) -> None:
-        """Another version was read; `flush` writes it."""
+        """Takes in another version that was read; `flush` writes it."""
         self._known[known.window_id] = known
         self._waiting.append(to_json(known))
 
     def flush(self) -> None:
-        """Write what was put. Safe from any thread, and for as long as the disk takes: who reads and puts meanwhile
-        does not wait."""
+        """Writes what was put, for as long as the disk takes. Safe from any thread; `get` and `put` do not wait
+        meanwhile."""
         with self._writing:
             while self._waiting:
                 self._log.add(self._waiting.popleft())
@@ -95,6 +96,6 @@ class WindowIndex:
                 _log.warning(f"the index of the windows cannot be written: {error.strerror}")
 
     def prune(self, window_ids: Iterable[str]) -> None:
-        """Forget all windows but these."""
+        """Forgets all windows except these."""
         for gone in self._known.keys() - set(window_ids):
             del self._known[gone]

@@ -1,11 +1,11 @@
-"""The folder of recorded windows: what is there, what has to go, bytes of a file.
+"""The folder of recorded windows: lists them, removes old ones, and reads bytes of a file.
 
-Whoever asks what is there is told from memory, and waits for no disk: threads that may wait for one, those of the
-recorders, look at the folder several times a second, write and remove.
+Questions about what is there are answered from memory and do not wait for the disk. Only threads that may wait for the
+disk, those of the recorders, look at the folder (several times a second), write and remove.
 
-No clock is trusted alone with a file. Which window is older is told by the order in which they were recorded; one is
-too old only when the wall clock says so and the sensor time of a newer window of its pair as well. And as both may
-jump together, age takes few at a time.
+No single clock decides whether a file is removed. The order of recording decides which window is older. A window is too
+old only if the wall clock says so and also the sensor time of a newer window of its pair. Because both may jump
+together, only a few windows at a time are removed for their age.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _log = logging.getLogger(__name__)
 NS_PER_DAY = 86_400 * 1_000_000_000
 
 EXPIRED_AT_ONCE = 2
-"""Windows that age removes whenever one begins: more than one, so that the folder empties; few, so that a clock that is
-wrong for an hour takes no more than twice what was recorded in it."""
+"""How many windows are removed for their age whenever one begins. More than one, so that the folder empties; few, so
+that a clock that is wrong for an hour removes no more than twice what was recorded in that hour."""
 
 SETTLED_S = 3.0
-"""A folder that has been as it is for so long is not read again before its time of modification changes; that time is
-as coarse as the clock of the file system, 4 ms on ext4 and XFS, 2 s on FAT."""
+"""A folder that has not changed for this time, s, is not read again until its modification time changes. That time is
+only as fine as the clock of the file system: 4 ms on ext4 and XFS, 2 s on FAT."""
 
 _WINDOW_ID = re.compile(r"([A-Za-z0-9_.-]{1,64})-(\d{1,19})", re.ASCII)
 
@@ -54,8 +54,8 @@ class Usage:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """A window that is there: its pair, the sensor time of its beginning, its place in the order of recordings, and
-    what the file system says."""
+    """A window in the folder: its pair, the sensor time of its beginning, its place in the order of recordings, and
+    size and modification time of its file."""
 
     pair: str
     start_ns: int
@@ -66,36 +66,36 @@ class _Found:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """The windows of one pair, as long as none comes or goes: in order, and the ids of those that were not read yet,
-    the latest first."""
+    """The windows of one pair, valid until one comes or goes: all in order, and the ids of those that were not read
+    yet, the latest first."""
 
     infos: tuple[WindowInfo, ...]
     unread: tuple[str, ...]
 
     def renewed(self, info: WindowInfo) -> _View:
-        """More is known of one of them. A view of thousands is not made anew for each."""
+        """The view with new information about one window. So a view of thousands is not made anew for each of them."""
         infos = tuple(info if one.window_id == info.window_id else one for one in self.infos)
         known = info.sha256 is not None
         return _View(infos, tuple(one for one in self.unread if one != info.window_id) if known else self.unread)
 
 
 class WindowStore:
-    """All windows of all pairs. Safe to use from several threads. What a recorder does, and `read`, waits for the disk;
-    `listing`, `usage`, `note`, `hold` and the like wait for nobody.
+    """All windows of all pairs. Safe to use from several threads. The methods for recorders, and `read`, wait for the
+    disk; `listing`, `usage`, `note`, `hold` and the like do not wait.
 
     Attributes:
-        removed: windows that had to go.
+        removed: number of windows that were removed.
     """
 
     def __init__(self, folder: Path, config: StateConfig) -> None:
-        """Makes the folder. What was read of its windows is kept beside it.
+        """Makes the folder. The index of its windows lies beside it.
 
         Raises:
             RecordingError: it cannot be made or read.
         """
         self._folder = folder
         self._config = config
-        self._disk = threading.Lock()  # before the other, where both are needed
+        self._disk = threading.Lock()  # taken before `_lock`, where both are needed
         self._lock = threading.Lock()
         self._found: dict[str, _Found] = {}
         self._views: dict[str, _View] = {}
@@ -115,7 +115,7 @@ class WindowStore:
             raise RecordingError(f"the folder {folder} cannot be made or read: {error.strerror}") from error
 
     def use(self, config: StateConfig) -> None:
-        """Keep these limits from the next window on."""
+        """Keeps to these limits from the next window on."""
         with self._lock:
             self._config = config
             self._views.clear()
@@ -144,8 +144,8 @@ class WindowStore:
             return [self.path(info.window_id) for info in self._view(pair).infos]
 
     def leftovers(self, pair: str) -> list[Path]:
-        """Files of the pair that were not finished before the last end of the service, by the sensor time of their
-        beginning."""
+        """Files of the pair that were not finished when the service last ended, in the order of the sensor time of
+        their beginning."""
         found = []
         for path in self._folder.glob(f"{pair}-*{SUFFIX}{PART_SUFFIX}"):
             match = _WINDOW_ID.fullmatch(path.name.removesuffix(f"{SUFFIX}{PART_SUFFIX}"))
@@ -154,12 +154,12 @@ class WindowStore:
         return [path for _, path in sorted(found)]
 
     def usage(self) -> Usage:
-        """How full it is."""
+        """How full the folder and its disk are."""
         with self._lock:
             return Usage(sum(found.size_bytes for found in self._found.values()), self._free)
 
     def listing(self, pair: str) -> tuple[WindowInfo, ...]:
-        """Every window of the pair, oldest first. Opens no file: what has not been read yet is null."""
+        """Every window of the pair, oldest first. Opens no file: fields that have not been read yet are null."""
         with self._lock:
             return self._view(pair).infos
 
@@ -175,7 +175,7 @@ class WindowStore:
     # --- what is known of it ----------------------------------------------------------------------------------------
 
     def add(self, recorded: RecordedWindow) -> None:
-        """A window was recorded: it is the latest."""
+        """Takes in a window that was just recorded, as the latest."""
         version = WindowVersion(
             size_bytes=recorded.bytes,
             modified_ns=recorded.modified_ns,
@@ -193,8 +193,8 @@ class WindowStore:
         self.flush()
 
     def note(self, window_id: str, version: WindowVersion) -> None:
-        """The file of a window was read or written again: this is what it was then. If it is another by now, nothing
-        is lost: what is noted counts for a file of this size and time only. Kept with the next `flush`."""
+        """Notes the version of a window's file that was just read or written. The note counts only for a file of this
+        size and time, so it does no harm if the file has changed since. The next `flush` writes it."""
         with self._lock:
             found = self._found.get(window_id)
             if found is not None:
@@ -208,11 +208,11 @@ class WindowStore:
                     self._views[found.pair] = view.renewed(self._info(window_id, found, kept_for))
 
     def flush(self) -> None:
-        """Put on the disk what was noted."""
+        """Writes what was noted to the disk."""
         self._index.flush()
 
     def version(self, window_id: str) -> WindowVersion | None:
-        """What was read of a window as it is now; None: not read yet, or no such window."""
+        """What was read of a window in its present version; None: not read yet, or no such window."""
         with self._lock:
             found = self._found.get(window_id)
             return None if found is None else self._version(window_id, found)
@@ -226,36 +226,36 @@ class WindowStore:
     # --- what has to stay, what has to go ---------------------------------------------------------------------------
 
     def hold(self, window_id: str) -> None:
-        """Something is under way with this window, which must not be removed until as many `release` have come."""
+        """Protects a window from removal while work on it is under way, until `release` was called as often."""
         with self._lock:
             self._held[window_id] += 1
 
     def release(self, window_id: str) -> None:
-        """What `hold` was for has come to its end."""
+        """Ends one `hold`."""
         with self._lock:
             self._held[window_id] -= 1
             if self._held[window_id] <= 0:
                 del self._held[window_id]
 
     def protect(self, pair: str, kept_for: Mapping[str, KeptFor]) -> None:
-        """These windows of the pair (and no others any more) are kept for something: age does not remove them, and lack
-        of room only when no other window is left that may go. Where all that are kept have more than
-        `max_protected_bytes`, the oldest of them are ordinary ones."""
+        """Protects these windows of the pair, and no others any more. Age does not remove them, and lack of room does
+        so only if no other window may be removed. If all protected windows together have more than
+        `max_protected_bytes`, the oldest of them count as ordinary ones."""
         with self._lock:
             if self._protected.get(pair) != kept_for:
                 self._protected[pair] = dict(kept_for)
                 self._views.clear()
 
     def make_room(self, progress: Callable[[], None]) -> None:
-        """Before a window starts: remove windows that are too old, and the oldest while there are too many bytes or
-        too little is left free. What is held stays, and the latest window of a pair; for their sake there may be more
-        bytes than asked for.
+        """Called before a window starts: removes windows that are too old, and the oldest ones while there are too many
+        bytes or too little is free. Held windows and the latest window of each pair stay, even if the limit is then
+        exceeded.
 
         Args:
             progress: called after every window that is removed.
 
         Raises:
-            RecordingError: too little is free all the same, or a window cannot be removed.
+            RecordingError: too little is free even so, or a window cannot be removed.
         """
         try:
             self._make_room(progress)
@@ -296,7 +296,7 @@ class WindowStore:
             )
 
     def _remove(self, window_id: str, *, spare_kept: bool) -> bool:
-        """Remove a window, unless something is under way with it by now, it has gone, or it is to be spared."""
+        """Removes a window, unless it is held by now, has gone, or is to be spared."""
         with self._disk:
             with self._lock:
                 spared = spare_kept and window_id in self._kept()
@@ -304,13 +304,14 @@ class WindowStore:
                     return False
                 del self._found[window_id]
                 self._views.clear()
-            self._changed_ns = None  # it is found again where it cannot be removed
+            self._changed_ns = None  # if it cannot be removed, the next `look` finds it again
             self.path(window_id).unlink(missing_ok=True)
             self.removed += 1
             return True
 
     def _is_too_old(self, found: _Found, newest: _Found) -> bool:
-        """A clock that was set back makes an age negative, which is no age."""
+        """Whether both clocks say that a window is too old. A clock that was set back gives a negative age, which never
+        counts as too old."""
         oldest_ns = round(self._config.max_age_days * NS_PER_DAY)
         by_wall_clock = time.time_ns() - found.modified_ns > oldest_ns
         return by_wall_clock and newest.start_ns - found.start_ns > oldest_ns
@@ -318,11 +319,11 @@ class WindowStore:
     # --- on threads that may wait for the disk ----------------------------------------------------------------------
 
     def look(self) -> None:
-        """Read the folder if it has changed. No file in it is written in place: a window that changes is replaced, and
-        the folder changes with it.
+        """Reads the folder if it has changed. No file in it is written in place: a changed window is replaced, and so
+        the folder's modification time changes, too.
 
         Raises:
-            OSError: the disk does not say.
+            OSError: the folder cannot be read.
         """
         with self._disk:
             now_s = time.monotonic()
@@ -343,7 +344,8 @@ class WindowStore:
     # --- inside; the lock is held -----------------------------------------------------------------------------------
 
     def _kept(self) -> dict[str, KeptFor]:
-        """What windows are kept for, of those that are; the latest first, as many as may be."""
+        """The protected windows and what each is kept for: the latest first, as many as `max_protected_bytes`
+        allows."""
         asked = {window_id: reason for of_pair in self._protected.values() for window_id, reason in of_pair.items()}
         there = sorted(self._found.keys() & asked.keys(), key=lambda window_id: -self._found[window_id].order)
         left, kept = self._config.max_protected_bytes, dict[str, KeptFor]()
@@ -358,8 +360,8 @@ class WindowStore:
         return sorted(self._found.items(), key=lambda item: item[1].order)
 
     def _compare(self, statuses: Mapping[str, os.stat_result]) -> None:
-        """Take over what is there now. A window that nobody has reported counts as the latest; of several of them their
-        times are all there is to tell."""
+        """Takes over the present content of the folder. A window that nobody has reported counts as the latest. Several
+        of them are ordered by their times, because nothing else is known."""
         gone = self._found.keys() - statuses.keys()
         changed = [
             (status.st_mtime_ns, start_ns_of(window_id), window_id)
@@ -413,12 +415,12 @@ class WindowStore:
 
 
 def start_ns_of(window_id: str) -> int:
-    """Stamp of the pair that opened the window of this id."""
+    """Stamp of the pair that opened the window."""
     return int(window_id.rpartition("-")[2])
 
 
 def _statuses(folder: Path) -> dict[str, os.stat_result]:
-    """Of every window, by its id."""
+    """Status of every window's file, by window id."""
     found = {}
     with os.scandir(folder) as entries:
         for entry in entries:
@@ -432,6 +434,6 @@ def _statuses(folder: Path) -> dict[str, os.stat_result]:
 
 
 def _free_bytes(folder: Path) -> int:
-    """On the disk that holds the folder, or will when it is made."""
+    """Bytes free on the disk that holds the folder, or will hold it once it is made."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     return shutil.disk_usage(there).free
