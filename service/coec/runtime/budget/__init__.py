@@ -1,1 +1,1 @@
-"""What the pairs of a daemon may spend of the processor between them, and whose turn it is."""
+"""How much processor time the pairs of a daemon may spend together, and whose turn it is."""

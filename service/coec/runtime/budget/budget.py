@@ -1,8 +1,8 @@
-"""The budget of a service as its threads see it: streams ask, the worker's supervisor pays, status tells.
+"""The budget of a service as its threads use it: streams ask, the worker's supervisor pays, status reports.
 
-One lock around one state machine, held for microseconds. A thread of its own would answer a stream some time later, at
-whichever pair has come by then: which pairs make a check would be a matter of the machine even where nobody has to
-wait.
+It is one lock around one state machine, held for microseconds. A thread of its own would answer a stream some time
+later, after further pairs have come. Then it would depend on the machine which pairs make a check, even where nobody
+has to wait.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ class BudgetReport:
     """How the budget is spent.
 
     Attributes:
-        cores: what may be spent, of a core.
-        spent: what the worker has taken, for whatever it did, of a core; see `spending.OVER_S`.
-        wanted: what every check and every window would take.
-        stretched_by: by how much periods and slices are longer than configured.
+        cores: the budget, in cores.
+        spent: what the worker has spent on everything, in cores, over the last `spending.OVER_S`.
+        wanted: what all checks and windows would need, in cores.
+        stretched_by: factor by which periods and slices are longer than configured.
         in_store_s: processor time in store; negative: borrowed.
-        pairs: what each takes.
-        unseen_s: since the worker last looked at each pair, by the steady clock; without those it never did.
+        pairs: what each pair takes.
+        unseen_s: time since the worker last looked at each pair, by the steady clock; pairs never looked at are left
+            out.
         totals_s: processor time since the start, by kind and pair, s.
     """
 
@@ -45,10 +46,10 @@ class BudgetReport:
 
 
 class Budget:
-    """Of all pairs of a daemon; for any thread."""
+    """The budget of all pairs of a daemon; for any thread."""
 
     def __init__(self, config: BudgetConfig, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock`: a steady one, s."""
+        """`clock`: a steady clock, s."""
         self._clock = clock
         self._lock = threading.Lock()
         self._turns = Turns(config.cores)
@@ -56,41 +57,43 @@ class Budget:
         self._looked_s: dict[str, float] = {}
 
     def use(self, config: BudgetConfig) -> None:
-        """Spend by this from now on."""
+        """Spends by these settings from now on."""
         with self._lock:
             self._turns.use(config.cores)
 
     def join(self, pair: str, monitor: MonitorConfig, window: WindowConfig) -> float:
-        """A pair joins; how long its first slice is to be, s: windows of different pairs end at different times. No
-        shorter than an urgent one, which is enough for a window."""
+        """A pair joins. Returns how long its first slice is to be, s, so that windows of different pairs end at
+        different times. It is no shorter than an urgent slice, which suffices for a window."""
         with self._lock:
             phase = self._turns.join(pair, monitor.period_s, window.slice_s)
         return window.slice_s - phase * max(window.slice_s - monitor.urgent_slice_s, 0.0)
 
     def join_looks(self, name: str, period_s: float) -> None:
-        """Something joins that wants a look in each period, and no windows."""
+        """Something joins that wants a look in each period but no windows."""
         with self._lock:
             self._turns.join_looks(name, period_s)
 
     def affords(self, pair: str, stamp_ns: int, *, suspected: bool) -> bool:
-        """Whether a check of a pair, whose stream has come to this stamp, may begin; `ended` has to follow then."""
+        """Whether a check of a pair may begin now that its stream has come to this stamp. If so, call `ended` after
+        it."""
         with self._lock:
             return self._turns.affords(pair, stamp_ns, suspected=suspected)
 
     def window_turn_s(self, pair: str, stamp_ns: int) -> float:
-        """How much later than at once a window of a pair that the rig wants may end, now that its stream has come to
-        this stamp, s: those before it are paid then. It is taken to be on its way."""
+        """By how much the end of a window that the rig wants of a pair may be delayed, s, now that the pair's stream
+        has come to this stamp. The windows before it are paid by then. It then counts as being on its way."""
         with self._lock:
             return self._turns.window_turn_s(pair, stamp_ns)
 
     def ended(self, pair: str) -> None:
-        """A check that had begun has ended, however it did."""
+        """A check that had begun has ended, with or without a result."""
         with self._lock:
             self._turns.ended(pair)
 
     def pay(self, cost: Cost) -> None:
-        """The worker has done something, for a pair that has joined or for none. Windows of earlier runs, pictures and
-        commissionings are not for the stream: they are told, and nobody waits for them to be earned."""
+        """Books the cost of the worker's work, for a pair that has joined or for none. Windows of earlier runs, pictures
+        and commissionings are not for the stream: they appear in the report, but no check waits until they are
+        earned."""
         now_s = self._clock()
         with self._lock:
             self._spending.add(cost.kind, cost.pair, cost.cpu_s, now_s)
@@ -105,7 +108,7 @@ class Budget:
 
     @property
     def stretch(self) -> float:
-        """By how much slices are to be longer than configured, at least 1."""
+        """Factor by which slices are to be longer than configured, at least 1."""
         with self._lock:
             return self._turns.stretch
 

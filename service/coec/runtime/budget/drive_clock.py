@@ -1,7 +1,7 @@
-"""One clock for all pairs that goes as the drive goes: with the stamps of whichever pair is in front.
+"""One clock for all pairs that shows the time of the drive, by the stamps of the pair that is farthest ahead.
 
-The budget is earned by it, so a drive that is replayed at ten times its pace earns, and spends, ten times as much in a
-second: it is judged by the same checks, on any machine that keeps up.
+The budget is earned by this clock. A replay at ten times the pace of the drive therefore earns and spends ten times as
+much per second, and makes the same checks as the drive did, on any machine that keeps up.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ NS_PER_S = 1_000_000_000
 
 
 class DriveClock:
-    """Seconds of driving since the first stamp. Stamps of one pair have nothing to do with those of another."""
+    """Seconds of driving since the first stamp. The stamps of different pairs need not be of the same clock."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -18,8 +18,9 @@ class DriveClock:
         self._reached_s: dict[str, float] = {}
 
     def observe(self, pair: str, stamp_ns: int, gap_s: float) -> float:
-        """The stream of a pair has come to a stamp; what time it is now, s. A step back, or ahead by more than `gap_s`,
-        is no driving: the pair goes on from where the others are, as does one that has fallen behind by so much."""
+        """The stream of a pair has come to a stamp. Returns the time now, s. A step back, or ahead by more than
+        `gap_s`, does not count as driving: the pair goes on from where the others are. So does a pair that has fallen
+        behind by more than `gap_s`."""
         last_ns = self._last_ns.get(pair)
         self._last_ns[pair] = stamp_ns
         passed_s = 0.0 if last_ns is None else (stamp_ns - last_ns) / NS_PER_S

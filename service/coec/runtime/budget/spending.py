@@ -1,4 +1,4 @@
-"""What the worker has taken of the processor, by what it was for and when."""
+"""The processor time that the worker has spent, by purpose and time."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections import deque
 from collections.abc import Mapping
 
 OVER_S = 180.0
-"""Over which the cores are told: a window and the checks beside it, at the default length of a slice."""
+"""Time over which `cores` is averaged, s: a window and the checks beside it, at the default length of a slice."""
 
 BIN_S = 5.0
-"""In which it is counted."""
+"""Width of the bins in which the time is counted, s."""
 
 
 class Spending:
-    """Times are of one steady clock, s."""
+    """Processor time spent. Times are of one steady clock, s."""
 
     def __init__(self, begin_s: float) -> None:
         self._begin_s = begin_s
@@ -21,7 +21,7 @@ class Spending:
         self._totals: dict[tuple[str, str], float] = {}
 
     def add(self, kind: str, pair: str, cpu_s: float, now_s: float) -> None:
-        """So much processor time went into work of this kind for a pair; empty where it is for none."""
+        """Adds processor time of work of this kind, for a pair or (empty) for none."""
         self._totals[kind, pair] = self._totals.get((kind, pair), 0.0) + cpu_s
         index = int(now_s // BIN_S)
         if self._bins and self._bins[-1][0] == index:
@@ -31,7 +31,7 @@ class Spending:
             self._bins.popleft()
 
     def cores(self, now_s: float) -> float:
-        """Of a core, over the last `OVER_S`, or since the beginning."""
+        """Cores in use on average over the last `OVER_S`, or since the beginning."""
         spent_s = sum(cpu_s for index, cpu_s in self._bins if index * BIN_S >= now_s - OVER_S)
         return spent_s / max(min(now_s - self._begin_s, OVER_S), BIN_S)
 

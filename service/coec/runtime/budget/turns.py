@@ -1,10 +1,11 @@
-"""Whose turn it is: a check is made when there is enough in store for it and for all with a stronger claim.
+"""Whose turn it is: a check may begin when the store holds enough for it and for all waiting checks with a stronger
+claim.
 
-A suspicion comes first, and may borrow; then whoever has not been looked at for longest, in periods of its own. Where
-the budget suffices for everybody, nobody waits, and every check is made with the pair at which it was asked for. Where
-it does not, the checks that are made are some of those, and all periods are stretched alike.
+A suspected pair comes first and may borrow. Then comes the pair that has not been looked at for longest, counted in its
+own periods. If the budget suffices for all, nobody waits, and every check is made at the pair of frames at which it was
+asked for. If it does not, only some of these checks are made, and all periods are stretched by the same factor.
 
-A state machine: sensor time alone passes in it, and it knows no thread and no clock.
+It is a state machine without threads or clocks; only sensor time passes in it.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from coec.runtime.budget.prices import Price, middle_s
 from coec.runtime.budget.store import LOOKS_SHARE, Debt, Store
 
 SEEN_PERIODS = 6
-"""A pair that has asked for nothing for so many of its periods takes no part: its streams have stopped, or the vehicle
-has. As many as the pairs of one check may span."""
+"""A pair that has asked for nothing for so many of its periods takes no part, because its streams or the vehicle have
+stopped. The pairs of one check may span as many periods."""
 
 STEPS = 20
-"""In which lengths are stretched, a twentieth each: a price that moves by less moves nothing."""
+"""Lengths are stretched in steps of one twentieth, so that small changes of a price change nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +31,11 @@ class Share:
     """What one pair takes of the budget.
 
     Attributes:
-        look_s: what a check costs, processor time; None before the first.
-        window_s: what a window costs, with the depth of its images; None before the first.
-        suspected: there is a suspicion; its checks come first.
-        waiting: a check of it waits for its turn.
-        active: its streams ask for checks.
+        look_s: processor time of a check, s; None before the first.
+        window_s: processor time of a window with the depth of its images, s; None before the first.
+        suspected: the pair is suspected, so its checks come first.
+        waiting: a check of the pair waits for its turn.
+        active: the pair's streams ask for checks.
     """
 
     look_s: float | None
@@ -46,8 +47,9 @@ class Share:
 
 @dataclass(slots=True)
 class _Pair:
-    """`asked_s`: when it asked last; `waits`: in vain. `begun_s`: when its last check began. `has_windows`: or looks
-    alone. `in_hand`: its checks that have begun and not ended; `prepared_s`: what depth for the open window cost."""
+    """A pair that shares the budget. `asked_s`: when it last asked; `waits`: whether it was refused then. `begun_s`:
+    when its last check began. `has_windows`: False if it wants looks only. `in_hand`: number of checks that have begun
+    and not ended. `prepared_s`: cost of the depth for the open window so far."""
 
     period_s: float
     debt: Debt
@@ -63,7 +65,7 @@ class _Pair:
 
 
 class Turns:
-    """Of all pairs of a service."""
+    """The turns of all pairs of a service."""
 
     def __init__(self, cores: float) -> None:
         self._cores = cores
@@ -73,24 +75,24 @@ class Turns:
         self._windows_until_s = 0.0
 
     def use(self, cores: float) -> None:
-        """Another budget from now on."""
+        """Sets another budget."""
         self._cores = cores
         self._store.use(cores)
 
     def join(self, name: str, period_s: float, slice_s: float) -> float:
-        """A pair joins that wants a check in each period and a window in each slice. Where in its slice, as a part of
-        it from 0 to 1, its first window begins: those of different pairs end at different times, as the worker does one
-        after the other and each pair waits for its own."""
+        """A pair joins that wants a check in each period and a window in each slice. Returns at which part of its
+        slice, from 0 to 1, its first window begins. Windows of different pairs are to end at different times, because
+        the worker solves one after the other and each pair waits for its own."""
         phase = _phase(len(self._pairs))
         self._pairs[name] = _Pair(period_s, Debt(slice_s), self._clock.now_s)
         return phase
 
     def join_looks(self, name: str, period_s: float) -> None:
-        """Something joins that wants a look in each period, and no windows."""
+        """Something joins that wants a look in each period but no windows."""
         self._pairs[name] = _Pair(period_s, Debt(period_s), self._clock.now_s, has_windows=False)
 
     def affords(self, name: str, stamp_ns: int, *, suspected: bool) -> bool:
-        """Whether a check of a pair may begin, now that its stream has come to a stamp. It is then taken to begin."""
+        """Whether a check of a pair may begin, now that its stream has come to a stamp. If so, it counts as begun."""
         pair = self._pairs[name]
         now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * pair.period_s)
         self._earn(now_s)
@@ -106,10 +108,10 @@ class Turns:
         return True
 
     def window_turn_s(self, name: str, stamp_ns: int) -> float:
-        """How much later than at once a window of a pair that is wanted soon may end, now that its stream has come to a
-        stamp, s. The windows of all pairs of a sensor follow each other as fast as the budget earns them beside the
-        looks; all at once they would be ready together, and keep the worker from every look for as long as they take.
-        In whole seconds: a price that moves by a little moves no slice."""
+        """By how much the end of an urgent window of a pair may be delayed, s, now that its stream has come to a stamp.
+        So the windows of all pairs of a sensor follow each other as fast as the budget earns them beside the looks. If
+        all were ready at once, the worker could not look at any pair until it has solved them all. In whole seconds,
+        so that small changes of a price move no slice."""
         now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * self._pairs[name].period_s)
         begin_s = max(self._windows_until_s, now_s)
         earned_in_s = self._window_s(self._pairs[name]) / ((1.0 - LOOKS_SHARE) * self._cores)
@@ -117,23 +119,23 @@ class Turns:
         return begin_s - now_s
 
     def ended(self, name: str) -> None:
-        """A check that had begun has ended, whether it was done or not."""
+        """A check that had begun has ended, with or without a result."""
         self._pairs[name].in_hand -= 1
 
     def looked(self, name: str, cpu_s: float) -> None:
-        """A check has cost so much."""
+        """Books the cost of a check."""
         pair = self._pairs[name]
         pair.look.add(cpu_s)
         self._store.pay(cpu_s, pair.look.cpu_s)
 
     def prepared(self, name: str, cpu_s: float) -> None:
-        """Depth for the open window has cost so much."""
+        """Books the cost of depth for the open window."""
         pair = self._pairs[name]
         pair.prepared_s += cpu_s
         pair.debt.owed_s += cpu_s
 
     def solved(self, name: str, cpu_s: float) -> None:
-        """A window has cost so much, beside what was prepared."""
+        """Books the cost of a window, in addition to what was prepared."""
         pair = self._pairs[name]
         pair.window.add(pair.prepared_s + cpu_s)
         pair.prepared_s = 0.0
@@ -141,12 +143,12 @@ class Turns:
 
     @property
     def cores(self) -> float:
-        """The budget."""
+        """The budget, in cores."""
         return self._cores
 
     @property
     def wanted(self) -> float:
-        """Of a core, for every check and every window of the pairs that ask for them."""
+        """What all checks and windows of the active pairs would need, in cores."""
         return sum(
             self._look_s(pair) / pair.period_s + self._window_s(pair) / pair.debt.over_s
             for pair in self._pairs.values()
@@ -155,7 +157,7 @@ class Turns:
 
     @property
     def stretch(self) -> float:
-        """By how much all periods and slices are longer than configured, at least 1."""
+        """Factor by which all periods and slices are longer than configured, at least 1."""
         return max(math.ceil(STEPS * self.wanted / self._cores) / STEPS, 1.0)
 
     @property
@@ -195,12 +197,13 @@ class Turns:
         return _expected_s([each.window for each in self._pairs.values()])
 
     def _claim(self, name: str, now_s: float) -> tuple[bool, float, str]:
-        """The name decides between equals, so that it is the same one every time."""
+        """Sort key of a pair's claim; the greatest comes first. The name decides between equals, so that the order is
+        always the same."""
         pair = self._pairs[name]
         return pair.suspected, (now_s - pair.begun_s) / pair.period_s, name
 
     def _waits(self, name: str) -> bool:
-        """Whether a check of a pair waits for its turn. One whose stream has stopped does so for a period."""
+        """Whether a check of a pair waits for its turn. After its stream has stopped it waits for one period more."""
         pair = self._pairs[name]
         return pair.waits and self._clock.now_s - pair.asked_s <= pair.period_s
 
@@ -209,14 +212,14 @@ class Turns:
 
 
 def _expected_s(others: Sequence[Price]) -> float:
-    """What is expected of a pair that has no price yet, s: the middle one of those of the others. With many pairs the
-    first windows are most of the work of the first minutes."""
+    """Expected price of a pair that has none yet, s: the median of the others' prices. It matters because with many
+    pairs the first windows are most of the work of the first minutes."""
     return middle_s([each.cpu_s for each in others if each.known])
 
 
 def _phase(index: int) -> float:
-    """0, 1/2, 1/4, 3/4, 1/8, ...: the digits of the index behind the point, last first (van der Corput). However many
-    there are, they lie far apart."""
+    """0, 1/2, 1/4, 3/4, 1/8, ...: the binary digits of the index in reverse order behind the point (van der Corput).
+    Any number of such values lie far apart."""
     phase, weight = 0.0, 0.5
     while index:
         phase += weight * (index & 1)

@@ -1,1 +1,1 @@
-"""What answers change, in order, and where it is written down."""
+"""Decisions about a pair: what each answer changes, in order, and the books in which that is written down."""

@@ -1,11 +1,11 @@
-"""A book of the history of a pair: append-only, a line per entry, each holding the sha256 of the one before
-(tamper-evident).
+"""A book of the history of a pair, as a hash chain: append-only, one line per entry, and each entry holds the sha256 of
+the one before, so that tampering shows.
 
 A line is `<sha256 of the entry> <entry, JSON><tab><result, JSON or null>`; the entry names the sha256 of its result.
 Hashes are over the bytes of the line, so that a later version with more fields can still verify it. Only the newest
-`limit` entries are kept: the first line's `previous_sha256` is then the hash of what was dropped. Place and hash of the
-last entry on the disk also stand in the state file, so that a tail that was cut off is noticed. A chain that does not
-hold is kept aside as it is, and goes on from the part that does.
+`limit` entries are kept; the first line's `previous_sha256` is then the hash of a dropped entry. The state file also
+holds place and hash of the last entry on the disk, so that a missing end is noticed. If a chain is broken, its file is
+kept aside as it is, and the chain goes on from the part that is sound.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ GENESIS = 64 * "0"
 
 
 MAX_DIGITS = 19
-"""Of the number of an entry: more than can ever be written."""
+"""Most digits of the number of an entry: more entries than that can never be written."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """An entry with its hash, its result if it is one of a window, and its line in the file."""
+    """An entry with its hash, its line in the file, and the result if it is the entry of a window's result."""
 
     sha256: str
     entry: HistoryEntry
@@ -45,21 +45,21 @@ class Kept:
 
     @property
     def chained(self) -> ChainedEntry:
-        """Without the result."""
+        """The entry without the result."""
         return ChainedEntry(sha256=self.sha256, entry=self.entry)
 
 
 class Chain:
-    """All that is kept in one book, oldest first. Safe to use from several threads; only `flush` waits for the disk.
+    """The entries of one book, oldest first. Safe to use from several threads; only `flush` waits for the disk.
 
-    Entries go to the disk in order: the chain on the disk holds at any time.
+    Entries go to the disk in order, so the chain on the disk is sound at any time.
 
     Attributes:
-        damage: what was wrong with the chain that was found, one sentence; None when it held.
+        damage: what was wrong with the chain on the disk at the start, one sentence; None if it was sound.
     """
 
     def __init__(self, path: Path, limit: int, head: str | None = None) -> None:
-        """`head` is the `durable_head` that the state file knows of: the chain must reach it, or it was cut off."""
+        """`head` is the `durable_head` in the state file: a chain that does not reach it was cut off."""
         self._path = path
         self._ledger: Ledger[Kept] = Ledger(path, limit, lambda kept: kept.line)
         self._writing = threading.Lock()
@@ -69,22 +69,22 @@ class Chain:
 
     @property
     def durable_head(self) -> str | None:
-        """Place and hash of the newest entry that is on the disk, in the words of this module; None before the first.
-        This, and nothing newer, is for the state file to remember."""
+        """Place and hash of the newest entry on the disk, in the format of this module; None before the first. The
+        state file may remember this and nothing newer."""
         durable = self._ledger.durable
         return None if durable is None else f"{durable.entry.sequence} {durable.sha256}"
 
     def entries(self) -> tuple[Kept, ...]:
-        """All that are kept."""
+        """All entries that are kept."""
         return self._ledger.items()
 
     def on_disk(self) -> tuple[Kept, ...]:
-        """All that are on the disk."""
+        """All entries that are on the disk."""
         return self._ledger.on_disk()
 
     def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
-        """Keep one more; its place in the chain is filled in, its number is its own or, where that is taken, the next.
-        On the disk with the next `flush`."""
+        """Appends an entry and fills in its place in the chain. Its number stays, or becomes the next one if it is
+        taken. The next `flush` writes it."""
 
         def placed_behind(last: Kept | None) -> Kept:
             placed = entry.model_copy(
@@ -102,10 +102,10 @@ class Chain:
         return self._ledger.add(placed_behind)
 
     def flush(self) -> None:
-        """Put on the disk what is not there yet.
+        """Writes to the disk what is not there yet.
 
         Raises:
-            StateError: it is not possible; the next call tries again.
+            StateError: the disk refuses; the next call tries again.
         """
         with self._writing:
             try:
@@ -143,7 +143,7 @@ class Chain:
 
 
 def _parsed(line: bytes) -> Kept | None:
-    """The entry of a line, None when the line is not what its hashes say, or holds a pose that is none."""
+    """The entry of a line; None if the line contradicts its hashes, or holds a matrix that is no pose."""
     sha256, _, body = line.partition(b" ")
     document, _, result = body.partition(b"\t")
     try:
@@ -161,7 +161,7 @@ def _parsed(line: bytes) -> Kept | None:
 
 
 def _reaches(chain: Sequence[Kept], head: str | None) -> bool:
-    """Whether a sound chain holds the entry that `head` names, or only ones after it: the oldest are dropped."""
+    """Whether a sound chain holds the entry that `head` names, or only later ones because the oldest were dropped."""
     if head is None:
         return True
     number, _, sha256 = head.partition(" ")

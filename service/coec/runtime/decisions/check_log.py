@@ -1,6 +1,6 @@
-"""The checks of the monitor at a pair, a JSON line each: what it saw on a drive, for whoever asks afterwards.
+"""The log of the monitor's checks of a pair, one JSON line each, so that people can see afterwards how a drive went.
 
-Only the newest are kept. Nothing is decided by them: a line that cannot be read is left out.
+Only the newest are kept. No decision depends on them, so a line that cannot be read is left out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from coec.schemas.replies import CheckReply
 
 
 class CheckLog:
-    """All that is kept, oldest first. Safe to use from several threads; only `flush` waits for the disk."""
+    """The checks, oldest first. Safe to use from several threads; only `flush` waits for the disk."""
 
     def __init__(self, path: Path, limit: int) -> None:
         """`path` holds the checks of earlier runs; the newest `limit` are kept."""
@@ -26,22 +26,22 @@ class CheckLog:
         self._load()
 
     def checks(self) -> tuple[CheckReply, ...]:
-        """All that are kept."""
+        """All checks that are kept."""
         return self._ledger.items()
 
     def on_disk(self) -> tuple[CheckReply, ...]:
-        """All that are on the disk."""
+        """All checks that are on the disk."""
         return self._ledger.on_disk()
 
     def append(self, check: CheckReply) -> None:
-        """Keep one more; on the disk with the next `flush`."""
+        """Appends a check; the next `flush` writes it."""
         self._ledger.add(lambda _: check)
 
     def flush(self) -> None:
-        """Put on the disk what is not there yet.
+        """Writes to the disk what is not there yet.
 
         Raises:
-            StateError: it is not possible; the next call tries again.
+            StateError: the disk refuses; the next call tries again.
         """
         try:
             self._ledger.flush()
@@ -51,7 +51,7 @@ class CheckLog:
     def _load(self) -> None:
         try:
             lines = self._ledger.load()
-        except OSError:  # then it begins anew
+        except OSError:  # then the log begins anew
             return
         for line in lines:
             with contextlib.suppress(ValidationError):

@@ -1,8 +1,8 @@
-"""The thread that decides about a pair: takes every answer, command and lapse of time, one after the other, and says
-what is served from then on.
+"""The thread that decides about a pair. It takes every answer, every command and the passing of time, one after the
+other, and determines what is served from then on.
 
-It alone changes what a pair has decided. Answers come through the mailbox and count in the order in which they were
-asked for (`queue`); what they change in the choice of further pairs goes to the stream as an effect.
+Only this thread changes the state of a pair. Answers come through the mailbox and count in the order in which their
+questions were asked (`queue`). What an answer changes in the choice of further pairs goes to the stream as an effect.
 """
 
 from __future__ import annotations
@@ -44,30 +44,31 @@ from coec.schemas.replies import CalibrationResult, CheckReply
 _log = logging.getLogger(__name__)
 
 EVENTS = (HealthState.SUSPECT, HealthState.DEGRADED, HealthState.MISCALIBRATED)
-"""States whose beginning is an event: a snippet of the seconds around it is recorded, if they are."""
+"""States whose beginning is an event. A snippet of the seconds around it is recorded, if snippets are wanted."""
 
 UNTOLD_S = 0.02
-"""Between two attempts to tell what the disk is about to take."""
+"""Time between two attempts to report a state that is about to reach the disk, s."""
 
 TICK_S = 1.0
-"""Longest time between two looks at the clocks; health is never older than that while the thread lives."""
+"""Longest time between two looks at the clocks, s. While the thread lives, health is never older than that."""
 
 
 class StreamSide(Protocol):
-    """The stream of the pair. What decisions change for the pairs to come is called on its thread."""
+    """The stream of the pair, as the decider uses it. `adopt`, `alarm`, `keep`, `calm` and `event` are called on the
+    stream's thread."""
 
     @property
     def report(self) -> StreamStatistics:
-        """What it last told of itself."""
+        """The stream's latest report."""
 
     def call(self, effect: Effect) -> None:
-        """Have an effect run on its thread."""
+        """Has an effect run on the stream's thread."""
 
     def adopt(self, served: Served) -> None:
         """Another extrinsic is served."""
 
     def alarm(self, since_ns: int) -> None:
-        """A window is wanted soon, of pairs since this sensor time."""
+        """A window of pairs since this sensor time is wanted soon."""
 
     def keep(self, kept: KeptPairs) -> None:
         """Pairs of a window belong to the next one."""
@@ -76,23 +77,24 @@ class StreamSide(Protocol):
         """There is no suspicion any more."""
 
     def event(self, name: str, T_camera_lidar: Matrix4) -> None:
-        """Something happened, while this extrinsic (4, 4) is served."""
+        """An event happened while this extrinsic (4, 4) is served."""
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """All that is known of a pair at one moment, for whoever tells it.
+    """Everything that is known of a pair at one moment, from which its answers are made.
 
     Attributes:
-        state: of the pair.
-        served: what is served.
-        check: the latest check of it.
-        troubles: what ails the service itself, or holds the extrinsic.
-        drift, result_drift: of what is served and of the latest result, from commissioned; None before commissioning.
+        state: state of the pair.
+        served: the extrinsic that is served.
+        check: the latest check of that extrinsic.
+        troubles: troubles of the service itself, or that the extrinsic is on hold.
+        drift, result_drift: drift of the served extrinsic and of the latest result from the commissioned one; None
+            before commissioning.
         since_ns: wall clock when the state of health began.
-        completed_stamp_ns, age_s: sensor time and age of the check that was completed last; None when not known.
-        checks, solved: how many were completed.
-        transitions: changes of health, by the state that was entered.
+        completed_stamp_ns, age_s: sensor time and age of the last completed check; None if unknown.
+        checks, solved: number of completed checks and of solved windows.
+        transitions: number of changes of health, by the state that was entered.
     """
 
     state: PairState
@@ -127,8 +129,8 @@ class Decider:
         calibrate_with: Callable[[CalibrationConfig], None],
         tell: Callable[[Known], None],
     ) -> None:
-        """`calibrate_with` says how windows that begin from now on are to be calibrated; `tell` hears what is known,
-        whenever something may have changed and once a second."""
+        """`calibrate_with` is called with the configuration for windows that begin from then on. `tell` is called with
+        what is known, whenever something may have changed and once a second."""
         self.thread = ServiceThread(f"decisions-{pair.name}", self._run)
         self._rules = Rules(pair.policy, pair.tracker, pair.monitor)
         self._stale_after_s = stale_after_s
@@ -154,7 +156,7 @@ class Decider:
         self._health = store.state.health
 
     def request_stop(self) -> None:
-        """Take what has come, and end the thread."""
+        """Has the thread take what has come, and end."""
         self.thread.request_stop()
         self._mailbox.wake()
 
@@ -186,13 +188,14 @@ class Decider:
         self.finish()
 
     def finish(self) -> None:
-        """Take what has come, and put the state on the disk; for the end of the service."""
+        """Takes what has come, and saves the state; for the end of the service."""
         while (item := self._mailbox.take(0.0)) is not None:
             item()
         self._store.save()
 
     def work(self, timeout_s: float) -> bool:
-        """Do the next piece of work, or look at the clocks when there is none for so long; whether there was one."""
+        """Does the next piece of work, or looks at the clocks if none comes for `timeout_s`. Returns whether there was
+        work."""
         item = self._mailbox.take(UNTOLD_S if self._untold else timeout_s)
         if item is not None:
             item()
@@ -203,32 +206,33 @@ class Decider:
         return item is not None
 
     def _note_event(self) -> None:
-        """What enters a state that is an event has the seconds around it kept; it changes no decision."""
+        """If the pair has just entered a state of `EVENTS`, has the stream keep the seconds around it. This changes no
+        decision."""
         before, state = self._health, self._store.state
         self._health = state.health
         if state.health is not before and state.health in EVENTS:
             self._stream.call(partial(self._stream.event, state.health.value, state.T_camera_lidar))
 
     def tell_now(self) -> None:
-        """Tell what is known, whatever waits."""
+        """Reports what is known, even if it is not on the disk yet."""
         self._untold = False
         self._tell(self.known())
 
     def look_at_clocks(self, monotonic_s: float) -> None:
-        """Give up what waits for too long, age what is known, tell it."""
+        """Gives up questions that have waited too long, ages the state, and reports it."""
         self._looked_s = monotonic_s
         lost = self._queue.expire(monotonic_s, self._lost_question)
         if lost:
             self._losses.add("monitor", "unanswered", lost)
         self._overdue = self._progress.overdue(self._stream.report, monotonic_s)
         self._store.age(self._overdue, self._progress.silent_s(monotonic_s), self._stale_after_s)
-        # What a restart would not know is not told, while the disk is only busy.
+        # As long as the disk is only busy, nothing is reported that a restart would not know.
         self._untold = not self._store.may_be_told()
         if not self._untold:
             self.tell_now()
 
     def use(self, pair: PairConfig, stale_after_s: float, told: str) -> None:
-        """Judge what comes by other settings from now on; `told` goes into the history."""
+        """Judges by other settings from now on; `told` is the entry for the history."""
         self._rules = Rules(pair.policy, pair.tracker, pair.monitor)
         self._stale_after_s = stale_after_s
         self._baseline.use(pair)
@@ -239,7 +243,8 @@ class Decider:
     # --- answers ----------------------------------------------------------------------------------------------------
 
     def checked(self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
-        """A check has ended; it was of the extrinsic of `epoch`, and some of its pairs were taken standing."""
+        """A check of the extrinsic of `epoch` has ended. `standing_ns`: stamps of its pairs that were taken while the
+        vehicle stood."""
         self._queue.answer(question, partial(self._take_check, question, epoch, standing_ns, outcome))
 
     def solved(self, window_id: str, outcome: JobOutcome, *, live: bool) -> None:
@@ -253,11 +258,11 @@ class Decider:
         if question is not None:
             self._queue.answer(question, take)
         elif (effect := take()) is not None:
-            # Nobody waits for it: a window that was asked for by command, or one of an earlier run.
+            # No question waits for this window: it was solved by command, or is of an earlier run.
             self._stream.call(effect)
 
     def lost(self, window_id: str) -> None:
-        """A window ended and came to nothing."""
+        """A window ended without being recorded."""
         question = self._queue.about(window_id)
         if question is not None:
             self._queue.answer(question, partial(self._take_failure, _NOT_RECORDED, True))
@@ -278,7 +283,7 @@ class Decider:
             self._stream.call(lambda: self._stream.alarm(since_ns))
 
     def replaced(self) -> None:
-        """A person has replaced the extrinsic: nothing that was seen is of it."""
+        """A person has replaced the extrinsic, so no earlier check is about the served one."""
         self._latest_check = None
         served = self._store.served
         self._rig.serves(None, self._store.state)
@@ -397,7 +402,7 @@ class Decider:
         return effect if kept is None or effect is None else partial(self._keep_and_go_on, kept, effect)
 
     def _calibrating_anew(self, effect: Effect | None) -> Effect:
-        """Windows that begin once this answer counts are calibrated in another way."""
+        """The effect, and with it another configuration for the windows that begin once this answer counts."""
         configuration = self._baseline.calibration
 
         def both() -> None:
@@ -408,7 +413,8 @@ class Decider:
         return both
 
     def _take_correction(self, question: Question, correction: Correction) -> Effect | None:
-        """Serve what all pairs of a sensor that moved are told at once, as far as the policy goes."""
+        """Serves the correction that the rig found for all pairs of a moved sensor together, as far as the policy
+        allows it."""
         state = self._store.state
         latest = state.latest
         estimate = latest if latest is not None and latest.verdict.decision is Decision.ACCEPTED else state.accepted
@@ -452,8 +458,8 @@ class Decider:
         epoch: int | None = None,
         by_check: bool = False,
     ) -> Effect | None:
-        """Take the step, the answer to a question, draw what a red event needs. What it changes for the pairs to come;
-        None when the step was meant for another extrinsic."""
+        """Takes a step, the answer to a question, and has the pictures of a red event drawn. Returns its effect on the
+        pairs to come; None if the step was meant for another extrinsic."""
         taken = self._store.update(step, stamp_ns, completed=completed, epoch=epoch)
         if taken is None:
             return None
@@ -469,7 +475,7 @@ class Decider:
         return partial(self._go_on_with, taken, by_check)
 
     def _add_window_after(self, result: CalibrationResult) -> None:
-        """The first window that began after a red event did is part of its evidence."""
+        """Adds a result to the evidence of a red event if it is the first window that began after the event began."""
         waiting, since_ns = self._store.incidents.awaiting, self._store.state.flagged_since_ns
         if waiting is None or start_ns_of(result.window_id) < (waiting.stamp_ns if since_ns is None else since_ns):
             return
@@ -485,8 +491,9 @@ class Decider:
         effect()
 
     def _go_on_with(self, taken: Taken, by_check: bool) -> None:
-        """What a step changes for the pairs to come: the extrinsic at which they are looked at, and how soon a window
-        is wanted: soon when the monitor's word has become worse, or a window did not settle it, or saw a knock."""
+        """The effect of a step on the pairs to come: the extrinsic at which they are looked at, and whether a window is
+        wanted soon. It is if the monitor's outcome has become worse, if a window did not settle the suspicion, or if
+        a window saw a knock."""
         self._stream.adopt(taken.served)
         before, after = taken.before, taken.after
         since_ns = lifecycle.window_wanted_since(after)
@@ -517,13 +524,12 @@ class Decider:
 
 
 def _due_ns(question: Question | None) -> int | None:
-    """Sensor time from which the answer to a question counts; None: whatever was not asked by a stream counts from
-    now on."""
+    """Sensor time from which the answer to a question counts; None: from now on, because no stream asked for it."""
     return None if question is None else question.due_ns
 
 
 HELD = "held"
-"""Code of the reason that ails nothing."""
+"""Code of the only reason in `troubles` that is no trouble: the extrinsic is on hold."""
 
 _NO_ANSWER = Reason("unanswered", "No answer came.")
 _NOT_RECORDED = Reason("not_recorded", "The window did not get to the disk.")

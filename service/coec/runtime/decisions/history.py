@@ -1,12 +1,13 @@
-"""The history of a pair, in three books with a quota each, so that none can push what another holds out of it.
+"""The history of a pair, in three books. Each has its own quota, so that none can push out what another holds.
 
-`results`: the estimate of each window, and the extrinsic that became served by it: all that a roll back and a
-commissioning need. `states`: changes of health, and what was found wrong with a book. `commands`: what people had done,
-the extrinsics that this put in place, and what comes of windows that are solved again, which is only done by command.
-Whoever floods the service with commands flushes this book.
+- `results`: the estimate of each window, and the extrinsic that was served because of it. That is all that a roll back
+  and a commissioning need.
+- `states`: changes of health, and damage that was found in a book.
+- `commands`: commands of people, the extrinsics that they put in place, and the outcomes of windows that are solved
+  again, which happens only by command. A flood of commands pushes out only entries of this book.
 
-Each book is a hash chain in a file of its own. The entries of all are numbered together, in the order in which they
-came.
+Each book is a hash chain in a file of its own. The entries of all books are numbered together, in the order in which
+they came.
 """
 
 from __future__ import annotations
@@ -22,24 +23,24 @@ from coec.runtime.decisions.chain import Chain, Kept
 from coec.schemas.replies import Book, CalibrationResult, HistoryEntry
 
 FILES: Final[Mapping[Book, str]] = {"results": "history", "states": "states", "commands": "commands"}
-"""First part of the name of the file of a book."""
+"""First part of the file name of each book."""
 
 
 class History:
-    """All that is kept of one pair. Safe to use from several threads.
+    """The three books of one pair. Safe to use from several threads.
 
-    Only `flush` waits for the disk, and nobody waits for it. Entries of a book go there in order: the chains on the
-    disk hold at any time.
+    Only `flush` waits for the disk, and no other call waits for `flush`. Entries of a book are written in order, so the
+    chains on the disk are sound at any time.
 
     Attributes:
-        damage: what was wrong with the chains that were found, one sentence; None when they held.
+        damage: what was wrong with the chains on the disk at the start, one sentence; None if they were sound.
     """
 
     def __init__(self, folder: Path, pair: str, limit: int, heads: Mapping[str, str]) -> None:
         """
         Args:
-            limit: entries kept in each book, the newest.
-            heads: the `durable_heads` that the state file knows of: the chains must reach them, or were cut off.
+            limit: how many entries, the newest, are kept in each book.
+            heads: the `durable_heads` in the state file; a chain that does not reach its head was cut off.
         """
         self._lock = threading.Lock()
         self._books = {
@@ -51,17 +52,17 @@ class History:
 
     @property
     def durable_heads(self) -> dict[str, str]:
-        """Of each book that has one, the newest entry that is on the disk. These, and nothing newer, are for the state
-        file to remember."""
+        """The newest entry on the disk of each book that has one. The state file may remember these and nothing
+        newer."""
         heads = ((book, chain.durable_head) for book, chain in self._books.items())
         return {book: head for book, head in heads if head is not None}
 
     def entries(self) -> tuple[Kept, ...]:
-        """All that are kept, oldest first."""
+        """All entries that are kept, oldest first."""
         return _in_order(chain.entries() for chain in self._books.values())
 
     def on_disk(self) -> tuple[Kept, ...]:
-        """All that are on the disk, oldest first."""
+        """All entries that are on the disk, oldest first."""
         return _in_order(chain.on_disk() for chain in self._books.values())
 
     def results(self) -> tuple[CalibrationResult, ...]:
@@ -69,17 +70,17 @@ class History:
         return tuple(kept.result for kept in self.entries() if kept.result is not None)
 
     def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
-        """Keep one more, in its book; its place is filled in. On the disk with the next `flush`."""
+        """Appends an entry to its book and fills in its place. The next `flush` writes it."""
         with self._lock:
             book = self._book_of(entry)
             number, self._next = self._next, self._next + 1
             return self._books[book].append(entry.model_copy(update={"sequence": number, "book": book}), result)
 
     def flush(self) -> None:
-        """Put on the disk what is not there yet.
+        """Writes to the disk what is not there yet.
 
         Raises:
-            StateError: it is not possible; the next call tries again.
+            StateError: the disk refuses; the next call tries again.
         """
         failed = []
         for chain in self._books.values():
@@ -102,7 +103,7 @@ class History:
                 return "commands"
 
     def _is_in_results(self, entry: HistoryEntry) -> bool:
-        """Whether the window of an entry has one of its kind there already."""
+        """Whether the book `results` already holds an entry of this kind for the same window."""
         kept = (kept.entry for kept in self._books["results"].entries())
         return any((one.kind, one.window_id) == (entry.kind, entry.window_id) for one in kept)
 

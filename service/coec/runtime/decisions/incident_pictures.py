@@ -1,5 +1,5 @@
-"""Pictures for the evidence of a red event: the windows before and after it, each at what was served and at what is
-true since."""
+"""Pictures for the evidence of a red event: the windows before and after it, each drawn at the extrinsic that was
+served and at the one that holds since."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coec.runtime.worker.jobs import Drawn, JobOutcome
 from coec.schemas.replies import EvidenceEvent
 
 SERVED = "what was served when it turned red"
-"""What the first extrinsic is called."""
+"""Caption of the first extrinsic."""
 
 
 class IncidentPictures:
@@ -36,15 +36,16 @@ class IncidentPictures:
         self._losses = losses
 
     def draw(self, event: EvidenceEvent) -> None:
-        """The window before it, at what was served when it began: all that is known then."""
+        """Draws the window before the event at the extrinsic that was served when the event began. Nothing else is
+        known at that time."""
         if event.window_before is not None:
             pose, title = matrix_of(event.camera_from_lidar), f"{event.window_before}  at {SERVED}"
             done = partial(self._drawn, event.event_id, "before")
             self._questions.overlay(self._folder.path(event.window_before), pose, title, done)
 
     def compare(self, event: EvidenceEvent, found: Matrix4, decision: str) -> None:
-        """The windows before and after it, each at what was served and at what the window after it tells, (4, 4): the
-        one fits what was seen before, and the other what is seen since."""
+        """Draws the windows before and after the event, each at the served extrinsic and at `found` (4, 4), the result
+        of the window after it. The first one fits the images before the event, the second one those after it."""
         poses = (matrix_of(event.camera_from_lidar), found)
         names = (SERVED, f"told by the window after it ({decision})")
         sides: tuple[tuple[Side, str | None], ...] = (("before", event.window_before), ("after", event.window_after))

@@ -1,7 +1,7 @@
-"""What is kept of every red event: the windows before and after it, pictures, the figures around it, the decision.
+"""The evidence of every red event: the windows before and after it, pictures, the figures around it, the decision.
 
-One folder per event: `event.json` and the pictures. The windows themselves stay in the window folder, which is told not
-to remove them. Bounded: the oldest event goes when there are too many, and its windows are ordinary ones again.
+Each event has a folder with `event.json` and the pictures. The windows themselves stay in the window folder, where they
+are protected from removal. If there are too many events, the oldest is dropped, and its windows lose that protection.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import EvidenceEvent, MetricsPoint
 
 POINTS_KEPT = 240
-"""Checks of the monitor whose figures are remembered: 20 minutes at one in 5 s."""
+"""How many checks' figures are remembered: 20 minutes at one check in 5 s."""
 
 POINTS_AFTER = 60
-"""Checks after the beginning of an event that are added to it: five minutes."""
+"""How many checks after the beginning of an event are added to it: five minutes."""
 
 EVENT = "event.json"
-"""In the folder of each event."""
+"""Name of the file in each event's folder that describes the event."""
 
 NO_EVENT = "no such event is kept; the list is in `evidence`"
 
@@ -32,8 +32,8 @@ Side = Literal["before", "after"]
 
 
 class Incidents:
-    """Red events of one pair. Safe to use from several threads; only `flush` waits for the disk, and what it could not
-    write is in memory until it can."""
+    """Red events of one pair. Safe to use from several threads. Only `flush` waits for the disk; what it cannot write
+    stays in memory until it can."""
 
     def __init__(self, folder: Path, pair: str, limit: int) -> None:
         self._folder = folder
@@ -43,7 +43,7 @@ class Incidents:
         self._writing = threading.Lock()
         self._points: deque[MetricsPoint] = deque(maxlen=POINTS_KEPT)
         self._events: dict[str, EvidenceEvent] = {}
-        # What is on the disk, what is not yet, and what is still there.
+        # Events as they are on the disk; events and pictures not yet written; dropped events not yet removed.
         self._on_disk: dict[str, EvidenceEvent] = {}
         self._unsaved: set[str] = set()
         self._pictures: dict[tuple[str, Side], bytes] = {}
@@ -53,26 +53,26 @@ class Incidents:
 
     @property
     def window_ids(self) -> frozenset[str]:
-        """Windows that must stay."""
+        """Windows that are evidence and must not be removed."""
         with self._lock:
             both = ((event.window_before, event.window_after) for event in self._events.values())
             return frozenset(window_id for pair in both for window_id in pair if window_id is not None)
 
     @property
     def newest(self) -> EvidenceEvent | None:
-        """The newest event; None when there is none."""
+        """The newest event; None if there is none."""
         with self._lock:
             return next(reversed(self._events.values()), None)
 
     @property
     def awaiting(self) -> EvidenceEvent | None:
-        """The event that has no window after it yet."""
+        """The newest event if it has no window after it yet; else None."""
         with self._lock:
             newest = self.newest
             return newest if newest is not None and newest.window_after is None else None
 
     def note(self, point: MetricsPoint) -> None:
-        """Figures of one check."""
+        """Takes in the figures of one check."""
         with self._lock:
             self._points.append(point)
             newest = self.newest
@@ -90,7 +90,7 @@ class Incidents:
             return begun
 
     def add_window_after(self, window_id: str) -> EvidenceEvent | None:
-        """The first window after the newest event; None when no event waits for one."""
+        """Adds the first window after the newest event, and returns the event; None if no event waits for one."""
         with self._lock:
             event = self.awaiting
             if event is None:
@@ -98,7 +98,7 @@ class Incidents:
             return self._keep(event.model_copy(update={"window_after": window_id}))
 
     def add_overlay(self, event_id: str, side: Side, jpeg: bytes) -> None:
-        """A picture of one of the windows; it takes the place of an earlier one."""
+        """Adds a picture of one of the windows; it replaces an earlier one."""
         with self._lock:
             event = self._events.get(event_id)
             if event is None:
@@ -115,12 +115,12 @@ class Incidents:
                 self._keep(newest.model_copy(update={"resolved_stamp_ns": stamp_ns, "resolution": text}))
 
     def events(self) -> tuple[EvidenceEvent, ...]:
-        """All that are kept, with their figures."""
+        """All events that are kept, with their figures."""
         with self._lock:
             return tuple(self._events.values())
 
     def on_disk(self) -> tuple[EvidenceEvent, ...]:
-        """All that are on the disk, as they are there."""
+        """All events that are on the disk, as they are there."""
         with self._lock:
             return tuple(self._on_disk.values())
 
@@ -142,7 +142,8 @@ class Incidents:
             raise NotFoundError(f"the event has no picture of the window {side} it") from error
 
     def _load(self) -> None:
-        """Events of earlier runs. A folder without its event was about to be filled or removed when the power went."""
+        """Loads events of earlier runs. A folder without its event file is removed: the power failed while the folder
+        was being filled or removed."""
         folders = [path for path in self._folder.glob(f"{self._pair}-*") if _is_event_of(self._pair, path.name)]
         for folder in sorted(folders, key=lambda path: _stamp(path.name)):
             with contextlib.suppress(OSError, DecodeError):
@@ -171,11 +172,11 @@ class Incidents:
         return event
 
     def flush(self) -> None:
-        """Put on the disk what is not there yet: pictures before the events that name them; and remove what is kept no
-        more.
+        """Writes to the disk what is not there yet, pictures before the events that name them; and removes dropped
+        events.
 
         Raises:
-            StateError: it is not possible; the next call tries again.
+            StateError: the disk refuses; the next call tries again.
         """
         with self._writing:
             with self._lock:

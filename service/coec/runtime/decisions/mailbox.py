@@ -1,4 +1,4 @@
-"""What other threads hand to the one that decides about a pair."""
+"""The queue of work that other threads hand to the thread that decides about a pair."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from coec.runtime.handover import BusyError, Handover
 T = TypeVar("T")
 
 COMMANDS_WAITING = 16
-"""Commands of people that may wait; more is a flood, and each is answered `busy`. Answers to questions have no bound of
-their own: there are no more of them than questions, which the worker's queue bounds."""
+"""How many commands of people may wait; every further one is answered `busy`. Answers to questions need no bound here,
+because the worker's queue bounds the questions."""
 
 
 class Mailbox:
-    """First in, first out. Any thread posts and asks, one takes."""
+    """A queue, first in, first out. Any thread posts and asks, one takes."""
 
     def __init__(self) -> None:
         self._items: deque[Callable[[], object]] = deque()
@@ -25,16 +25,17 @@ class Mailbox:
         self._condition = threading.Condition()
 
     def post(self, work: Callable[[], object]) -> None:
-        """Have `work` done; never waits."""
+        """Has `work` done; never waits."""
         with self._condition:
             self._items.append(work)
             self._condition.notify()
 
     def ask(self, work: Callable[[], T], timeout_s: float) -> T:
-        """Have `work` done and wait for what it returns; what it raises is raised here.
+        """Has `work` done and waits for what it returns; an exception of the work is raised here.
 
         Raises:
-            BusyError: too many wait, or it was not begun within `timeout_s`: nothing was done.
+            BusyError: too many commands wait, or the work was not begun within `timeout_s`, and nothing was done; or it
+                has not ended.
         """
         handed = Handover(work)
         with self._condition:
@@ -55,7 +56,7 @@ class Mailbox:
             self._condition.notify()
 
     def take(self, timeout_s: float) -> Callable[[], object] | None:
-        """The next piece of work; None when nothing came within `timeout_s` or on `wake`."""
+        """The next piece of work; None if nothing came within `timeout_s`, or after `wake`."""
         with self._condition:
             if not self._items:
                 self._condition.wait(timeout_s)

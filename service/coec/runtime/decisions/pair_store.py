@@ -1,8 +1,9 @@
-"""The books of a pair: its state, its history, its incidents, and when a check of it was last completed.
+"""The books of a pair: its state, its history, its incidents, and when a check was last completed.
 
-Every change of the state passes through `update`, which works out from the state before and after what has to be
-written down: a line of the history for every extrinsic and every state of health, evidence for every red one. Then it
-is all put on the disk. One thread changes it, the one that decides about the pair; what others read is immutable.
+Every change of the state passes through `update`. It compares the states before and after, and writes down what has
+changed: a line of the history for every new extrinsic and every new state of health, and evidence for every red one.
+Then all books are put on the disk. Only the thread that decides about the pair changes them; what others read is
+immutable.
 """
 
 from __future__ import annotations
@@ -50,18 +51,18 @@ _log = logging.getLogger(__name__)
 EntryKind = Literal["estimate", "extrinsic", "state", "command", "commissioned", "chain"]
 
 MIN_HASH = 8
-"""Characters of a hash that name a line of the history."""
+"""At least so many characters of a hash name a line of the history."""
 
 WORDS = {
     HealthState.HEALTHY: "What is served has been looked at and agrees with the data.",
     HealthState.UNKNOWN: "What is served has not been looked at.",
 }
-"""Where a state comes without reasons."""
+"""Text for a state of health that comes without reasons."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Taken:
-    """A step: the states before and after it, and what is served after it."""
+    """A step that was taken: the states before and after it, and what is served after it."""
 
     before: PairState
     after: PairState
@@ -78,7 +79,7 @@ class Books:
 
     @property
     def results(self) -> tuple[CalibrationResult, ...]:
-        """Of windows."""
+        """Results of windows."""
         return tuple(kept.result for kept in self.entries if kept.result is not None)
 
 
@@ -86,9 +87,9 @@ class PairStore:
     """Keeps the books of one pair.
 
     Attributes:
-        history, incidents: what is kept.
-        damage: why what was found on the disk could not all be used; None when it could.
-        transitions: changes of health, by the state that was entered.
+        history, incidents: the books themselves.
+        damage: why a part of what was found on the disk could not be used; None if all could.
+        transitions: number of changes of health, by the state that was entered.
     """
 
     def __init__(
@@ -144,8 +145,8 @@ class PairStore:
 
     @property
     def kept(self) -> KeptPairs | None:
-        """Pairs of the latest window that belong to the next one: the camera moved before they were taken, and no
-        window has been recorded since."""
+        """Pairs of the latest window that belong to the next one, because the camera moved before they were taken. None
+        if there are none, or a window has been recorded since."""
         latest = self._state.latest
         recorded = self._folder.windows(self._rig.pair)
         if latest is None or not recorded or recorded[-1].stem != latest.window_id:
@@ -159,12 +160,12 @@ class PairStore:
 
     @property
     def completed_stamp_ns(self) -> int | None:
-        """Sensor time of the last pair of the check, or accepted window, that was completed last."""
+        """Sensor time of the last pair of the check, or the accepted window, that was completed last."""
         return self._completed_stamp_ns
 
     @property
     def age_s(self) -> float | None:
-        """Since a check was last completed, or a window accepted; None when that is not known."""
+        """Time since a check was last completed or a window accepted, s; None if unknown."""
         return None if self._completed_s is None else time.monotonic() - self._completed_s
 
     def update(
@@ -175,14 +176,14 @@ class PairStore:
         completed: bool,
         epoch: int | None = None,
     ) -> Taken | None:
-        """Take a step. None when the extrinsic has changed since `epoch`.
+        """Takes a step. Returns None, and does nothing, if the extrinsic has changed since `epoch`.
 
         Args:
-            stamp_ns: sensor time of the data behind it.
+            stamp_ns: sensor time of the data behind the step.
             completed: whether a check was completed or a window accepted, so that the age begins anew.
 
         Raises:
-            CommandRefusedError: as `step` does; nothing has changed then.
+            CommandRefusedError: raised by `step`; nothing has changed then.
         """
         if epoch is not None and epoch != self._epoch:
             return None
@@ -213,8 +214,8 @@ class PairStore:
         self._scribe.write(self._checks, self.incidents)
 
     def told(self) -> Books:
-        """What may be told: what a restart knows as well, unless the disk has refused it for so long that `health` says
-        so."""
+        """The books that may be reported: only what is on the disk, so that a restart would know it, too. If the disk
+        has refused for so long that `health` reports it, everything."""
         if self._scribe.trouble is None:
             return Books(self.history.on_disk(), self._checks.on_disk(), self.incidents.on_disk())
         return Books(self.history.entries(), self._checks.checks(), self.incidents.events())
@@ -222,8 +223,8 @@ class PairStore:
     def note_command(
         self, name: str, code: str, text: str, sender: str, *, accepted: bool, reason: str | None = None
     ) -> None:
-        """A command was carried out or refused, for which its sender gave a reason, or none. Of equal refusals in a row
-        only the first is written down."""
+        """Writes down that a command was carried out or refused, with the `reason` that its sender gave, if any. Of
+        equal refusals in a row only the first is written down."""
         last = next(reversed(self.history.entries()), None)
         told = f"{name}: {text}"
         if not accepted and last is not None:
@@ -239,14 +240,15 @@ class PairStore:
         self.protect()
 
     def served_before(self, name: str | None) -> tuple[Kept, CalibrationResult]:
-        """A calibration that was served, as the history holds it, and the accepted result that it rested on.
+        """A calibration that was served, as the history holds it, and the accepted result on which it rested.
 
         Args:
-            name: id of an accepted window, or the beginning of the sha256 of its line or of that of an extrinsic: what
-                was served once that was known. None for the calibration before the one that is served now.
+            name: id of an accepted window, or the beginning of the sha256 of its line or of an extrinsic's line. It
+                names the calibration that was served once that line was known. None: the calibration before the one
+                that is served now.
 
         Raises:
-            NotFoundError: there is none of this name, or the name is ambiguous.
+            NotFoundError: no calibration has this name, or the name is ambiguous.
         """
         served = transform_of(self._state.T_camera_lidar).matrix
         results: dict[str, CalibrationResult] = {}
@@ -276,7 +278,7 @@ class PairStore:
         return line, results[str(line.entry.window_id)]
 
     def save(self) -> None:
-        """Have all books put on the disk: those of the history before the state, which names their ends."""
+        """Has all books put on the disk: those of the history before the state, because the state names their ends."""
         age_s = self.age_s
         completed_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
         clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
@@ -293,7 +295,8 @@ class PairStore:
         return self._scribe.has_written() or self._scribe.trouble is not None
 
     def age(self, why_overdue: Reason | None, silent_s: float, stale_after_s: float) -> None:
-        """Time has passed: no check has been completed in time, for a reason, or for `silent_s` at all."""
+        """Time has passed: ages the state. `why_overdue` says why no check was completed in time (None: one was);
+        `silent_s` is the time since the last completed check."""
 
         def passed(state: PairState) -> PairState:
             late = state if why_overdue is None else overdue(state, why_overdue)
@@ -322,7 +325,7 @@ class PairStore:
         now_ns = time.time_ns()
         if clocks.since_wall_ns is not None and clocks.since_wall_ns <= now_ns:
             self._since_ns = clocks.since_wall_ns
-        # A clock that was set back since, or has not been set yet, does not tell how old that is.
+        # A clock that was set back since, or has not been set yet, cannot say how old the check is.
         if clocks.completed_wall_ns is not None and clocks.completed_wall_ns <= now_ns:
             self._completed_s = time.monotonic() - (now_ns - clocks.completed_wall_ns) / NS_PER_S
             self._completed_stamp_ns = clocks.completed_stamp_ns
@@ -354,7 +357,7 @@ class PairStore:
         at_ns = stamp_ns if stamp_ns is not None else time.time_ns()
         since_ns = state.flagged_since_ns if state.flagged_since_ns is not None else at_ns
         by_window = state.pending is not None and state.latest is state.pending.estimate
-        # What contradicts is not what came before.
+        # The window that contradicts the served extrinsic cannot be the window before the event.
         deciding = state.latest.window_id if by_window and state.latest else None
         earlier = [
             result.window_id
@@ -385,12 +388,13 @@ class PairStore:
         self._scribe.write(self.incidents)
 
     def note_window(self, window_id: str, version: WindowVersion) -> None:
-        """The file of a window was written again: this is what it was then."""
+        """Notes the new version of a window's file after it was written again."""
         self._folder.note(window_id, version)
         self._scribe.write(self._folder)
 
     def protect(self) -> None:
-        """Tell the window folder which windows are evidence, and from which the rig was commissioned."""
+        """Protects in the window folder the windows that are evidence, and those from which the rig was
+        commissioned."""
         kept: dict[str, KeptFor] = dict.fromkeys(self._commissioned_from, "commissioning")
         kept |= dict.fromkeys(self.incidents.window_ids, "red_event")
         self._folder.protect(self._rig.pair, kept)

@@ -1,7 +1,7 @@
-"""Proof of progress: when a check was last completed, on both clocks, and why none has been since.
+"""Proof of progress: when a check was last completed, on both clocks, and why none has been completed since.
 
-Health is green because something was looked at, never because nobody complained. Whatever fault keeps checks from being
-completed, known or not, is seen here as the same thing: none comes.
+Health is green only because something was checked, never because no fault was reported. Any fault that keeps checks
+from being completed, known or not, shows here in the same way: no completed check comes.
 """
 
 from __future__ import annotations
@@ -18,49 +18,49 @@ from coec.runtime.worker.jobs import Fate
 from coec.runtime.worker.queue import BUSY, SUPERSEDED, WORKER_FAILED
 
 PERIODS = 3
-"""Periods of the monitor without a completed check after which a pair is not green any more (ARCHITECTURE)."""
+"""After so many periods of the monitor without a completed check a pair is not green any more (ARCHITECTURE)."""
 
 SLOWEST_PACE = 0.1
-"""Of a replay, in seconds of sensor time a second: a slower one counts as standing still."""
+"""Slowest replay, in seconds of sensor time per second. A slower one counts as standing still."""
 
 IN_VAIN = 3
-"""Checks, or windows, in a row that came to nothing, from which on health says so."""
+"""After so many failed checks, or failed windows, in a row health reports it."""
 
 DEPTH_CODES = frozenset({ModelError.reply_code})
-"""Codes of failures that are the depth network's."""
+"""Codes of failures of the depth network."""
 
 WORKER_CODES = frozenset(
     {WORKER_FAILED, SUPERSEDED.code, BUSY.code, Fate.LATE.value, "internal_error", "unsendable", "unanswered"}
 )
-"""Codes of failures that are the worker's, or those of the way there and back."""
+"""Codes of failures of the worker, or on the way to it and back."""
 
 
 class Attempts:
-    """A kind of attempt, and how many of them came to nothing one after the other: whoever cannot look must not go on
-    saying that all is well. Belongs to the thread that decides."""
+    """Counts how many attempts of one kind have failed in a row, because a service that cannot look must not go on
+    reporting that all is well. Belongs to the thread that decides."""
 
     def __init__(self, what: str, code: str) -> None:
-        """`what` in the plural; `code` of the trouble."""
+        """`what`: name of the attempts, in the plural. `code`: code of the trouble."""
         self._what = what
         self._code = code
         self._in_vain = 0
         self.trouble: Reason | None = None
 
     def failed(self, reason: Reason) -> None:
-        """One came to nothing."""
+        """An attempt has failed."""
         self._in_vain += 1
         if self._in_vain >= IN_VAIN:
             text = f"The last {self._in_vain} {self._what} came to nothing. {reason.text}"
             self.trouble = Reason(self._code, text)
 
     def succeeded(self) -> None:
-        """One came to something."""
+        """An attempt has succeeded."""
         self._in_vain, self.trouble = 0, None
 
 
 @dataclass(slots=True)
 class _Last:
-    """The last completed check: steady clock, sensor time, and what the streams had brought by then."""
+    """The last completed check: steady clock, sensor time, and the report of the streams at that time."""
 
     monotonic_s: float
     stamp_ns: int | None
@@ -68,7 +68,7 @@ class _Last:
 
 
 class Progress:
-    """Of the checks of one pair. Belongs to the thread that decides."""
+    """Progress of the checks of one pair. Belongs to the thread that decides."""
 
     def __init__(self, period_s: float, monotonic_s: float, report: StreamStatistics) -> None:
         self._period_s = period_s
@@ -76,32 +76,32 @@ class Progress:
         self._failure: Reason | None = None
 
     def completed(self, stamp_ns: int | None, monotonic_s: float, report: StreamStatistics) -> None:
-        """A check was completed, of pairs up to this sensor time; or a window, which is more."""
+        """A check of pairs up to this sensor time was completed; or a window, which says even more."""
         self._last = _Last(monotonic_s, stamp_ns, report)
         self._failure = None
 
     def failed(self, reason: Reason) -> None:
-        """A check came to nothing."""
+        """A check has failed."""
         self._failure = reason
 
     def time_stepped_back(self) -> None:
-        """Stamps of before tell nothing any more."""
+        """Sensor time has stepped back, so earlier stamps say nothing any more."""
         self._last.stamp_ns = None
 
     def silent_s(self, monotonic_s: float) -> float:
-        """Since the last completed check, or the start."""
+        """Time since the last completed check, or since the start, s."""
         return monotonic_s - self._last.monotonic_s
 
     def overdue(self, report: StreamStatistics, monotonic_s: float) -> Reason | None:
-        """Why no check was completed for `PERIODS` periods, on the steady clock or on that of the sensors; None while
-        there was one. A replay that is slower than the drive has as much longer."""
+        """Why no check was completed for `PERIODS` periods, by the steady clock or by sensor time; None if one was. For
+        a replay that is slower than the drive the limit is longer in proportion."""
         pace = 1.0 if report.pace is None else min(max(report.pace, SLOWEST_PACE), 1.0)
         silent_s = self.silent_s(monotonic_s)
         unseen_s = 0.0
         if self._last.stamp_ns is not None and report.chosen.last_ns is not None:
             unseen_s = (report.chosen.last_ns - self._last.stamp_ns) / NS_PER_S
         late = silent_s > PERIODS * self._period_s / pace
-        # By so much the stream may run ahead of an answer.
+        # The stream may run ahead of an answer by `ANSWER_PERIODS`.
         late |= unseen_s > (PERIODS + ANSWER_PERIODS) * self._period_s
         if not late:
             return None
@@ -109,7 +109,7 @@ class Progress:
         return Reason(f"overdue_{code}", f"No check has been completed for {max(silent_s, unseen_s):.0f} s: {why}")
 
     def _cause(self, now: StreamStatistics) -> tuple[str, str]:
-        """What has stood still since the last completed check, first in the order of a frame's way."""
+        """What has stood still since the last completed check: the first such stage on a frame's way."""
         then = self._last.report
         for stream in (CAMERA, LIDAR):
             before, after = then.streams.get(stream), now.streams.get(stream)

@@ -1,4 +1,4 @@
-"""What the stream of a pair asks, on its way to the worker and back to the thread that decides."""
+"""Passes the questions of a pair's stream to the worker, and the answers to the thread that decides."""
 
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ from coec.runtime.worker.supervisor import Worker
 _log = logging.getLogger(__name__)
 
 ANSWER_PERIODS = 1
-"""Periods of the monitor after which the answer to a check or a window counts in the choice of further pairs: more than
-either takes at 5 s. Where it takes longer, the stream waits, and its pairs are held."""
+"""After so many periods of the monitor the answer to a check or a window counts in the choice of further pairs. At 5 s
+this is longer than either takes. If an answer takes longer, the stream waits, and its pairs are held."""
 
 GRACE_S = 30.0
-"""Beyond the deadline that the worker keeps: how long an answer may take from there to here, and a window to the disk,
-before it is given up as lost."""
+"""Time beyond the worker's deadline, s, for an answer to get from there to here, and for a window to get to the disk.
+After that it is given up as lost."""
 
 
 class Decides(Protocol):
     """Who takes the answers, on the thread that decides about the pair; see `runtime.decisions.decider`."""
 
     def checked(self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
-        """A check has ended; it was of the extrinsic of `epoch`, and some of its pairs were taken standing."""
+        """A check of the extrinsic of `epoch` has ended. `standing_ns`: stamps of its pairs that were taken while the
+        vehicle stood."""
 
     def solved(self, window_id: str, outcome: JobOutcome, *, live: bool) -> None:
         """The solve of a window has ended."""
 
     def lost(self, window_id: str) -> None:
-        """A window ended and came to nothing."""
+        """A window ended without being recorded."""
 
     def corrected(self, question: Question, correction: Correction) -> None:
         """The rig has a correction for the pair."""
@@ -54,7 +55,7 @@ class Decides(Protocol):
 
 
 class Questions:
-    """Asks for one pair: for its stream (`ingest.chooser.Asks`) and for its recorder. Any thread."""
+    """Asks questions about one pair, for its stream (`ingest.chooser.Asks`) and its recorder. For any thread."""
 
     def __init__(
         self,
@@ -67,7 +68,8 @@ class Questions:
         rig: PairOfRig,
         show: Callable[[PairConfig, FramePair, Matrix4], None],
     ) -> None:
-        """`show(pair, drawn, pose)` is told of a pair of every check, and of the extrinsic (4, 4) that is checked."""
+        """`show(pair, drawn, pose)` is called for every check with one of its pairs of frames, and with the extrinsic
+        (4, 4) that is checked."""
         self._pair = pair
         self._show = show
         self._windows = windows
@@ -81,39 +83,39 @@ class Questions:
         self._decides: Decides
 
     def answer_to(self, decides: Decides) -> None:
-        """Who takes the answers; to be called once, before anything is asked."""
+        """Sets who takes the answers; called once, before anything is asked."""
         self._decides = decides
 
     def use(self, pair: PairConfig) -> None:
-        """Ask by these settings from now on. The period of the monitor is that of the start: other questions are
-        waiting by it."""
+        """Asks by these settings from now on. The period of the monitor stays that of the start, because the due times
+        of waiting questions were set by it."""
         self._pair = pair
 
     # --- for the stream ---------------------------------------------------------------------------------------------
 
     def affords(self, stamp_ns: int, *, suspected: bool) -> bool:
-        """Whether a check may be asked for at a sensor time; it has to be asked for then. What is `suspected` comes
-        before what is not."""
+        """Whether the budget allows a check at a sensor time. If it does, the caller must ask for that check. Checks of
+        `suspected` pairs come first."""
         return self._budget.affords(self._pair.name, stamp_ns, suspected=suspected)
 
     @property
     def stretch(self) -> float:
-        """By how much slices are to be longer than configured, at least 1."""
+        """Factor by which slices are to be longer than configured, at least 1."""
         return self._budget.stretch
 
     def window_wanted(self, stamp_ns: int) -> int | None:
-        """Since which sensor time the rig wants pairs for a window, before a pair of this stamp; told once. None: it
-        wants none, or one of since then is on its way, or known."""
+        """Sensor time since which the rig wants pairs for a window, asked before a pair of this stamp; returned once.
+        None: it wants no window, or one that began after that time is on its way or known."""
         since_ns = self._rig.window_wanted(stamp_ns)
         return None if since_ns is None or since_ns <= self._latest_window_ns else since_ns
 
     def window_turn_s(self, stamp_ns: int) -> float:
-        """How much later than at once a window that the rig wants may end, s, so that the budget pays for those before
-        it. It is then taken to be on its way."""
+        """By how much the end of a window that the rig wants may be delayed, s, so that the budget can pay for the
+        windows before it. The window then counts as being on its way."""
         return self._budget.window_turn_s(self._pair.name, stamp_ns)
 
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
-        """Is `served` right, by these pairs? Asked at a sensor time, once it is known to be afforded."""
+        """Asks at a sensor time whether `served` is right according to these pairs. Only after `affords`."""
         standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
         question = self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.CHECK))
         post = self._post(partial(self._decides.checked, question, served.epoch, standing))
@@ -127,22 +129,22 @@ class Questions:
         self._show(pair, pairs[-1], served.T_camera_lidar)
 
     def window(self, window_id: str, stamp_ns: int) -> int:
-        """What does a window say that ends at a sensor time? It is on its way to the disk. From when on its answer
-        counts, sensor time."""
+        """Asks for the result of a window that ends at a sensor time and is on its way to the disk. Returns from which
+        sensor time the answer counts."""
         self._latest_window_ns = start_ns_of(window_id)
         return self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.SOLVE), window_id).due_ns
 
     def prefetch(self, frame: bytes) -> None:
-        """The depth of a camera frame (native msgpack) will be needed."""
+        """Announces that the depth of a camera frame (native msgpack) will be needed."""
         self._worker.prefetch(self._pair.name, frame)
 
     @property
     def unanswered(self) -> int:
-        """Checks and windows whose answer has not come."""
+        """Number of checks and windows whose answer has not come."""
         return self._queue.unanswered
 
     def waits(self, stamp_ns: int) -> bool:
-        """Whether an answer is due before a pair of this stamp, and has not come; of the worker, or of the rig."""
+        """Whether an answer of the worker or of the rig is due before a pair of this stamp and has not come."""
         waits = self._queue.waits(stamp_ns)
         if self._rig.must_wait(stamp_ns, for_own=waits) or waits:
             return True
@@ -153,11 +155,12 @@ class Questions:
         return bool(corrections) and self._queue.waits(stamp_ns)
 
     def settle(self, stamp_ns: int) -> None:
-        """Let the answers take effect that are due before a pair of this stamp."""
+        """Lets the answers take effect that are due before a pair of this stamp."""
         self._queue.settle(stamp_ns)
 
     def bring_forward(self, stamp_ns: int) -> None:
-        """Whatever waits is due before a pair of this stamp: the first of a new time."""
+        """Makes all outstanding answers due before a pair of this stamp, which is the first after a step back of sensor
+        time."""
         self._queue.bring_forward(stamp_ns)
 
     def time_stepped_back(self, stamp_ns: int) -> None:
@@ -169,7 +172,7 @@ class Questions:
     # --- for the recorder, and for whoever wants a window solved again -----------------------------------------------
 
     def solve(self, window_id: str, path: Path, live: bool) -> None:
-        """A window is on the disk. `live` is False for one of an earlier run."""
+        """Has a window on the disk solved. `live` is False for a window of an earlier run."""
         post = self._post(partial(self._decides.solved, window_id, live=live))
 
         def done(outcome: JobOutcome) -> None:
@@ -180,23 +183,23 @@ class Questions:
         self._worker.ask(jobs.solve(self._pair.name, path, window_id, done, live))
 
     def lost(self, window_id: str) -> None:
-        """A window ended and came to nothing."""
+        """A window ended without being recorded."""
         self._mailbox.post(partial(self._decides.lost, window_id))
 
     # --- for the decider --------------------------------------------------------------------------------------------
 
     def overlay(self, path: Path, pose: Matrix4, title: str, done: Callable[[JobOutcome], None]) -> None:
-        """Draw a window at an extrinsic (4, 4)."""
+        """Has a window drawn at an extrinsic (4, 4)."""
         self._worker.ask(jobs.overlay(self._pair.name, path, pose, title, self._post(done)))
 
     def comparison(
         self, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Callable[[JobOutcome], None]
     ) -> None:
-        """Draw a window at two extrinsics (4, 4) that are called so."""
+        """Has a window drawn at two extrinsics (4, 4); `names` are their captions."""
         self._worker.ask(jobs.comparison(self._pair.name, path, poses, names, self._post(done)))
 
     def commission(self, pose: Matrix4, paths: list[Path], done: Callable[[JobOutcome], None]) -> None:
-        """Learn the baseline of the rig at an extrinsic (4, 4) from windows."""
+        """Has the baseline of the rig learned at an extrinsic (4, 4) from windows."""
         self._worker.ask(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, self._post(done)))
 
     def _post(self, ended: Callable[[JobOutcome], None]) -> Callable[[JobOutcome], None]:

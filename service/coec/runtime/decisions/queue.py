@@ -1,12 +1,12 @@
-"""What was asked about a pair, in the order in which it was asked: no answer counts before those in front of it.
+"""The questions about a pair, in the order in which they were asked. An answer counts only after all those before it.
 
-How long an answer takes is a matter of the machine; what it changes must not be. So every question has a sensor time
-from which on its answer counts in the choice of further pairs, fixed when it is asked: before a pair of that time is
-looked at the service waits, and a drive that is replayed, at any rate, on any machine, is judged in the same way.
+How long an answer takes depends on the machine, but what it changes must not. So every question gets, when it is asked,
+a sensor time from which its answer counts in the choice of further pairs. The stream waits for the answer before it
+looks at a pair of that time. A replay of a drive is therefore judged in the same way, at any rate and on any machine.
 Answers are served the moment they come; only the stream waits.
 
-Every question ends: with its answer, or when it has waited for longer than whoever answers may take. One that was lost
-must not hold up those behind it.
+Every question ends: with its answer, or when it has waited longer than an answer may take, so that a lost question does
+not hold up those behind it.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 Effect = Callable[[], None]
-"""What an answer changes in the choice of further pairs; run by the thread that chooses them."""
+"""Applies what an answer changes in the choice of further pairs; run by the thread that chooses them."""
 
 Take = Callable[[], Effect | None]
-"""Takes an answer, and says what it changes; run by the thread that decides."""
+"""Takes an answer and returns its effect; run by the thread that decides."""
 
 
 @dataclass(slots=True, eq=False)
 class Question:
-    """One of them.
+    """One question.
 
     Attributes:
-        due_ns: sensor time of the first pair that is looked at with the answer known.
-        expires_s: steady clock after which no answer is waited for.
-        name: the window it is about, empty for a check.
+        due_ns: sensor time from which pairs are looked at only once the answer is known.
+        expires_s: time of the steady clock after which the answer is no longer awaited.
+        name: id of the window that the question is about; empty for a check.
         take: takes the answer; None until it has come.
-        effect: what it changes, once it was taken.
+        effect: effect of the answer, once it was taken.
     """
 
     due_ns: int
@@ -52,7 +52,7 @@ class DecisionQueue:
         self._untaken: deque[Question] = deque()
 
     def ask(self, due_ns: int, expires_s: float, name: str = "") -> Question:
-        """A question is asked now. It is due no earlier than those before it, for which its answer has to wait."""
+        """Asks a question. It is due no earlier than those before it, because its answer has to wait for theirs."""
         with self._lock:
             before_ns = self._questions[-1].due_ns if self._questions else due_ns
             question = Question(max(due_ns, before_ns), expires_s, name)
@@ -61,18 +61,20 @@ class DecisionQueue:
             return question
 
     def about(self, name: str) -> Question | None:
-        """The question about a window that has no answer yet."""
+        """The unanswered question about a window; None if there is none."""
         with self._lock:
             return next((one for one in self._untaken if one.name == name and one.take is None), None)
 
     def answer(self, question: Question, take: Take) -> None:
-        """The answer to a question has come. The first one counts: it is taken now, or with the last one in front."""
+        """The answer to a question has come. It is taken as soon as all those in front are. A second answer to the same
+        question is ignored."""
         if question.take is None:
             question.take = take
         self._take_answered()
 
     def expire(self, monotonic_s: float, lost: Callable[[Question], Take]) -> int:
-        """Gives up what has waited for too long; `lost(question)` stands in for its answer. How many those were."""
+        """Gives up questions that have waited too long; `lost(question)` stands in for the answer. Returns how many
+        there were."""
         with self._lock:
             late = [one for one in self._untaken if one.take is None and one.expires_s <= monotonic_s]
         for question in late:
@@ -83,7 +85,7 @@ class DecisionQueue:
 
     @property
     def unanswered(self) -> int:
-        """Questions whose answer has not come, or waits for one in front of it. Any thread."""
+        """Number of questions whose answer has not come, or waits for one in front of it. For any thread."""
         return len(self._untaken)
 
     def waits(self, stamp_ns: int) -> bool:
@@ -102,7 +104,8 @@ class DecisionQueue:
                 question.effect()
 
     def bring_forward(self, stamp_ns: int) -> None:
-        """Sensor time stepped back, to this stamp: whatever waits is due with the first pair of the new time."""
+        """Sensor time has stepped back to this stamp: makes all outstanding answers due with the first pair of the new
+        time."""
         with self._lock:
             for question in self._questions:
                 question.due_ns = min(question.due_ns, stamp_ns)
@@ -113,7 +116,7 @@ class DecisionQueue:
                 first = self._untaken[0] if self._untaken else None
                 if first is None or first.take is None:
                     return
-            # The thread that answers is the only one that takes: outside the lock, the stream may ask meanwhile.
+            # Taken outside the lock, so that the stream may ask meanwhile. Only the thread that answers takes.
             first.effect = first.take()
             with self._lock:
                 self._untaken.popleft()

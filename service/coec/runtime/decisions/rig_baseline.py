@@ -1,5 +1,5 @@
-"""The baseline of a rig, its own or that of its model, as long as it fits: its limits, its bias, and why it is not
-used."""
+"""The baseline of a rig, its own or that of its model, as long as it fits: the learned limits and bias, or why the
+baseline is not used."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class RigBaseline:
     """Belongs to the thread that decides about the pair.
 
     Attributes:
-        trouble: why there is a baseline that is not used; None otherwise.
+        trouble: why an existing baseline is not used; else None.
     """
 
     def __init__(self, pair: PairConfig, rig: Rig, state: StateConfig) -> None:
@@ -31,7 +31,7 @@ class RigBaseline:
         self.load()
 
     def load(self) -> None:
-        """Read it from the disk, where the worker puts it."""
+        """Reads the baseline from the disk, where the worker writes it."""
         self._baseline, self.trouble = None, None
         try:
             baseline = baseline_of(self._rig, self._state)
@@ -47,42 +47,42 @@ class RigBaseline:
             self.trouble = _mismatched(wrong)
 
     def use(self, pair: PairConfig) -> None:
-        """The rig is calibrated by these settings from now on, which the baseline may not fit."""
+        """Goes on with other settings, which the baseline may not fit."""
         self._pair = pair
         self.load()
 
     def refuse(self, why: str) -> bool:
-        """It does not fit after all; whether it was in use until now."""
+        """Stops using the baseline because it does not fit after all. Returns whether it was in use."""
         if self._baseline is None:
             return False
         self._baseline, self.trouble = None, _mismatched(why)
         return True
 
     def fits_network(self, depth_identity: str) -> bool:
-        """Whether it was made with the network that the worker has opened."""
+        """Whether the baseline was made with the network that the worker has opened; True without a baseline."""
         return self._baseline is None or self._baseline.depth_identity == depth_identity
 
     @property
     def calibration(self) -> CalibrationConfig:
-        """How windows are calibrated: with the limits that were learned on this rig, if they were."""
+        """The configuration for windows: with the limits that were learned on this rig, if there is a baseline."""
         configured = self._pair.calibration
         if self._baseline is None:
             return configured
         return configured.model_copy(update={"verdict": self._baseline.verdict(configured.verdict)})
 
     def unbiased(self, estimate: Estimate) -> Estimate:
-        """What an estimate says once the estimator's bias on this rig is taken out."""
+        """The estimate with the estimator's bias on this rig taken out."""
         if self._baseline is None:
             return estimate
         return lifecycle.moved(estimate, self._baseline.unbiased(estimate.optimum.T_camera_lidar), self._rig)
 
     def moved(self, estimate: Estimate, pose: Matrix4) -> Estimate:
-        """An estimate that says another pose (4, 4), of which the estimator's bias has been taken out."""
+        """The estimate with another pose (4, 4), from which the estimator's bias has been taken out."""
         return lifecycle.moved(estimate, pose, self._rig)
 
     def drift(self, T_camera_lidar: Matrix4, sigma: NDArray[np.float64] | None) -> Drift | None:
-        """From the commissioned calibration to a pose (4, 4) that has had its bias taken out, of which `sigma` (6,) is
-        known; None before commissioning."""
+        """Drift from the commissioned calibration to a pose (4, 4) without bias, whose standard deviations are `sigma`
+        (6,) (None: unknown). None before commissioning."""
         if self._baseline is None:
             return None
         known = np.full(6, np.nan) if sigma is None else sigma

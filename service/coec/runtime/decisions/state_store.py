@@ -1,4 +1,4 @@
-"""The state of every pair in the one state file."""
+"""The states of all pairs, in one state file."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ _log = logging.getLogger(__name__)
 STATE_FILE = "state.json"
 
 LARGEST = 1e9
-"""Radians or metres, of a correction and of the standard deviations beside it. No window says more; what follows from
-less, in degrees and squared, is finite."""
+"""Largest correction, and standard deviation of it, that a state file may hold, radians or metres. No window gives
+more, and values below it stay finite in degrees and squared."""
 
 Rows = tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]
 
@@ -93,9 +93,9 @@ class StoredRecord(Part):
 
 
 class StoredPair(Part):
-    """`PairState` on the disk; when (wall clock) a check was last completed and since when it is in its state of
-    health; and the heads of its history on the disk. What is not in a file of an earlier version is as at the first
-    start."""
+    """`PairState` on the disk. Beside it: when (wall clock) a check was last completed, since when the pair is in its
+    state of health, and the heads of its history on the disk. Fields that a file of an earlier version lacks have the
+    values of a first start."""
 
     rig_sha256: str
     T_camera_lidar: Rows
@@ -164,11 +164,11 @@ class StateStore:
         self._pairs: dict[str, Any] = pairs if isinstance(pairs, dict) else {}
 
     def recall(self, rig: Rig) -> Remembered | None:
-        """What is known of the pair; None when nothing is, or when it belongs to another rig (then said in the log).
+        """What is known of the pair; None if nothing is, or if it belongs to another rig, which is logged.
 
         Raises:
-            StateError: the file is intact, but not what this version can read, or a pose in it is none. It is kept
-                aside when the state is put on the disk next.
+            StateError: the file is intact, but this version cannot read it, or a matrix in it is no pose. The file is
+                kept aside when the state is next put on the disk.
         """
         document = self._pairs.get(rig.pair)
         if document is None:
@@ -196,8 +196,8 @@ class StateStore:
         history_heads: Callable[[], Mapping[str, str]],
         commissioned_from: tuple[str, ...] = (),
     ) -> None:
-        """Keep the pair's state, and the ids of the windows that it was commissioned from; on the disk with the next
-        `flush`, together with what `history_heads()` says then."""
+        """Keeps the pair's state, and the ids of the windows from which it was commissioned. The next `flush` writes
+        them, together with what `history_heads()` returns then."""
         stored = StoredPair(
             rig_sha256=_rig_sha256(rig),
             T_camera_lidar=_rows(state.T_camera_lidar.tolist()),
@@ -232,15 +232,15 @@ class StateStore:
             self._heads[rig.pair] = history_heads
 
     def flush(self) -> None:
-        """Put what is kept on the disk.
+        """Writes what is kept to the disk.
 
         Raises:
-            StateError: it is not possible; the next call tries again.
+            StateError: the disk refuses; the next call tries again.
         """
         with self._writing:
             with self._lock:
                 pairs, heads = dict(self._pairs), dict(self._heads)
-            # What the file holds of pairs that this service does not know may be of any form, and stays as it is.
+            # Entries of pairs that this service does not know may have any form, and stay as they are.
             told = {pair: {**pairs[pair], "history_heads": dict(of_pair())} for pair, of_pair in heads.items()}
             self._file.save({"pairs": {**pairs, **told}})
 
@@ -254,11 +254,11 @@ class StateStore:
 
 
 def read_pairs(folder: Path) -> dict[str, tuple[StoredPair, PairState]]:
-    """What a state directory holds of every pair, for readers beside the service, or without one.
+    """What a state directory holds of every pair, for programs that read it beside the service or without one.
 
     Raises:
-        NotFoundError: it holds no state file.
-        StateError: there is one, but no copy of it can be used; says why.
+        NotFoundError: the directory holds no state file.
+        StateError: no copy of the state file can be used; the message says why.
     """
     loaded = StateFile(folder / STATE_FILE).load()
     if loaded.body is None:
@@ -290,11 +290,12 @@ def _reasons(stored: tuple[replies.Reason, ...]) -> tuple[Reason, ...]:
 
 
 class _NoPoseError(StateError):
-    """A matrix that should be a pose, and is no rigid transform."""
+    """A matrix that should be a pose is no rigid transform."""
 
 
 def _pose(rows: Rows) -> Matrix4:
-    """A checksum tells that a file is as it was written, not that who wrote it was this service."""
+    """The pose in these rows, checked to be rigid: the checksum of the file does not prove that this service wrote
+    it."""
     T = np.array(rows, dtype=np.float64)
     if not se3.is_rigid(T):
         raise _NoPoseError("no rigid transform")
@@ -323,7 +324,7 @@ def _track(stored: dict[str, Any]) -> Track:
 
 
 def _hold(stored: StoredPair) -> Hold | None:
-    """A file of an earlier version does not say who holds it."""
+    """The hold on the extrinsic; None if there is none. A file of an earlier version does not say who holds it."""
     if not stored.frozen:
         return None
     return Hold() if stored.hold is None else Hold(**stored.hold.model_dump())

@@ -1,1 +1,1 @@
-"""The process that infers and solves, and whoever looks after it."""
+"""The process that infers and solves, and the supervisor that watches it."""

@@ -1,7 +1,7 @@
-"""An answer of the worker on its way back: written by the worker, read and checked by the service.
+"""The wire format of the worker's answers: the worker writes it, the service reads and checks it.
 
-`{"id": number, "result": {field: value}}` or `{"id": number, "refused": {"code", "text"}}`. A result has the fields of
-its dataclass, arrays as an extension type of their shape and their doubles, so that every bit stays as it is.
+An answer is `{"id": number, "result": {field: value}}` or `{"id": number, "refused": {"code", "text"}}`. A result has
+the fields of its dataclass. Arrays are an extension type of their shape and their doubles, so that every bit is kept.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ ARRAY = 1
 
 
 class MalformedAnswerError(Exception):
-    """An answer is not of the documented form; the message says in what, never with the sender's values."""
+    """An answer is not of the documented form. The message says what is wrong, but quotes none of its values."""
 
 
 @dataclass(frozen=True, slots=True)
 class _SolvedOnTheWire:
-    """`Solved` with the result in msgpack, as the window's file and the history have it."""
+    """`Solved` with the result in msgpack, as in the window's file and the history."""
 
     result: bytes
     note: Reason | None
@@ -50,12 +50,12 @@ class _SolvedOnTheWire:
 
 
 def pack_answer(number: int, answer: Answer | None) -> dict[str, Any]:
-    """The answer to the question of this number; None to one that asks for nothing."""
+    """The answer to the question of this number; None if the question asks for nothing."""
     return {"id": number, "result": None if answer is None else _packed(answer)}
 
 
 def pack_refusal(number: int, reason: Reason) -> dict[str, Any]:
-    """The answer to the question of this number: it has none, and why."""
+    """The refusal of the question of this number, with its reason."""
     return {"id": number, "refused": _packed(reason)}
 
 
@@ -63,7 +63,7 @@ def number_of(message: Mapping[str, Any]) -> int:
     """The number of the question that is answered.
 
     Raises:
-        MalformedAnswerError: there is none.
+        MalformedAnswerError: the message has no number.
     """
     number = message.get("id")
     if type(number) is not int:
@@ -72,10 +72,11 @@ def number_of(message: Mapping[str, Any]) -> int:
 
 
 def read_answer(message: Mapping[str, Any], kind: Kind | None) -> Answer | Reason | None:
-    """The answer to a question of a kind, or why there is none; None for the kind None, which asks for nothing.
+    """The answer to a question of a kind, or the reason why there is none. None for the kind None, which asks for
+    nothing.
 
     Raises:
-        MalformedAnswerError: it is none of these.
+        MalformedAnswerError: the message is none of these.
     """
     content = {name: value for name, value in message.items() if name != "id"}
     if content.keys() == {"refused"}:
@@ -94,7 +95,7 @@ def read_answer(message: Mapping[str, Any], kind: Kind | None) -> Answer | Reaso
 
 
 def _solved(wire: _SolvedOnTheWire) -> Solved:
-    # The worker, which imports this module, too, has no need of the wire models for a check, which comes first.
+    # Imported here because the worker imports this module, too, and its first work, a check, needs no wire models.
     from coec.schemas.replies import CalibrationResult
 
     try:
@@ -105,7 +106,7 @@ def _solved(wire: _SolvedOnTheWire) -> Solved:
 
 @cache
 def _reader() -> TypeAdapter[Any]:
-    """Reads a map into the dataclass that has just its fields. Made at the first answer, as only the service reads."""
+    """Reads a map into the dataclass with exactly its fields. Made at the first answer: only the service reads."""
     settings = ConfigDict(arbitrary_types_allowed=True, extra="forbid")
     return TypeAdapter(_SolvedOnTheWire | Checked | Drawn | Commissioned | Registered | Reason, config=settings)
 
@@ -142,7 +143,7 @@ def _check_shapes(read: object) -> None:
 
 
 def _packed(value: Any) -> Any:
-    """In values that msgpack knows."""
+    """The value as values that msgpack knows."""
     if isinstance(value, BaseModel):
         return to_msgpack(value)
     if is_dataclass(value):
@@ -158,7 +159,7 @@ def _packed(value: Any) -> Any:
 
 
 def _unpacked(value: Any) -> Any:
-    """The arrays that `_packed` packed, in whatever holds them."""
+    """The value with the arrays that `_packed` packed, at any depth."""
     if isinstance(value, msgpack.ExtType):
         return _array(value)
     if isinstance(value, dict):
@@ -169,8 +170,10 @@ def _unpacked(value: Any) -> Any:
 
 
 def _array(packed: msgpack.ExtType) -> NDArray[np.float64]:
-    """Raises:
-    ValueError, TypeError, UnpackException: it is no array.
+    """The array in an extension type.
+
+    Raises:
+        ValueError, TypeError, UnpackException: it holds no array.
     """
     if packed.code != ARRAY:
         raise ValueError("an extension type that is no array")

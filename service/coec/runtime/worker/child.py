@@ -1,4 +1,5 @@
-"""One worker process as the supervisor has it: started, watched, spoken to, ended. All its faults are `ChildError`s."""
+"""One worker process, as the supervisor handles it: starts, watches, talks to and ends it. Every fault of the process
+is a `ChildError`."""
 
 from __future__ import annotations
 
@@ -21,13 +22,14 @@ _log = logging.getLogger(__name__)
 PACKAGE_ROOT = Path(__file__).resolve().parents[3]
 
 MAX_ANSWER_BYTES = 2**26
-"""Largest answer: a picture has some MB, every other answer some kB."""
+"""Largest answer, bytes: a picture has some MB, every other answer some kB."""
 
 LAST_WORDS_S = 1.0
-"""A process that has broken its connection gets so long to end, so that its exit can be told."""
+"""Time for a process that has broken its connection to end, s, so that its exit code can be reported."""
 
 KILL_S = 5.0
-"""A killed process ends within milliseconds; one that waits for a broken disk may not, and is left behind."""
+"""Time for a killed process to end, s. It takes milliseconds, unless the process waits for a broken disk; then it is
+left behind."""
 
 
 class Fault(StrEnum):
@@ -45,7 +47,7 @@ class Fault(StrEnum):
 
 
 class ChildError(Exception):
-    """The worker process has to be replaced. The message goes on where "The worker" begins."""
+    """The worker process has to be replaced. The message continues a sentence that begins with "The worker"."""
 
     def __init__(self, fault: Fault, text: str) -> None:
         super().__init__(text)
@@ -56,10 +58,10 @@ class Child:
     """One worker process. `kill` must be called in the end."""
 
     def __init__(self, command: Sequence[str], config: WorkerConfig) -> None:
-        """Start it: `command`, and the descriptor of its socket and the id of this process as further arguments.
+        """Starts `command`, with the descriptor of its socket and the id of this process as further arguments.
 
         Raises:
-            ChildError: it cannot be started.
+            ChildError: the process cannot be started.
         """
         self._config = config
         try:
@@ -81,14 +83,14 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Process id."""
         return self._process.pid
 
     def watch(self) -> int:
-        """Its resident memory, bytes.
+        """Checks the process and returns its resident memory, bytes.
 
         Raises:
-            ChildError: it has ended, or is too large.
+            ChildError: the process has ended, or is too large.
         """
         if (exit_text := self._exit_text()) is not None:
             raise ChildError(Fault.DIED, exit_text)
@@ -100,22 +102,22 @@ class Child:
         return resident
 
     def taken_s(self) -> float:
-        """Processor time that it has taken since the last call, s; of one that has ended, as far as it was watched."""
+        """Processor time since the last call, s. If the process has ended, up to when it was last watched."""
         self._look_at_processor()
         taken_s, self._told_cpu_s = self._cpu_s - self._told_cpu_s, self._cpu_s
         return taken_s
 
     def send(self, message: dict[str, Any]) -> None:
-        """Give it a message.
+        """Sends a message.
 
         Raises:
-            ChildError: it has ended or does not read, or the message cannot be put into bytes.
+            ChildError: the process has ended or does not read, or the message cannot be packed.
         """
         try:
             self._link.send(message)
         except OSError as error:
             raise self._broken(error) from error
-        except Exception as error:  # whatever a lazy sequence fails with: part of the message is with the worker
+        except Exception as error:  # from a lazy sequence; part of the message has already reached the worker
             _log.exception("a message for the worker could not be packed")
             text = f"could not be sent a message ({type(error).__name__}: {error})"
             raise ChildError(Fault.UNSENDABLE_JOB, text) from error
@@ -125,10 +127,10 @@ class Child:
         return self._link.poll(within_s)
 
     def receive(self) -> dict[str, Any]:
-        """Its next message; to be called when it `has_spoken`.
+        """The next message of the process; to be called when it `has_spoken`.
 
         Raises:
-            ChildError: it has ended, stopped in the middle, or what came is no message.
+            ChildError: the process has ended or stopped in the middle, or what came is no message.
         """
         try:
             return self._link.receive(MAX_ANSWER_BYTES)
@@ -138,7 +140,7 @@ class Child:
             raise self._broken(error) from error
 
     def kill(self) -> None:
-        """End it, whatever it does."""
+        """Kills the process, whatever it is doing."""
         self._process.kill()
         try:
             self._process.wait(KILL_S)
@@ -151,14 +153,14 @@ class Child:
             self._cpu_s = processor_s(self.pid)
 
     def _broken(self, error: Exception) -> ChildError:
-        """Its exit tells more than the broken pipe that it left."""
+        """The fault behind a broken connection: how the process ended, if it did, because that tells more."""
         exit_text = self._exit_text(LAST_WORDS_S)
         if exit_text is not None:
             return ChildError(Fault.DIED, exit_text)
         return ChildError(Fault.DISCONNECTED, f"broke the connection ({type(error).__name__})")
 
     def _exit_text(self, wait_s: float = 0.0) -> str | None:
-        """How the process ended, or None while it lives."""
+        """How the process ended; None while it lives."""
         try:
             code = self._process.wait(wait_s)
         except subprocess.TimeoutExpired:
@@ -166,7 +168,7 @@ class Child:
         return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
     def _resident_bytes(self) -> int:
-        """0 when the process is gone."""
+        """Resident memory of the process, bytes; 0 if it is gone."""
         return resident_bytes(self.pid)
 
 
@@ -174,6 +176,6 @@ def _environment(threads: int) -> dict[str, str]:
     inherited = os.environ.get("PYTHONPATH")
     path = os.pathsep.join([str(PACKAGE_ROOT), *([inherited] if inherited else [])])
     limits = {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
-    # What is multiplied as matrices is (N, 3) by (3, 3): more threads only spin, for longer than the work takes.
+    # All matrix products are (N, 3) by (3, 3): further threads would only spin, for longer than the work takes.
     limits["OPENBLAS_NUM_THREADS"] = "1"
     return {**os.environ, **limits, "PYTHONPATH": path}

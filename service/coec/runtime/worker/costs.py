@@ -1,4 +1,4 @@
-"""What the worker process takes of the processor, and what for."""
+"""The processor time that the worker process takes, and for what."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from coec.runtime.worker.jobs import PREFETCH, Job, Kind, Prefetch
 
 START, IDLE, BACKLOG = "start", "idle", "backlog"
-"""Kinds that are no job of the moment: a new process until it is ready, one that waits, windows of an earlier run."""
+"""Kinds of cost beside the present jobs: a process that starts, a process that waits, windows of an earlier run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,9 +15,9 @@ class Cost:
     """Processor time of all threads of the worker, s.
 
     Attributes:
-        kind: of the job, or one of the above, or `prefetch`.
-        pair: for which; empty for none.
-        cpu_s: how much.
+        kind: kind of the job, or one of the above, or `prefetch`.
+        pair: the pair for which it was spent; empty for none.
+        cpu_s: processor time.
     """
 
     kind: str
@@ -26,7 +26,7 @@ class Cost:
 
 
 def cost_of(work: Job | Prefetch, cpu_s: float) -> Cost:
-    """Of a piece of work."""
+    """The cost of a piece of work."""
     if isinstance(work, Prefetch):
         return Cost(PREFETCH, work.pair, cpu_s)
     kind = BACKLOG if work.kind is Kind.SOLVE and not work.live else work.kind.value

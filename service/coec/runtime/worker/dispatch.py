@@ -1,4 +1,5 @@
-"""A question to the worker becomes work, and its end an answer: a window that cannot be solved is an answer, too."""
+"""Turns each question to the worker into work, and its end into an answer. A refusal is an answer, too: a window that
+cannot be solved, for example."""
 
 from __future__ import annotations
 
@@ -17,12 +18,12 @@ from coec.runtime.worker.tasks import Solver
 _log = logging.getLogger(__name__)
 
 INTERNAL_ERROR = "internal_error"
-"""Code of an answer to work in which the program failed."""
+"""Code of the refusal if the program failed in the work."""
 
 
 def answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
-    """The answer to one question, under its number. Of a window what is not a `CoecError` ends the process: the service
-    replaces it and tries again, within bounds."""
+    """The answer to one question, under its number. If the solve of a window raises anything but a `CoecError`, the
+    process ends; the service replaces it and tries again, a limited number of times."""
     number = message["id"]
     try:
         end = solver.solve(Path(message["path"])) if message["kind"] == Kind.SOLVE else _errand(solver, message)
@@ -32,12 +33,12 @@ def answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
-    """The answer to work that is done once or not at all. A fault of the program in it is an answer, too: checks come
-    every few seconds, and a worker that each of them ended would solve no window any more.
+    """The answer to work that is tried only once. A fault of the program is an answer, too, because checks come every
+    few seconds: if each of them ended the worker, it would solve no more windows.
 
     Raises:
-        CoecError: there is none.
-        MemoryError: this process has had its time.
+        CoecError: the work has no result.
+        MemoryError: the process has to end.
     """
     try:
         match message["kind"]:

@@ -1,5 +1,4 @@
-"""What the worker may be asked, and how a question ends: plain values that the asking side, the queue and the worker
-share.
+"""The questions to the worker, and how they end: plain values that the asking side, the queue and the worker share.
 
 Every job ends in exactly one `JobOutcome`: a result, a failure with its reason, superseded by a newer one, or its
 deadline has passed.
@@ -58,21 +57,22 @@ DEADLINE_S = {
     Kind.COMMISSION: 1800.0,
     Kind.REGISTER: 180.0,
 }
-"""From asking to the last moment of an answer, s. A live window: the two attempts of 120 s that `worker` allows by
-default, behind another window that has them, and two minutes for new processes. A check: the first start of a
-worker, which compiles its kernels for a minute and a half on two busy cores, twice over. The registration of
-two LiDARs, the same. A picture: six solves of 10 s. A commissioning: twice `COMMISSIONING_TIMEOUT_S`."""
+"""Time from asking until an answer is given up, s. For a live window: two attempts of 120 s, which `worker` allows by
+default, after another window that needs as long, and two minutes for new processes. For a check, and for the
+registration of two LiDARs: twice the first start of a worker, which compiles its kernels for a minute and a half on two
+busy cores. For a picture: six solves of 10 s. For a commissioning: twice `COMMISSIONING_TIMEOUT_S`."""
 
 BACKLOG_DEADLINE_S = 86_400.0
-"""Of a window of an earlier run: it waits behind everything else, and is asked for again after the next start."""
+"""The same for a window of an earlier run, s: it waits behind everything else, and is asked for again after the next
+start."""
 
 COMMISSIONING_TIMEOUT_S = 900.0
-"""Of the worker with a commissioning: it calibrates its eight windows many times over."""
+"""Longest time of the worker with a commissioning, s: it calibrates its eight windows many times over."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenFile:
-    """A window's file as it was written: its bytes, the time of its last write, its hash, the pairs in it."""
+    """A window's file as it was written: its size, the time of its last write, its hash, the number of its pairs."""
 
     size_bytes: int
     modified_ns: int
@@ -82,8 +82,8 @@ class WrittenFile:
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """A window was calibrated. `note` says why the window's file does not hold the result, if it does not; `written` is
-    that file if it does."""
+    """A window was calibrated. If its file holds the result, `written` is that file; else `note` says why it does
+    not."""
 
     result: CalibrationResult
     note: Reason | None
@@ -92,7 +92,7 @@ class Solved:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """The monitor looked at some pairs. `baseline_not_used` says why it did without the rig's baseline, if there is
+    """The monitor looked at some pairs. `baseline_not_used` says why the rig's baseline was not used, if there is
     one."""
 
     observation: Observation
@@ -108,7 +108,8 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Commissioned:
-    """A baseline was learned from so many windows and pairs and is on the disk; `pose` (4, 4) maps LiDAR to camera."""
+    """A baseline was learned and is on the disk; `windows` and `pairs` say from how many. `pose` (4, 4) maps LiDAR to
+    camera."""
 
     pose: Matrix4
     baseline_hash: str
@@ -118,7 +119,7 @@ class Commissioned:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """Two LiDARs a and b were registered; what is told is that of `LidarEdge`."""
+    """Two LiDARs a and b were registered; the fields are those of `LidarEdge`."""
 
     T_a_b: Matrix4
     covariance: NDArray[np.float64]
@@ -140,7 +141,7 @@ ANSWERS: dict[Kind, type[Answer]] = {
     Kind.COMMISSION: Commissioned,
     Kind.REGISTER: Registered,
 }
-"""What each kind is answered with."""
+"""The type of the answer to each kind."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,10 +149,10 @@ class JobOutcome:
     """The end of a job.
 
     Attributes:
-        fate: which.
-        answer: exactly when there is a result.
-        reason: why there is none, exactly when there is none.
-        elapsed_s: from asking, s.
+        fate: how the job ended.
+        answer: the answer; None exactly if there is no result.
+        reason: why there is no result; None exactly if there is one.
+        elapsed_s: time since asking, s.
     """
 
     fate: Fate
@@ -160,8 +161,10 @@ class JobOutcome:
     elapsed_s: float
 
     def __post_init__(self) -> None:
-        """Raises:
-        ValueError: neither, or both, of an answer and a reason; or the wrong one.
+        """Checks that the fields fit each other.
+
+        Raises:
+            ValueError: there is neither an answer nor a reason, or both, or the one that does not fit the fate.
         """
         if (self.answer is not None) is not (self.fate is Fate.RESULT) or (self.reason is None) is (
             self.answer is None
@@ -175,14 +178,15 @@ class Job:
 
     Attributes:
         kind: what is asked.
-        pair: whose.
+        pair: the pair for which it is asked.
         subject: id of a window, or a word, for logs and status.
-        body: what the work needs, in values that msgpack knows or lazy sequences of them; that of a job which is done
-            at most once is emptied when it has been sent.
-        done: called once, with no lock held, on the supervisor's thread or on the one that asks or stops.
+        body: input of the work, in values that msgpack knows or lazy sequences of them. If the job is done at most
+            once, the body is emptied after sending.
+        done: called once with the outcome, with no lock held, on the supervisor's thread or on the one that asks or
+            stops.
         live: False for a window left over from an earlier run.
-        deadline_s: from asking, after which the job is answered `LATE`; None for the default of its kind.
-        timeout_s: of the worker with this job, after which it is replaced; None for `worker.timeout_s`.
+        deadline_s: time since asking after which the job is answered `LATE`; None: the default of its kind.
+        timeout_s: time after which a worker with this job is replaced; None: `worker.timeout_s`.
     """
 
     kind: Kind
@@ -196,7 +200,7 @@ class Job:
 
     @property
     def patience_s(self) -> float:
-        """How long the answer is waited for, s."""
+        """How long to wait for the answer, s."""
         if self.deadline_s is not None:
             return self.deadline_s
         return DEADLINE_S[self.kind] if self.live else BACKLOG_DEADLINE_S
@@ -204,7 +208,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Prefetch:
-    """Depth inference of a camera frame (native msgpack): a head start that nobody waits for, and no job."""
+    """Depth inference of a camera frame (native msgpack) ahead of its use. It is no job: nobody waits for it."""
 
     pair: str
     frame: bytes
@@ -214,25 +218,25 @@ Done = Callable[[JobOutcome], None]
 
 
 def solve(pair: str, path: Path, window_id: str, done: Done, live: bool = True) -> Job:
-    """Calibrate a finished window's file and write the result into it; answered with `Solved`."""
+    """Calibrates the file of a finished window and writes the result into it; answered with `Solved`."""
     return Job(Kind.SOLVE, pair, window_id, {"path": str(path)}, done, live)
 
 
 def check(pair: str, configuration: CalibrationConfig, pose: Matrix4, pairs: Sequence[FramePair], done: Done) -> Job:
-    """Have the monitor look at pairs at an extrinsic (4, 4); answered with `Checked`. The question says how the pair is
-    calibrated at the moment it is asked, whatever the worker was started with."""
+    """Has the monitor look at pairs at an extrinsic (4, 4); answered with `Checked`. The question brings the
+    configuration of the moment at which it is asked, whatever the worker was started with."""
     body = {"configuration": _packed(configuration), "pose": pack_pose(pose), "frames": pack_pairs(pairs)}
     return Job(Kind.CHECK, pair, "check", body, done)
 
 
 def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadline_s: float | None = None) -> Job:
-    """Draw the last pair of a window's file at an extrinsic (4, 4); answered with `Drawn`."""
+    """Draws the last pair of a window's file at an extrinsic (4, 4); answered with `Drawn`."""
     body = {"path": str(path), "pose": pack_pose(pose), "title": title}
     return Job(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
 
 
 def comparison(pair: str, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Done) -> Job:
-    """Draw two extrinsics (4, 4), which are called so, on a window's file where they differ most; answered with
+    """Draws a window's file at two extrinsics (4, 4), where they differ most; `names` are their captions. Answered with
     `Drawn`."""
     body = {"path": str(path), "poses": [pack_pose(pose) for pose in poses], "names": list(names)}
     return Job(Kind.OVERLAY, pair, path.stem, body, done)
@@ -241,7 +245,7 @@ def comparison(pair: str, path: Path, poses: tuple[Matrix4, Matrix4], names: tup
 def picture(
     pair: str, configuration: CalibrationConfig, pose: Matrix4, drawn: FramePair, title: str, done: Done
 ) -> Job:
-    """Draw a pair of the stream at an extrinsic (4, 4); answered with `Drawn`."""
+    """Draws a pair of the stream at an extrinsic (4, 4); answered with `Drawn`."""
     body = {
         "configuration": _packed(configuration),
         "pose": pack_pose(pose),
@@ -252,13 +256,13 @@ def picture(
 
 
 def commission(pair: str, configuration: CalibrationConfig, pose: Matrix4, paths: Sequence[Path], done: Done) -> Job:
-    """Learn the rig's baseline at an extrinsic (4, 4) from windows' files; answered with `Commissioned`."""
+    """Learns the rig's baseline at an extrinsic (4, 4) from windows' files; answered with `Commissioned`."""
     body = {"configuration": _packed(configuration), "pose": pack_pose(pose), "paths": [str(path) for path in paths]}
     return Job(Kind.COMMISSION, pair, "commissioning", body, done, timeout_s=COMMISSIONING_TIMEOUT_S)
 
 
 def register(edge: str, rig: LidarRig, pairs: Sequence[SweepPair], done: Done) -> Job:
-    """Find where one LiDAR sits in another from pairs of their sweeps; answered with `Registered`."""
+    """Finds the pose of one LiDAR in another from pairs of their sweeps; answered with `Registered`."""
     body = {"lidars": pack_lidars(rig), "frames": pack_sweeps(pairs)}
     return Job(Kind.REGISTER, edge, "lidars", body, done)
 

@@ -1,5 +1,5 @@
-"""Kernels that a solve comes to after its edges are found, which is half of what compiling takes: each run once on next
-to nothing, for what is to be compiled before a solve needs it."""
+"""Runs the kernels that a solve uses after finding its edges, each once on tiny inputs, so that they are compiled
+before a solve needs them. They take half of the compiling time."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ CAMERA_PX = 64
 """Longer side of the image: kernels are compiled for types, not for sizes."""
 
 BLUR_RAD = 0.1
-"""Of a chart of few cells."""
+"""Blur that gives a chart of few cells, rad."""
 
 
 def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
-    """What is to be run, the last ones of a solve first."""
+    """The functions to run; those that a solve needs last come first."""
     scale = min(1.0, CAMERA_PX / max(camera.width, camera.height))
     camera = scaled(camera, scale, scale)
     edges, pose = one_edge(camera), np.eye(4)
@@ -58,13 +58,13 @@ def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
 
 
 def one_edge(camera: Camera) -> EdgeFrames:
-    """A range edge, and an image without any."""
+    """Input with one range edge, and an image without edges."""
     maps = np.zeros((1, camera.height, camera.width), np.int8)
     return EdgeFrames(camera, np.ones((3, 1), np.float32), np.ones(1, np.float32), np.array([0, 1]), maps)
 
 
 def _binned(camera: Camera) -> BinnedFrames:
-    """A point in an image of one depth."""
+    """Input with one point, and an image of a single depth."""
     return BinnedFrames(
         camera=camera,
         xyz_m=np.ones((3, 1), np.float32),

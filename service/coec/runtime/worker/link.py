@@ -1,7 +1,7 @@
 """The wire between the service and its worker process: one socket pair, one msgpack map per message, sent in parts.
 
-Both ends are ours, yet a dying end may leave half a message: sends and receives have a time limit, so that neither can
-block for good on the other.
+A process that dies may leave half a message. So sends and receives have a time limit, and neither end can block for
+ever on the other.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ import msgpack
 
 _BIN32 = struct.Struct(">BI")
 _BIN32_CODE = 0xC6
-"""Of the msgpack format: the head of a byte string with a length of 32 bits."""
+"""Code of msgpack for a byte string with a length of 32 bits."""
 
 LARGE_BYTES = 2**16
-"""A byte string from this size on is sent from where it lies."""
+"""A byte string of at least this size is sent without being copied."""
 
 END = b""
-"""The part behind the last one of a message."""
+"""The part that ends a message."""
 
 MAX_MESSAGE_BYTES = 2**30
-"""Largest message; a frame is bounded by `LimitsConfig.max_message_bytes`, which is at most 1 GiB."""
+"""Largest message, bytes. A frame is bounded by `LimitsConfig.max_message_bytes`, which is at most 1 GiB."""
 
 TRANSFER_TIMEOUT_S = 10
-"""Largest pause inside one transfer; the other end only has to read from its socket buffer."""
+"""Largest pause inside one transfer, s. The other end only has to read from its socket buffer."""
 
 
 class NoMessageError(Exception):
-    """What came over the wire is no message; the text says why."""
+    """What came over the wire is not a message; the text says why."""
 
 
 class Link:
@@ -52,7 +52,7 @@ class Link:
         return cls(ours.detach()), theirs
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send one message.
+        """Sends one message.
 
         Raises:
             OSError: the other end is gone, or does not read.
@@ -90,18 +90,18 @@ class Link:
         try:
             return self._connection.recv_bytes(max_bytes)
         except OSError:
-            if not self._connection.readable:  # which the library makes it when a part is too large
+            if not self._connection.readable:  # the library sets this when a part is too large
                 raise NoMessageError(f"it is larger than {max_bytes} bytes") from None
             raise
 
     def close(self) -> None:
-        """Close this end; the other end reads the end of the stream."""
+        """Closes this end; the other end reads the end of the stream."""
         self._connection.close()
 
 
 def _parts(message: dict[str, Any]) -> Iterator[bytes]:
-    """The message in msgpack, piece by piece: a large byte string is a piece by itself, not copied, and what a lazy
-    sequence makes of its entries is in memory one entry at a time."""
+    """The message in msgpack, piece by piece. A large byte string is a piece by itself and is not copied. Of a lazy
+    sequence only one packed entry is in memory at a time."""
     packer = msgpack.Packer(autoreset=False)
 
     def taken() -> bytes:
@@ -126,5 +126,5 @@ def _parts(message: dict[str, Any]) -> Iterator[bytes]:
             packer.pack(value)
 
     yield from add(message)
-    if rest := taken():  # there is none behind a large byte string; an empty part would be the end
+    if rest := taken():  # empty after a large byte string, but an empty part would end the message
         yield rest

@@ -1,4 +1,4 @@
-"""What a question to the worker carries, in values that msgpack knows: pairs as their frames, poses as rows."""
+"""Packs the contents of questions to the worker into values that msgpack knows: pairs as frames, poses as rows."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ T = TypeVar("T")
 
 
 def pack_pairs(pairs: Sequence[FramePair]) -> Sequence[list[bytes | None]]:
-    """Camera, LiDAR and ego-motion frame of each pair, native msgpack, packed anew whenever an entry is asked for: the
-    pairs of a check have 15 MB, and need not be in memory twice."""
+    """Camera, LiDAR and ego-motion frame of each pair in native msgpack. Each entry is packed whenever it is read,
+    because the pairs of a check have 15 MB and need not be in memory twice."""
     return _Packed(pairs, _pair)
 
 
 def pack_sweeps(pairs: Sequence[SweepPair]) -> Sequence[list[bytes | None]]:
-    """The same of sweeps of two LiDARs."""
+    """The same for sweeps of two LiDARs."""
     return _Packed(pairs, _sweeps)
 
 

@@ -1,4 +1,4 @@
-"""What a process of the worker has to do with the process that started it."""
+"""Ties a process of the worker to the process that started it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from coec.adapters.system.parent import die_with
 
 
 def tie_to(parent: int) -> None:
-    """Die with the parent thread that started this process; leave the signals of a terminal or a manager to it."""
+    """Lets this process die with the parent thread that started it, and ignore the signals of a terminal or a manager,
+    which the parent handles."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     die_with(parent)

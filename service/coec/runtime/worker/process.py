@@ -1,7 +1,7 @@
 """The worker process: infers depth and solves windows, one job at a time, for the service that started it.
 
 Started as `python -m coec.runtime.worker.process SOCKET PARENT`; see `link` for the wire. It dies with its parent,
-leaves signals meant for the service alone, and answers every question under its number: see `dispatch`.
+ignores the signals that are meant for the service, and answers every question under its number: see `dispatch`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from coec.runtime.worker.link import Link
 from coec.runtime.worker.parent import tie_to
 
 START = "start"
-"""Kind of the first message, and of any later one that brings another configuration."""
+"""Kind of the first message, and of every later one that brings another configuration."""
 
 DEPTH_MAPS_KEPT = 64
-"""Maps kept per network: two windows of 25 and some; a map at network resolution is about 1 MB."""
+"""Number of depth maps kept per network: two windows of 25 and some more. A map at network resolution is about 1 MB."""
 
 
 def main(arguments: list[str]) -> int:
-    """Serve until the service goes away; the exit status is 0 then."""
+    """Serves until the service goes away; returns the exit status, 0."""
     descriptor, parent = (int(argument) for argument in arguments)
     tie_to(parent)
     link = Link(descriptor)
@@ -39,8 +39,8 @@ def main(arguments: list[str]) -> int:
 
 
 def _serve(link: Link, config: Config) -> None:
-    # Imported here: numba and onnxruntime take most of a second, and the ties to the parent come first. All of that
-    # stays: to look through it for garbage took a tenth of the start.
+    # Imported here because numba and onnxruntime take most of a second, and the process is tied to its parent before.
+    # The imported objects stay for good: without `freeze`, looking through them for garbage took a tenth of the start.
     gc.disable()
     from coec.runtime.worker.dispatch import answer
     from coec.runtime.worker.second_compiler import second_compiler

@@ -1,7 +1,8 @@
-"""What waits for the worker, and how each of it ends: a state machine without a thread, a process or a clock.
+"""The queue of jobs for the worker, and how each of them ends: a state machine without a thread, a process or a clock.
 
-Every job that comes in goes out exactly once, with its outcome. Waiting room is bounded per pair, so that pairs do not
-push each other out: of checks and of live windows the newest stay, of the rest the oldest.
+Every job that comes in goes out exactly once, with its outcome. The number of waiting jobs is bounded per pair, so that
+pairs do not push each other out. If there are too many, the newest checks and live windows stay, and the oldest of the
+rest.
 """
 
 from __future__ import annotations
@@ -26,19 +27,19 @@ class Lane(Enum):
 
 
 WAITING = {Lane.CHECK: 4, Lane.LIVE: 2, Lane.LIDARS: 2, Lane.ERRAND: 8, Lane.BACKLOG: 64}
-"""Jobs that may wait, per pair: checks, windows and registrations of LiDARs of this run (the service waits for answers
-before it asks more; these are for a worker that does not answer), pictures and commissionings, unsolved windows of
-earlier runs."""
+"""How many jobs may wait, per pair. Checks, windows and registrations of LiDARs are those of this run; the service
+waits for their answers before it asks more, so these limits matter only if the worker does not answer. Errands are
+pictures and commissionings, the backlog is unsolved windows of earlier runs."""
 
 SUPERSEDING = frozenset({Lane.CHECK, Lane.LIVE, Lane.LIDARS})
-"""Where the newest is worth most."""
+"""Lanes in which the newest job is worth most."""
 
 PREFETCHES_WAITING, PREFETCH_BYTES_WAITING = 8, 32 * 2**20
-"""Images that may wait for early inference, and their bytes; beyond, the solve infers them itself."""
+"""How many images may wait for early inference, and their bytes. The solve itself infers those that find no room."""
 
 WINDOW_WAITS_S = 5.0
-"""How long checks may keep a window of this run from the worker, s: while one waits, its pair is not looked at. The
-usual time between two checks of a pair."""
+"""How long checks may keep a window of this run from the worker, s: the usual time between two checks of a pair. While
+a window waits, its pair is not looked at."""
 
 SUPERSEDED = Reason("superseded", "A newer one of the pair came before the worker was free.")
 BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
@@ -50,7 +51,7 @@ WORKER_FAILED = "worker_failed"
 
 @dataclass(frozen=True, slots=True)
 class Ticket:
-    """What the worker is to do next, under a number that no other has had."""
+    """The next work for the worker, under a number that no other ticket has had."""
 
     number: int
     work: Job | Prefetch
@@ -58,7 +59,7 @@ class Ticket:
 
 @dataclass(frozen=True, slots=True)
 class InProgress:
-    """What is with the worker, and for how long, s; `kind` is a kind of job or `prefetch`."""
+    """The work that the worker has, and since how long, s. `kind` is a kind of job or `prefetch`."""
 
     kind: str
     pair: str
@@ -68,7 +69,7 @@ class InProgress:
 
 @dataclass(slots=True, eq=False)
 class _Entry:
-    """A job on its way. `attempts`: times that it was with a worker; `returned`: it could not be sent once."""
+    """A job on its way. `attempts`: how often a worker had it; `returned`: sending it has failed once."""
 
     job: Job
     asked_s: float
@@ -89,11 +90,11 @@ class _InHand:
 
 
 class JobQueue:
-    """The jobs that wait and the one that is with the worker. Not for several threads at once; times are of one steady
-    clock, s. What has ended lies in the outbox until `drain`."""
+    """The jobs that wait and the one that the worker has. Not for several threads at once. Times are of one steady
+    clock, s. Ended jobs stay in the outbox until `drain`."""
 
     def __init__(self, attempts: int) -> None:
-        """`attempts`: workers that may fail on one window before it is given up."""
+        """`attempts`: how many workers may fail on one window before it is given up."""
         self._attempts = attempts
         self._lanes: dict[Lane, deque[_Entry]] = {lane: deque() for lane in Lane}
         self._prefetches: deque[Prefetch] = deque()
@@ -108,7 +109,7 @@ class JobQueue:
     # --- from those who ask -----------------------------------------------------------------------------------------
 
     def ask(self, job: Job, now_s: float) -> None:
-        """A job comes in."""
+        """Takes in a job."""
         entry = _Entry(job, now_s)
         if self._stopped:
             self._end(entry, Fate.FAILED, STOPPING, now_s)
@@ -124,7 +125,7 @@ class JobQueue:
         self._lanes[lane].append(entry)
 
     def prefetch(self, prefetch: Prefetch) -> None:
-        """An image comes in; the oldest makes room for it."""
+        """Takes in an image; if there is no room, the oldest image is dropped."""
         if self._stopped:
             return
         self._prefetches.append(prefetch)
@@ -137,10 +138,10 @@ class JobQueue:
     # --- from the worker's side -------------------------------------------------------------------------------------
 
     def take(self, now_s: float) -> Ticket | None:
-        """What is to be done next, if anything waits; it is in hand until it is `answered` or the worker `died`.
+        """Takes out the next work, if any waits. It is in hand until it is `answered` or the worker `died`.
 
         Raises:
-            ValueError: there is something in hand already.
+            ValueError: some work is in hand already.
         """
         if self._in_hand is not None:
             raise ValueError("the worker has something to do")
@@ -153,15 +154,14 @@ class JobQueue:
         return Ticket(self._number, work.job if isinstance(work, _Entry) else work)
 
     def sent(self, now_s: float) -> None:
-        """The worker has what is in hand: it counts as begun from now on."""
+        """The work in hand has reached the worker and counts as begun from now on."""
         hand = self._hand()
         hand.sent, hand.taken_s = True, now_s
         if isinstance(hand.work, _Entry):
             hand.work.attempts += 1
 
     def answered(self, answer: Answer | Reason | None, now_s: float) -> None:
-        """What is in hand has come to an end: with an answer, or with the reason why there is none. None is the
-        answer to a prefetch, which nobody waits for."""
+        """The work in hand has ended, with an answer or with the reason why there is none. None answers a prefetch."""
         work = self._hand().work
         self._in_hand = None
         if isinstance(work, Prefetch):
@@ -176,9 +176,9 @@ class JobQueue:
             self._end(work, Fate.FAILED if isinstance(answer, Reason) else Fate.RESULT, answer, now_s)
 
     def died(self, why: str, now_s: float) -> None:
-        """The worker is being replaced because it `why` (a verb and what follows). What was in hand and had not reached
-        it goes back in front; of what had, a window does until it has had its attempts, other work is done once or not
-        at all."""
+        """The worker is being replaced because it `why` (a verb and what follows). If the work in hand had not reached
+        it, the work goes back to the front, a window always, other work once. If it had, a window goes back until its
+        attempts are used up, and other work has failed."""
         hand, self._in_hand = self._in_hand, None
         if hand is None or isinstance(hand.work, Prefetch):
             return
@@ -202,7 +202,7 @@ class JobQueue:
     # --- from both --------------------------------------------------------------------------------------------------
 
     def expire(self, now_s: float) -> None:
-        """Time has passed: jobs whose deadline has come are answered. One that is with the worker stays in hand."""
+        """Time has passed: answers jobs whose deadline has come. A job that the worker has stays in hand."""
         for waiting in self._lanes.values():
             for entry in [each for each in waiting if each.deadline_s <= now_s]:
                 waiting.remove(entry)
@@ -212,7 +212,7 @@ class JobQueue:
             self._end_late(entry_in_hand, now_s)
 
     def stop(self, now_s: float) -> None:
-        """Nothing is done any more: whatever waits or is in hand is answered so, and whatever comes in."""
+        """Ends all work: answers all jobs that wait, are in hand or come later as `stopping`."""
         self._stopped = True
         self._prefetches.clear()
         for waiting in self._lanes.values():
@@ -223,7 +223,7 @@ class JobQueue:
             self._end(entry, Fate.FAILED, STOPPING, now_s)
 
     def drain(self) -> list[tuple[Job, JobOutcome]]:
-        """Takes out what has ended since the last call, in order."""
+        """Takes out the jobs that have ended since the last call, in order."""
         ended, self._outbox = self._outbox, []
         return ended
 
@@ -231,18 +231,18 @@ class JobQueue:
 
     @property
     def outcomes(self) -> Mapping[Fate, int]:
-        """Jobs that have ended, by how they did."""
+        """Number of ended jobs, by how they ended."""
         return dict(self._outcomes)
 
     @property
     def causes(self) -> Mapping[str, int]:
-        """Jobs without a result by the code of their reason; `prefetch_dropped` and `prefetch_refused`: images that
-        were not inferred ahead; `late_answer`: answers that came after the job's deadline."""
+        """Number of jobs without a result, by the code of their reason. `prefetch_dropped` and `prefetch_refused` count
+        images that were not inferred ahead, `late_answer` answers that came after the job's deadline."""
         return {cause: count for cause, count in self._causes.items() if count}
 
     @property
     def waiting(self) -> Mapping[str, int]:
-        """Jobs that wait by kind, `backlog` for windows of an earlier run."""
+        """Number of waiting jobs by kind; windows of an earlier run are under `backlog`."""
         names = (
             "backlog" if lane is Lane.BACKLOG else entry.job.kind.value
             for lane, entries in self._lanes.items()
@@ -251,7 +251,7 @@ class JobQueue:
         return dict(Counter(names))
 
     def in_progress(self, now_s: float) -> InProgress | None:
-        """What is in hand."""
+        """The work in hand; None if there is none."""
         if self._in_hand is None:
             return None
         work, age_s = self._in_hand.work, now_s - self._in_hand.taken_s
@@ -263,7 +263,8 @@ class JobQueue:
 
     def _next(self, now_s: float) -> _Entry | Prefetch | None:
         checks, live = self._lanes[Lane.CHECK], self._lanes[Lane.LIVE]
-        # Checks that kill must not keep every new worker from its windows, nor checks of other pairs from any.
+        # A check that kills the worker must not keep every new worker from its windows, nor may many checks of other
+        # pairs keep a window waiting.
         windows_turn = live and (self._check_was_fatal or now_s - live[0].asked_s > WINDOW_WAITS_S)
         if checks and not windows_turn:
             return checks.popleft()
@@ -282,7 +283,7 @@ class JobQueue:
         return sum(entry.job.pair == pair for entry in self._lanes[lane]) >= WAITING[lane]
 
     def _put_back(self, entry: _Entry, reason: Reason, now_s: float) -> None:
-        """In front, where it came from; unless newer ones of its pair have taken the room."""
+        """Puts a job back to the front of its lane, unless newer ones of its pair have filled it."""
         lane = _lane_of(entry.job)
         if not self._is_full(lane, entry.job.pair):
             self._lanes[lane].appendleft(entry)

@@ -1,8 +1,8 @@
-"""Kernels are compiled by two processes where there is a processor for both: by the worker, as its warm-up comes to
-them, and by another that begins with those that the warm-up comes to last.
+"""A second process that compiles kernels while the worker warms up, if there is a second processor.
 
-Each finds in the cache on the disk what the other has done, so nobody divides the work, and they meet somewhere in the
-middle. Where nothing has to be compiled there is no second process.
+The worker compiles kernels in the order of its warm-up; the second process begins with those that the warm-up needs
+last. Each finds the other's kernels in the cache on the disk, so they meet somewhere in the middle without dividing the
+work beforehand. If nothing has to be compiled, no second process starts.
 
 Started as `python -m coec.runtime.worker.second_compiler PARENT`, with the configuration on its standard input.
 """
@@ -23,7 +23,8 @@ from coec.runtime.worker.parent import tie_to
 
 @contextmanager
 def second_compiler(config: Config) -> Iterator[None]:
-    """Within, the first kernel that has to be compiled starts it. Whether it gets anywhere changes nothing but time."""
+    """Within the block, the first kernel that has to be compiled starts the second process. If that process fails, the
+    worker only needs more time."""
     children: list[subprocess.Popen[bytes]] = []
 
     def hear(_: str) -> None:
@@ -49,7 +50,7 @@ def _started(config: Config) -> subprocess.Popen[bytes]:
 
 
 def main(arguments: list[str]) -> int:
-    """One pair of each lens model after the other."""
+    """Compiles the kernels for one camera of each lens model."""
     (parent,) = (int(argument) for argument in arguments)
     tie_to(parent)
     config = Config.model_validate_json(sys.stdin.buffer.read())

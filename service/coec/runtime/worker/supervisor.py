@@ -1,9 +1,9 @@
-"""The supervisor of the worker process: hands it one job at a time and replaces it when it crashes, hangs, grows or
-says what nobody asked.
+"""The supervisor of the worker process. It hands the worker one job at a time, and replaces the process if it crashes,
+hangs, grows too large or answers what nobody asked.
 
 The worker infers depth and solves windows in a process of its own, so that neither a fault in a network nor a long
-solve can reach the part that answers queries. Jobs wait here, in the service (`queue`): a worker that dies takes at
-most the job it had with it, and whatever happens to it, every job has its outcome.
+solve can reach the part that answers queries. Jobs wait here, in the service (`queue`). So a worker that dies takes at
+most one job with it, and every job gets its outcome whatever happens to the worker.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from coec.runtime.worker.queue import WORKER_FAILED, InProgress, JobQueue, Ticke
 _log = logging.getLogger(__name__)
 
 POLL_S = 0.1
-"""How often a busy or idle worker is looked at: small against any job, and what a stop may have to wait."""
+"""Time between two looks at a worker, s. It is short against any job; a stop may have to wait this long."""
 
 START_TIMEOUT_S = 300.0
-"""A first start compiles every kernel: tens of seconds on a slow machine."""
+"""Longest start of a worker, s. A first start compiles every kernel: tens of seconds on a slow machine."""
 
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.5, 30.0
-"""Pause before a worker that could not start is started again; doubles from the first to the last. One that started
-and ended without a single answer is started again after the first."""
+"""Pauses before a worker that could not start is started again, s; each is twice the one before. A worker that started
+and ended without a single answer is started again after the first pause."""
 
 
 class WorkerState(StrEnum):
@@ -53,19 +53,19 @@ class WorkerState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class WorkerStatus:
-    """How the worker is.
+    """State and counters of the worker.
 
     Attributes:
-        state: see there.
-        starts: processes so far, those that could not be started, too.
-        failure: why the last one was replaced.
+        state: what the worker is doing.
+        starts: number of processes so far, including those that could not be started.
+        failure: why the last process was replaced.
         rss_bytes: resident memory of the process when it was last looked at.
-        in_progress: what is with it.
-        waiting: jobs that wait, by kind; see `JobQueue.waiting`.
-        outcomes: jobs that have ended, by fate.
-        losses: jobs without a result by the code of their reason, and what else was lost; see `JobQueue.causes`.
-            `done_raised`: outcomes at which the asking side failed.
-        faults: processes replaced, by cause.
+        in_progress: the work that the process has.
+        waiting: number of waiting jobs, by kind; see `JobQueue.waiting`.
+        outcomes: number of ended jobs, by fate.
+        losses: number of jobs without a result by the code of their reason, and other losses; see `JobQueue.causes`.
+            `done_raised`: outcomes on which the asking side raised an exception.
+        faults: number of processes that were replaced, by cause.
     """
 
     state: WorkerState
@@ -91,9 +91,9 @@ class Worker:
     """Owns the worker process. `start` and `request_stop` are for the daemon, the rest may be called from any thread.
 
     Attributes:
-        thread: the supervisor's, on which most outcomes are told, one at a time.
-        jobs_took: from a question to its result, by kind.
-        work_took: what of that the process needed for it.
+        thread: the supervisor's thread, on which most outcomes are reported, one at a time.
+        jobs_took: time from a question to its result, by kind.
+        work_took: the part of that time during which the process worked on it.
     """
 
     def __init__(
@@ -103,18 +103,18 @@ class Worker:
         command: Sequence[str] = (sys.executable, "-m", "coec.runtime.worker.process"),
         pay: Callable[[Cost], None] = lambda _: None,
     ) -> None:
-        """`settings` is the JSON of the `Config`, handed to every process; `command` starts one, given two more
-        arguments: the descriptor of its socket and the id of this process. `pay` is told of all processor time that
-        the process takes, on the supervisor's thread, of a job before its outcome is."""
+        """`settings` is the JSON of the `Config` that every process gets. `command` starts a process; two arguments are
+        added: the descriptor of its socket and the id of this process. `pay` is called with all processor time that the
+        process takes, on the supervisor's thread; for a job before its outcome is reported."""
         self._config = config
         self._settings = settings
         self._told = ""
         self._command = tuple(command)
         self._pay = pay
         self._condition = threading.Condition()
-        # Under the condition: the queue is everybody's.
+        # All threads use the queue, so it is used only under the condition.
         self._queue = JobQueue(config.attempts)
-        # The supervisor's own, read by all.
+        # Written only by the supervisor, read by all.
         self._state = WorkerState.STARTING
         self._starts = 0
         self._failure: Reason | None = None
@@ -129,38 +129,38 @@ class Worker:
         self.work_took = Histogram(LONG_S)
 
     def start(self) -> None:
-        """Start the supervisor, which starts the process."""
+        """Starts the supervisor, which starts the process."""
         self.thread.start()
 
     def use(self, settings: str) -> None:
-        """Go on with another configuration: every job that is asked for from now on is done by it."""
+        """Goes on with another configuration, which holds for every job that is asked for from now on."""
         with self._condition:
             self._settings = settings
 
     def request_stop(self) -> None:
-        """End the supervisor, which kills the process, whatever it does. All jobs are answered (`stopping`) when this
-        returns; windows not solved stay on the disk."""
+        """Ends the supervisor, which kills the process whatever it is doing. When this returns, all jobs have been
+        answered (`stopping`). Unsolved windows stay on the disk."""
         self.thread.request_stop()
         with self._held() as queue:
             queue.stop(time.monotonic())
             self._condition.notify_all()
 
     def ask(self, job: Job) -> None:
-        """Queue a job; `job.done` will be called once, perhaps before this returns."""
+        """Queues a job; `job.done` will be called once, perhaps before this returns."""
         with self._held() as queue:
             queue.ask(job, time.monotonic())
             self._condition.notify_all()
 
     def prefetch(self, pair: str, frame: bytes) -> None:
-        """Queue the depth inference of a camera frame (native msgpack); only a head start, so it may be dropped."""
+        """Queues the depth inference of a camera frame (native msgpack). It only saves time, so it may be dropped."""
         with self._held() as queue:
             queue.prefetch(Prefetch(pair, frame))
             self._condition.notify_all()
 
     @property
     def unusable(self) -> Reason | None:
-        """Why no worker can ever start with this configuration, as far as one said so before any was ready (a bad
-        model)."""
+        """Why no worker can ever start with this configuration, for example because of a bad model. Set if a worker
+        says so before any was ready."""
         return self._unusable
 
     @property
@@ -169,7 +169,7 @@ class Worker:
         return self._pid
 
     def status(self) -> WorkerStatus:
-        """How the worker is."""
+        """State and counters of the worker."""
         raised = {"done_raised": self._done_raised} if self._done_raised else {}
         with self._condition:
             return WorkerStatus(
@@ -188,7 +188,7 @@ class Worker:
 
     @contextmanager
     def _held(self) -> Iterator[JobQueue]:
-        """The queue under its lock; what ends meanwhile is told afterwards, without it."""
+        """The queue under its lock. Outcomes of jobs that end in the block are reported after it, without the lock."""
         with self._condition:
             yield self._queue
             ended = self._queue.drain()
@@ -222,7 +222,7 @@ class Worker:
                 queue.stop(time.monotonic())
 
     def _run_child(self) -> _Reached:
-        """One process from its start to its end."""
+        """Runs one process from its start to its end."""
         self._state = WorkerState.STARTING
         self._starts += 1
         try:
@@ -268,10 +268,10 @@ class Worker:
         raise ChildError(Fault.MALFORMED_ANSWER, "said something else than that it is ready")
 
     def _take_turn(self, child: Child) -> bool:
-        """Give the worker its next job, if there is one, once it is known to be well; whether it has answered one."""
+        """Checks the worker, then gives it the next job, if there is one. Returns whether it has answered a job."""
         self._look_after(child)
         if child.has_spoken(0.0):
-            child.receive()  # its end, perhaps
+            child.receive()  # raises if the process has ended
             raise ChildError(Fault.STRAY_ANSWER, "answered though nothing was asked")
         if self._told != self._settings:
             self._await_ready(child)
@@ -296,7 +296,7 @@ class Worker:
         return True
 
     def _take(self) -> Ticket | None:
-        """The next job, or None when there was none for a moment."""
+        """The next job; None if there is none, after waiting for `POLL_S` at most."""
         with self._held() as queue:
             ticket = queue.take(time.monotonic())
             self._state = WorkerState.READY if ticket is None else WorkerState.BUSY
@@ -313,15 +313,15 @@ class Worker:
                     queue.answered(Reason("unsendable", f"The worker {error}."), time.monotonic())
             raise
         if isinstance(ticket.work, Job) and ticket.work.kind is not Kind.SOLVE:
-            ticket.work.body.clear()  # the frames of a check are 15 MB, and are not sent twice
+            ticket.work.body.clear()  # frees the frames of a check, 15 MB, which are not sent twice
         with self._held() as queue:
             queue.sent(time.monotonic())
 
     def _next_message(self, child: Child, timeout_s: float) -> dict[str, Any] | None:
-        """The worker's next message; None when a stop was requested meanwhile.
+        """The worker's next message; None if a stop was requested meanwhile.
 
         Raises:
-            ChildError: dead, too slow, too large, or not to be understood.
+            ChildError: the worker is dead, too slow or too large, or its message cannot be understood.
         """
         deadline_s = time.monotonic() + timeout_s
         while not child.has_spoken(POLL_S):
@@ -333,10 +333,10 @@ class Worker:
         return child.receive()
 
     def _look_after(self, child: Child) -> None:
-        """What is done many times a second, whatever the worker does.
+        """Checks time limits, memory and life of the worker; called many times a second.
 
         Raises:
-            ChildError: dead or too large.
+            ChildError: the worker is dead or too large.
         """
         self._keep_time()
         self._rss_bytes = child.watch()
@@ -365,7 +365,7 @@ class Worker:
 
 
 def _question(ticket: Ticket) -> dict[str, Any]:
-    """What is sent to the worker."""
+    """The message to the worker."""
     work = ticket.work
     if isinstance(work, Prefetch):
         return {"id": ticket.number, "kind": PREFETCH, "pair": work.pair, "frame": work.frame}
@@ -376,7 +376,7 @@ def _checked_answer(message: Mapping[str, Any], number: int, kind: Kind | None) 
     """The answer to the question of this number and kind.
 
     Raises:
-        ChildError: it is to another question, or not of the documented form.
+        ChildError: the answer is to another question, or not of the documented form.
     """
     try:
         if number_of(message) != number:

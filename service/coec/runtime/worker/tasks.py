@@ -1,4 +1,4 @@
-"""The work of the worker: depth of an image, calibration of a window file. No process, no socket."""
+"""The work of the worker, for example depth of an image or calibration of a window file. No process, no socket."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ OVERLAY_JPEG_QUALITY = 88
 class Solver:
     """Opens the networks of the configuration once and keeps the depth of recent images.
 
-    What belongs to window files and results is imported by what reads and writes them: the types of ROS messages and
-    the schemas take 0.15 s, and a check, which comes first, needs none.
+    The methods that read or write window files import what they need for that: the types of ROS messages and the
+    schemas take 0.15 s, and the first work, a check, needs none of them.
     """
 
     def __init__(self, config: Config, depth_maps_kept: int) -> None:
-        """Open every depth model that a pair of `config` names.
+        """Opens every depth model that a pair of `config` names.
 
         Raises:
             ModelError: a network is missing, corrupt or does not match its card.
@@ -68,8 +68,8 @@ class Solver:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Go on with another configuration, whose limits are the same. Networks of pairs that are awaited are opened,
-        too: what they lack is found at the start.
+        """Goes on with another configuration that has the same limits. Networks of awaited pairs are opened, too, so
+        that the start shows what is wrong with them.
 
         Raises:
             ModelError, ConfigError: as at the start.
@@ -81,8 +81,8 @@ class Solver:
             self._network(pair.calibration.depth)
 
     def warm_up(self) -> None:
-        """Run every kernel once on a few invented points, so that no window waits for a compiler. Kernels are compiled
-        for types: of pairs that differ in numbers alone, as most of a vehicle do, one is enough."""
+        """Runs every kernel once on a few invented points, so that no window waits for a compiler. Kernels are compiled
+        for types, so one is enough of pairs that differ only in numbers, as most pairs of a vehicle do."""
         alike = {
             (type(rig.camera), rig.sweep is None, pair.calibration): (rig, pair.calibration)
             for pair in self._config.pairs
@@ -101,7 +101,7 @@ class Solver:
         register(LidarRig("a", "b", np.eye(4), np.eye(4)), pairs, Trees())
 
     def prefetch(self, pair: str, frame: bytes) -> None:
-        """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
+        """Infers the depth of a camera frame (native msgpack) that was chosen for an open window.
 
         Raises:
             DecodeError: the frame cannot be decoded.
@@ -109,7 +109,7 @@ class Solver:
         self._network(self._pairs[pair].calibration.depth).infer(decode_camera(frame, self._config.limits))
 
     def solve(self, path: Path) -> Solved:
-        """Calibrate a finished window by the configuration it carries, and write the result into its file.
+        """Calibrates a finished window by the configuration in its file, and writes the result into the file.
 
         Raises:
             WindowError, CalibrationError, DecodeError, ModelError: there is no result.
@@ -130,7 +130,8 @@ class Solver:
         return Solved(result, None, WrittenFile(file.bytes, file.modified_ns, file.sha256, file.pairs))
 
     def _picture_of_result(self, window: Window, configuration: CalibrationConfig, estimate: Estimate) -> bytes | None:
-        """JPEG of the window's last pair at its result; None where it cannot be drawn: a result needs no picture."""
+        """JPEG of the window's last pair at its result; None if it cannot be drawn, because a result needs no
+        picture."""
         title = f"{window.window_id}  {estimate.verdict.decision.value}"
         pose = estimate.optimum.T_camera_lidar.tolist()
         try:
@@ -146,7 +147,7 @@ class Solver:
         pose: Sequence[Sequence[float]],
         frames: Sequence[Sequence[bytes | None]],
     ) -> Checked:
-        """A check of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs
+        """Makes a check of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs
         them.
 
         Raises:
@@ -164,7 +165,7 @@ class Solver:
         return Checked(observe(window, network, images, configuration, baseline), not_used)
 
     def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> Drawn:
-        """JPEG of the points of a window's last pair on its image, at an extrinsic (rows of the (4, 4) matrix).
+        """JPEG of a window's last pair, with its points drawn on its image at an extrinsic (rows of the (4, 4) matrix).
 
         Raises:
             WindowError, DecodeError: the window or its image cannot be read.
@@ -182,7 +183,7 @@ class Solver:
         """
         from coec.adapters.mcap.windows import read_window
 
-        # Matplotlib takes 0.3 s and 30 MB: most workers never draw one of these.
+        # Imported here because Matplotlib takes 0.3 s and 30 MB, and most workers never draw such a picture.
         from coec.reports.close_ups import Caption, close_ups
 
         window, configuration = read_window(path)
@@ -205,7 +206,7 @@ class Solver:
         frames: Sequence[Sequence[bytes | None]],
         title: str,
     ) -> Drawn:
-        """The same of one pair of the stream, packed as `messages` does.
+        """JPEG of one pair of the stream at an extrinsic, like `overlay`; the pair is packed as `messages` does.
 
         Raises:
             DecodeError: a frame cannot be decoded.
@@ -216,7 +217,7 @@ class Solver:
     def commission(
         self, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
     ) -> Commissioned:
-        """Learn the baseline of a rig at an extrinsic (rows of the (4, 4) matrix) from recorded windows; write it.
+        """Learns the baseline of a rig at an extrinsic (rows of the (4, 4) matrix) from recorded windows and writes it.
 
         Raises:
             WindowError, CalibrationError, DecodeError, ModelError, StateError: there is no baseline.
@@ -237,7 +238,7 @@ class Solver:
         return Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
 
     def register(self, lidars: Mapping[str, Any], frames: Sequence[Sequence[bytes | None]]) -> Registered:
-        """Where one LiDAR sits in another, with both and pairs of their sweeps as `messages` packs them.
+        """Finds the pose of one LiDAR in another; both, and pairs of their sweeps, are packed as `messages` does.
 
         Raises:
             SourceError: the optional extra is not installed.
@@ -262,7 +263,7 @@ class Solver:
         return Drawn(encode_jpeg(titled(picture, told), OVERLAY_JPEG_QUALITY))
 
     def _scale(self, pair: str, sweep: LidarFrame) -> RangeScale:
-        """Of the colours of a stream, which do not change from picture to picture."""
+        """The colour scale of a stream, which stays the same from picture to picture."""
         scale = kept_or(self._scales.get(pair), scale_of(lengths(sweep.xyz_m)))
         self._scales[pair] = scale
         return scale
@@ -270,7 +271,7 @@ class Solver:
     def _baseline(
         self, pair: str, configuration: CalibrationConfig, depth_identity: str
     ) -> tuple[Baseline | None, str | None]:
-        """What was learned of the rig, if it holds for this configuration and network; else why it does not."""
+        """The baseline of the rig if it holds for this configuration and network; else why it does not hold."""
         try:
             learned = baseline_of(self._rigs[pair], self._config.state)
         except StateError as error:

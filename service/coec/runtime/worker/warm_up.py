@@ -1,5 +1,5 @@
-"""What a worker does before its first job: every kernel is run once on a few invented points, so that no window waits
-for a compiler."""
+"""The warm-up of a worker before its first job: runs every kernel once on a few invented points, so that no window
+waits for a compiler."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ POINTS = 4000
 DEPTH_PX = (48, 64)
 
 CAMERA_PX = 128
-"""Longer side of the images of the warm-up: kernels are compiled for types, not for sizes, and a few milliseconds of
-work on an image of this size would be more than a second on the camera's own."""
+"""Longer side of the images of the warm-up. Kernels are compiled for types, not for sizes, and a few milliseconds of
+work at this size would be more than a second at the size of a camera's images."""
 
 EVALUATIONS, REACH_DEG = 4, 4.0
-"""Of the searches of the warm-up."""
+"""Limits of the searches of the warm-up."""
 
 
 def warm_up(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> None:
-    """Of one pair: what a check and a solve of it run."""
+    """Runs the kernels that a check and a solve of one pair use."""
     search = calibration.search.model_copy(update={"max_evaluations": EVALUATIONS, "reach_deg": REACH_DEG})
     configuration = calibration.model_copy(update={"search": search})
     rig = small(rig)
@@ -50,13 +50,13 @@ def warm_up(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> Non
         diagnose(invented_window(rig), _Ramp(), images, configuration, None)
     with contextlib.suppress(CalibrationError, DecodeError):
         calibrate(invented_window(rig), _Ramp(), images, configuration, Silence())
-    # Two kernels are those of the uncertainty of a result, and an invented window need not lead to one.
+    # These two kernels compute the uncertainty of a result, and an invented window need not give a result.
     project(rig.camera, np.ones((1, 3)))
     alignment_of_parts(one_edge(rig.camera), np.zeros(1, np.uint8), 1, np.eye(4)[None])
 
 
 class _Ramp:
-    """Depth that grows from left to right, of any image."""
+    """A depth network that gives the same map for every image: depth grows from left to right."""
 
     @property
     def identity(self) -> str:
@@ -69,8 +69,8 @@ class _Ramp:
 
 
 def small(rig: Rig) -> Rig:
-    """The rig with a camera of fewer pixels, and of as large a field of view; masked at a corner, so that what looks at
-    borders of masks finds one."""
+    """The rig with a camera of fewer pixels and the same field of view. One corner is masked, so that code for the
+    borders of masks runs, too."""
     scale = min(1.0, CAMERA_PX / max(rig.camera.width, rig.camera.height))
     camera = scaled(rig.camera, scale, scale)
     mask = np.ones((camera.height, camera.width), np.bool_)
@@ -79,8 +79,9 @@ def small(rig: Rig) -> Rig:
 
 
 def invented_window(rig: Rig) -> Window:
-    """Pairs with points all around the LiDAR, seeded; as a window from the disk holds them, so that the kernels are
-    compiled for the same arrays: sweeps that may not be written to, images from a decoder, motion to compensate."""
+    """A window with random points all around the LiDAR, from a fixed seed. Its arrays are like those of a window from
+    the disk, so that the kernels are compiled for the same types: read-only sweeps, images from a decoder, motion to
+    compensate."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(POINTS, 3))
     range_m = rng.uniform(5.0, 30.0, size=(POINTS, 1))
