@@ -91,9 +91,9 @@ class Budget:
             self._turns.ended(pair)
 
     def pay(self, cost: Cost) -> None:
-        """Books the cost of the worker's work, for a pair that has joined or for none. Windows of earlier runs, pictures
-        and commissionings are not for the stream: they appear in the report, but no check waits until they are
-        earned."""
+        """Books the cost of the worker's work, for a pair that has joined or for none. Windows of earlier runs,
+        pictures and commissionings are not for the stream: they appear in the report, but no check waits until they
+        are earned."""
         now_s = self._clock()
         with self._lock:
             self._spending.add(cost.kind, cost.pair, cost.cpu_s, now_s)

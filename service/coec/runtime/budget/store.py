@@ -54,7 +54,8 @@ class Store:
         self.level_s = min(self.level_s, self.depth_s)
 
     def earn(self, now_s: float, debts: list[Debt]) -> None:
-        """Time has come to `now_s`: what was earned since the last call pays the instalments due; the rest is stored."""
+        """Time has come to `now_s`: pays the instalments due from what was earned since the last call, and stores the
+        rest."""
         passed_s, self._now_s = max(now_s - self._now_s, 0.0), max(now_s, self._now_s)
         earned_s = self._cores * passed_s
         due_s = [max(debt.owed_s + debt.next_s, 0.0) * -math.expm1(-passed_s / debt.over_s) for debt in debts]

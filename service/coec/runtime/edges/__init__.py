@@ -1,1 +1,2 @@
-"""Where the LiDARs of a vehicle sit to one another: looks at every two of them, from sweeps to what the rig is told."""
+"""Measures the poses of a vehicle's LiDARs against each other: looks at every two of them, from sweeps to the report to
+the rig."""

@@ -1,4 +1,4 @@
-"""All LiDARs of a vehicle, two by two."""
+"""Starts looks at every two LiDARs of a vehicle."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from coec.runtime.worker.supervisor import Worker
 
 
 class LidarEdges:
-    """For the main thread.
+    """The edges between all LiDARs of a vehicle. For the main thread.
 
     Attributes:
-        trouble: why none is looked at, where that can be helped; None else.
+        trouble: why no LiDARs are looked at, if people can change that; else None.
     """
 
     def __init__(
@@ -34,7 +34,8 @@ class LidarEdges:
         self.trouble: Reason | None = None
 
     def grow(self, pairs: Iterable[PairConfig]) -> None:
-        """These are all pairs now, and the rig knows them: look at every two of their LiDARs that it did not have.
+        """Takes all present pairs, which the rig knows already, and begins to look at every two of their LiDARs that
+        are new.
 
         Raises:
             ConfigError: the rig of a pair cannot be built.

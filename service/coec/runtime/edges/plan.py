@@ -1,4 +1,4 @@
-"""Which two LiDARs of a vehicle are looked at together, as its pairs have them."""
+"""Plans which two LiDARs of a vehicle are looked at together, from the configuration of its pairs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from coec.config import PairConfig
 from coec.runtime.rig.graph import graph_of, sensors_of
 
 MOST = 6
-"""Two LiDARs each that are looked at, those that stand first: all of four LiDARs. Each holds some twenty sweeps."""
+"""How many combinations of two LiDARs are looked at, in the order of the configuration: all those of four LiDARs. Each
+holds some twenty sweeps."""
 
 NOT_INSTALLED = Reason(
     "lidars_not_installed",
@@ -38,7 +39,7 @@ TOO_MANY = Reason("too_many", f"Not measured: {MOST} pairs of LiDARs are looked 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounted:
-    """A LiDAR of a vehicle: its name, a pair that has it, and the rig of that."""
+    """A LiDAR of a vehicle: its name, a pair that has it, and the rig of that pair."""
 
     name: str
     pair: PairConfig
@@ -50,8 +51,8 @@ class Planned:
     """Two LiDARs.
 
     Attributes:
-        edge: between them, as they were built.
-        why_not: nothing looks at them, for this reason.
+        edge: the edge between them, with the pose as built.
+        why_not: why they are not looked at; None if they are.
     """
 
     edge: Edge
@@ -61,13 +62,14 @@ class Planned:
 
     @property
     def rig(self) -> LidarRig:
-        """For who registers them."""
+        """The two LiDARs as input of a registration."""
         a, b = self.a, self.b
         return LidarRig(a.name, b.name, self.edge.T_a_b, a.rig.T_lidar_ego, a.rig.sweep, b.rig.sweep)
 
 
 def planned(pairs: Iterable[PairConfig], period_s: float) -> tuple[Planned, ...]:
-    """Every two LiDARs of some pairs, the one that stands first being a: where there is a larger one it is told first.
+    """Every two LiDARs of the pairs. The one that comes first in the configuration is a; if one LiDAR is larger, people
+    name it first.
 
     Raises:
         ConfigError: the rig of a pair cannot be built.
@@ -92,8 +94,8 @@ def planned(pairs: Iterable[PairConfig], period_s: float) -> tuple[Planned, ...]
 
 
 def _places(pairs: Mapping[str, tuple[PairConfig, Matrix4]]) -> dict[str, Mapping[str, Matrix4]]:
-    """T_sensor_origin (4, 4) by origin and sensor, of those that pairs join; none of more sensors than a rig may
-    have."""
+    """T_sensor_origin (4, 4) by origin and sensor, for sensors that are joined by pairs; empty if there are more
+    sensors than a rig may have."""
     try:
         graph = graph_of(pairs, ())
     except ValueError:

@@ -1,7 +1,7 @@
-"""Two LiDARs on the thread of the intake: sweeps -> look -> worker -> what the rig is told.
+"""Two LiDARs on the thread of the intake: sweeps -> look -> worker -> report to the rig.
 
-Sensor time alone decides which sweeps are taken, and from when on it counts what they told: a drive that is replayed,
-at any rate, is put together in the same way. Who is told waits for what counts by its time (`runtime.rig.order`).
+Only sensor time decides which sweeps are taken, and from when their result counts, so a replay of a drive gives the
+same at any rate. The rig waits for everything that counts by its sensor time (`runtime.rig.order`).
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from coec.runtime.worker.jobs import JobOutcome, Registered
 from coec.runtime.worker.supervisor import Worker
 
 COUNTS_AFTER_NS = 15 * NS_PER_S
-"""Sensor time from a look to when it counts: a registration takes half a second, and may wait behind the solve of a
+"""Sensor time from a look until it counts. A registration takes half a second, and may wait behind the solve of a
 window."""
 
 LOOKS_WAITING = 2
-"""Looks whose sweeps may wait for their turn, or for an answer that comes before them."""
+"""How many looks may wait for their turn, or for the answer to an earlier one."""
 
 RESTS = 7
-"""Looks that are left out after one that found next to nothing in common: two LiDARs that do not overlap cost an
-eighth, and are seen to overlap after all, in a narrow street, within two minutes."""
+"""How many looks are left out after one that found next to nothing in common. Two LiDARs that do not overlap so cost an
+eighth. If they overlap after all, in a narrow street, that is noticed within two minutes."""
 
 WEAK = Reason(
     "surroundings_tell_nothing",
@@ -56,8 +56,8 @@ MISSED: Mapping[str, Reason] = {
 
 @dataclass(slots=True, eq=False)
 class _Question:
-    """A look that was asked for. `rests`: how many are left out after it, from its `due_ns` on; None until its answer
-    has come."""
+    """A look that was asked for. `rests`: how many looks are left out after it, from its `due_ns` on; None until its
+    answer has come."""
 
     due_ns: int
     start_ns: int
@@ -67,11 +67,11 @@ class _Question:
 
 
 class LidarEdgeStream:
-    """Of two LiDARs. Everything but `unanswered` belongs to the thread of the intake.
+    """The looks at two LiDARs. Everything but `unanswered` belongs to the thread of the intake.
 
     Attributes:
-        sensors: the streams of both, and of the vehicle's motion.
-        unanswered: looks that were asked for and have no answer; for any thread.
+        sensors: the streams of both LiDARs and of the vehicle's motion.
+        unanswered: number of looks that were asked for and have no answer; for any thread.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class LidarEdgeStream:
             self._tried_ns = None
 
     def _miss(self, missed: Missed) -> None:
-        """There is no look, and the rig is told why when that is new."""
+        """No look was possible; reports the cause to the rig if it is new."""
         if missed.cause != self._missed:
             self._missed = missed.cause
             said = LidarsSaid(missed.stamp_ns, None, (MISSED[missed.cause],), self._lost())
@@ -157,14 +157,15 @@ class LidarEdgeStream:
     # --- turns ------------------------------------------------------------------------------------------------------
 
     def may_choose(self) -> bool:
-        """Whether there is a look, every answer that counts before it has come, and it was not refused just now."""
+        """Whether a look waits, every answer that counts before it has come, and the budget did not refuse it just
+        now."""
         if not self._looks or self._tried_ns == self._sampler.latest_ns:
             return False
         stamp_ns = self._looks[0].stamp_ns
         return all(question.rests is not None for question in self._questions if question.due_ns <= stamp_ns)
 
     def choose_next(self) -> bool:
-        """Ask for the look whose turn it is; whether anything became of one."""
+        """Asks for the oldest waiting look, or leaves it out. Returns False if it still waits."""
         if not self.may_choose():
             return False
         look = self._looks[0]
@@ -182,7 +183,7 @@ class LidarEdgeStream:
         return True
 
     def tick(self, *, waiting: bool) -> None:
-        """Nothing here waits for a clock."""
+        """Does nothing: nothing here waits for a clock."""
 
     def _ask(self, look: Look) -> None:
         question = _Question(look.stamp_ns + COUNTS_AFTER_NS, look.start_ns, look.stamp_ns, self._lost())
@@ -200,7 +201,7 @@ class LidarEdgeStream:
     def _answered(self, question: _Question, outcome: JobOutcome) -> None:
         self.unanswered -= 1
         if question not in self._questions:
-            return  # of a time that is over
+            return  # it was asked before sensor time stepped back
         said, question.rests = self._said(question, outcome)
         self._rig.put(self._name, question.due_ns, said)
         if self._sampler.latest_ns is not None:
@@ -211,7 +212,7 @@ class LidarEdgeStream:
         self._rig.at(self._name, now_ns, waits=waits)
 
     def _said(self, question: _Question, outcome: JobOutcome) -> tuple[LidarsSaid, int]:
-        """What came of a look, and how many are to be left out after it."""
+        """The outcome of a look, and how many looks are to be left out after it."""
         answer = outcome.answer
         if not isinstance(answer, Registered):
             reasons = () if outcome.reason is None else (outcome.reason,)
@@ -235,7 +236,7 @@ class LidarEdgeStream:
     # --- inside -----------------------------------------------------------------------------------------------------
 
     def _begin_new_time(self) -> None:
-        """Sensor time stepped back: what was asked in the old one tells nothing in the new."""
+        """Sensor time has stepped back: drops all looks and questions, whose stamps mean nothing in the new time."""
         self._losses["time_stepped_back"] += len(self._questions) + len(self._looks)
         self._looks.clear()
         self._questions.clear()

@@ -1,1 +1,1 @@
-"""Nominal calibrations that the configuration leaves out: what is heard of them, found, and kept."""
+"""Nominal calibrations that the configuration leaves out: listens for them on the bus, finds and keeps them."""

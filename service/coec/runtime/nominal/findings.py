@@ -1,7 +1,7 @@
-"""What is known of a pair whose configuration leaves out its calibration, what is missing, and what it comes to. Pure.
+"""Completes a pair whose configuration leaves out its calibration, or says what is still missing. Pure functions.
 
-Whatever the configuration gives, it gives: only what it leaves out is found. Nothing is assumed: frames that
-`/tf_static` does not connect, or an image of another size than its `CameraInfo`, are reasons to wait.
+What the configuration gives is used as it is; only what it leaves out is looked for. Nothing is assumed: the pair waits
+if `/tf_static` does not connect two frames, or an image has another size than its `CameraInfo`.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ T = TypeVar("T")
 
 
 CHANGED_RAD, CHANGED_M = 1e-6, 1e-6
-"""Of a transform: more is another one. What is published anew is rounded to float64; a thousandth of what is found."""
+"""A transform that differs by more than this is another one (rad, m). One that is published again differs only by the
+rounding of float64. These limits are a thousandth of what a calibration finds."""
 
 CANNOT_BE_BUILT = "cannot_be_built"
-"""Code of a reason: what was found makes no rig."""
+"""Code of a reason: no rig can be built of what was found."""
 
 SHOWN_FRAMES = 24
-"""Frames that a sentence lists at most."""
+"""How many frames a sentence lists at most."""
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./:-]{1,64}")
-"""Names of frames as people give them; others are not repeated, for they are the sender's."""
+"""Names of frames as people give them. Other names are not repeated, because a sender chose them."""
 
 INTRINSICS, EXTRINSIC, CAMERA_FRAME, LIDAR_FRAME, CLOUD, EGO = (
     "camera.intrinsics",
@@ -47,12 +48,12 @@ INTRINSICS, EXTRINSIC, CAMERA_FRAME, LIDAR_FRAME, CLOUD, EGO = (
     "lidar.T_cloud_lidar",
     "ego.T_lidar_ego",
 )
-"""Places of a pair's configuration that are found."""
+"""Places of a pair's configuration that can be found on the bus."""
 
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """The first image: the frame of its header and its size, px."""
+    """The latest image: the frame in its header and its size, px."""
 
     frame_id: str
     width: int
@@ -61,8 +62,8 @@ class Image:
 
 @dataclass(slots=True)
 class Heard:
-    """Of one pair, so far. `cloud` and `ego` are the frames of the first cloud and of the first motion; `refused` says
-    of each source (`camera`, `lidar`, `ego`, `info`) why what came last could not be used."""
+    """What was heard of one pair so far. `cloud` and `ego` are the frame names in the latest cloud and motion.
+    `refused` says for a source (`camera`, `lidar`, `ego`, `info`) why its latest message could not be used."""
 
     image: Image | None = None
     cloud: str | None = None
@@ -73,15 +74,15 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A pair of which everything is known, and where what was found comes from, by its place in the configuration."""
+    """A complete pair, and where each found value comes from, by its place in the configuration."""
 
     pair: PairConfig
     origins: Mapping[str, str]
 
 
 def info_topic_of(pair: OpenPairConfig) -> str | None:
-    """The topic of the `CameraInfo` that tells the intrinsics; None where nothing does: they are given, or the images
-    come on a key, which has no namespace."""
+    """The topic of the `CameraInfo` with the intrinsics. None if the intrinsics are given, or if the images come on a
+    key, which has no namespace."""
     camera = pair.camera
     if camera.intrinsics is not None:
         return None
@@ -91,7 +92,7 @@ def info_topic_of(pair: OpenPairConfig) -> str | None:
 
 
 def needs_transforms(pair: OpenPairConfig) -> bool:
-    """Whether anything that is left out is read off `/tf_static`."""
+    """Whether anything that the configuration leaves out comes from `/tf_static`."""
     ego = pair.ego
     return (
         pair.T_camera_lidar is None
@@ -101,7 +102,7 @@ def needs_transforms(pair: OpenPairConfig) -> bool:
 
 
 def found_of(pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> Found | tuple[Reason, ...]:
-    """The pair, complete; or what it waits for, one reason each."""
+    """The complete pair; or a reason for each thing that it waits for."""
     search = _Search(pair, heard, transforms)
     intrinsics = search.ask(search.intrinsics)
     camera_frame, cloud_frame = search.ask(search.camera_frame), search.ask(search.cloud_frame)
@@ -126,7 +127,7 @@ def found_of(pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -
 
 
 class _MissingError(Exception):
-    """An answer that is missing, and why."""
+    """A value is missing, for a reason."""
 
     def __init__(self, reason: Reason) -> None:
         super().__init__(reason.text)
@@ -134,8 +135,8 @@ class _MissingError(Exception):
 
 
 class _Search:
-    """One look at everything. Each question gives what the configuration says, or else what was found; None where it
-    hangs on another whose answer is missing; and raises where its own is."""
+    """One search for everything that is left out. Each method returns what the configuration gives, else what was
+    found. It returns None if it depends on another value that is missing, and raises if its own value is."""
 
     def __init__(self, pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> None:
         self._pair = pair
@@ -145,7 +146,7 @@ class _Search:
         self.missing: list[Reason] = []
 
     def ask(self, question: Callable[..., T | None], *known: str | None) -> T | None:
-        """What a question gives; None, and a reason in `missing`, where its answer is missing."""
+        """The value of a question; None, and a reason in `missing`, if it is missing."""
         try:
             return question(*known)
         except _MissingError as error:
@@ -242,7 +243,7 @@ class _Search:
 
 
 def changed(found: Found, pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> Reason | None:
-    """What the bus says now otherwise than what the pair was built with; None where it says the same, or nothing."""
+    """In what the bus now contradicts the values with which the pair was built; None if in nothing."""
     built = found.pair
     told = []
     if INTRINSICS in found.origins and heard.info is not None:
@@ -282,7 +283,7 @@ def _frameless(what: str, stream: AnyStreamConfig, place: str) -> str:
 
 
 def _named(frame: str) -> str:
-    """A frame for people; what nobody would call one stays unsaid."""
+    """The name of a frame for people to read; a name that is not plain is not repeated."""
     return repr(frame) if _PLAIN.fullmatch(frame) else "(a frame of no plain name)"
 
 

@@ -1,4 +1,5 @@
-"""Nominal calibrations that were found, in the state directory: a restart has the same, whoever publishes by then."""
+"""Keeps the nominal calibrations that were found in the state directory, so that a restart has the same ones, whatever
+is published by then."""
 
 from __future__ import annotations
 
@@ -25,8 +26,8 @@ NOMINAL_FILE = "nominal.json"
 
 
 class KeptPair(Part):
-    """`Found` on the disk. `asked` is the hash of what was left out and where it was looked for; `found_ns` (wall
-    clock) when it was found."""
+    """`Found` on the disk. `asked` is the hash of what the configuration left out and where it was looked for.
+    `found_ns` is the wall clock when it was found."""
 
     asked: str
     found_ns: Annotated[int, Field(ge=0, lt=2**63)]
@@ -35,7 +36,7 @@ class KeptPair(Part):
 
 
 class KeptNominals:
-    """Those of a vehicle: a book that the scribe writes. Safe to use from several threads."""
+    """The nominal calibrations of a vehicle, as a book that the scribe writes. Safe to use from several threads."""
 
     def __init__(self, folder: Path) -> None:
         self._lock = threading.Lock()
@@ -53,7 +54,8 @@ class KeptNominals:
                 _log.warning("a nominal calibration that was kept has another form", extra={"fields": {"pair": name}})
 
     def found(self, config: Config) -> dict[str, Found]:
-        """What was found earlier of pairs that this configuration awaits, and asks the same for, by their names."""
+        """What was found earlier, by pair, for the pairs that this configuration awaits and for which it still asks the
+        same."""
         found = {pair.name: self._found(pair, config) for pair in config.awaited}
         return {name: one for name, one in found.items() if one is not None}
 
@@ -70,7 +72,7 @@ class KeptNominals:
             document["ego"]["T_lidar_ego"] = earlier.ego.T_lidar_ego
         try:
             complete = PairConfig.model_validate(document)
-            rig_of(complete)  # what it was read for may have changed on the disk: the mask
+            rig_of(complete)  # may fail, because the mask may have changed on the disk
         except (ConfigError, ValidationError) as error:
             _log.warning(f"a nominal calibration that was kept cannot be used: {error}")
             return None
@@ -78,13 +80,13 @@ class KeptNominals:
         return Found(complete, {place: f"{origin}; kept since {since}" for place, origin in kept.origins.items()})
 
     def keep(self, found: Found, asked: OpenPairConfig, config: Config, now_ns: int) -> None:
-        """Put down what was found; on the disk with the next `flush`."""
+        """Keeps what was found; the next `flush` writes it."""
         kept = KeptPair(asked=_asked(asked, config), found_ns=now_ns, pair=found.pair, origins=dict(found.origins))
         with self._lock:
             self._pairs = {**self._pairs, asked.name: kept}
 
     def flush(self) -> None:
-        """Put on the disk what was put down.
+        """Writes to the disk what is kept.
 
         Raises:
             StateError: it cannot be written; the next call tries again.
@@ -95,7 +97,7 @@ class KeptNominals:
 
 
 def _asked(pair: OpenPairConfig, config: Config) -> str:
-    """Hash of what is given and where the rest is looked for; other settings may change."""
+    """Hash of what the configuration gives and where the rest is looked for. Other settings may change."""
     question = pair.model_dump(
         mode="json",
         include={
@@ -110,14 +112,15 @@ def _asked(pair: OpenPairConfig, config: Config) -> str:
 
 
 def completed(config: Config, found: Mapping[str, PairConfig]) -> Config:
-    """The configuration with these pairs, by their names, among those of which everything is known."""
+    """The configuration in which these pairs, by their names, are moved from the awaited ones to the complete ones."""
     joined = tuple(found[pair.name] for pair in config.awaited if pair.name in found)
     still = tuple(pair for pair in config.awaited if pair.name not in found)
     return config.model_copy(update={"pairs": (*config.pairs, *joined), "awaited": still})
 
 
 def with_kept(config: Config) -> Config:
-    """A configuration with what a service found of its awaited pairs, and keeps in its state directory."""
+    """The configuration completed by what a service has found for its awaited pairs and keeps in its state
+    directory."""
     if not config.awaited:
         return config
     kept = KeptNominals(config.state.directory).found(config)

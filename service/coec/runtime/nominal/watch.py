@@ -1,8 +1,8 @@
 """The thread that listens for what the configuration leaves out: first frames, `CameraInfo`, `/tf_static`.
 
-Samples wait in bounded queues that the network's threads fill; everything else belongs to this thread. What it has
-found lies ready for the main thread, which builds the pairs. It goes on listening to `/tf_static` and `CameraInfo`
-afterwards: what they say otherwise by then is told, and changes nothing.
+Samples wait in bounded queues that the network's threads fill; everything else belongs to this thread. The main thread
+takes what was found, and builds the pairs. Afterwards the thread goes on listening to `/tf_static` and `CameraInfo`. If
+they then say something else, that is reported but changes nothing.
 """
 
 from __future__ import annotations
@@ -30,22 +30,23 @@ from coec.runtime.nominal.findings import Found, Heard, Image, changed, found_of
 _log = logging.getLogger(__name__)
 
 TRANSFORMS_WAITING = 512
-"""Messages of static transforms that may wait; a vehicle has some ten publishers, each of which says one."""
+"""How many messages of static transforms may wait. A vehicle has some ten publishers with one message each."""
 
 MAX_WAITING_BYTES = 8 * 2**20
-"""Of all of them; several thousand transforms."""
+"""Limit for all these messages together, bytes: several thousand transforms."""
 
 TOO_LARGE = Sample(bytes(MAX_INFO_BYTES + 1), CDR)
-"""Waits in place of a `CameraInfo` that is larger than any."""
+"""Waits in place of a `CameraInfo` that is too large."""
 
 TRANSFORMS_A_TURN = 64
-"""Taken at once: with a turn every `IDLE_S` a flood costs at most some 250 messages a second."""
+"""How many messages are taken in one turn. With a turn every `IDLE_S` a flood costs at most some 250 messages a
+second."""
 
 IDLE_S = 0.25
-"""Between two turns."""
+"""Time between two turns, s."""
 
 INFO = "info"
-"""Place of a loss: a `CameraInfo`, as `camera` and the others are places."""
+"""Place of a loss: a `CameraInfo`. The streams `camera` and so on are places, too."""
 
 TRANSFORMS = "tf_static"
 """Place of a loss: a message of static transforms."""
@@ -53,13 +54,14 @@ TRANSFORMS = "tf_static"
 
 @dataclass(frozen=True, slots=True)
 class Nominal:
-    """What there is to say of a pair's nominal calibration.
+    """What is known of a pair's nominal calibration.
 
     Attributes:
-        awaits: what is missing, one reason each; empty for a pair that is built.
-        origins: where what was found comes from, by its place in the configuration.
-        changed: what the bus says otherwise by now.
-        losses: samples that could not be used, by place and cause; those of `/tf_static` are the vehicle's.
+        awaits: a reason for each thing that is missing; empty for a pair that is built.
+        origins: where each found value comes from, by its place in the configuration.
+        changed: in what the bus contradicts the values by now; None: in nothing.
+        losses: number of samples that could not be used, by place and cause; those of `/tf_static` are counted for the
+            whole vehicle.
     """
 
     awaits: tuple[Reason, ...] = ()
@@ -76,7 +78,7 @@ BEING_BUILT = Reason("being_built", "Everything that the configuration leaves ou
 
 @dataclass(slots=True)
 class _Pair:
-    """One pair, on the thread."""
+    """An awaited pair and what was heard of it."""
 
     pair: OpenPairConfig
     samples: Mapping[str, SampleReader]
@@ -89,11 +91,12 @@ class _Pair:
 
 
 class NominalWatch:
-    """Of a vehicle. `take_*` are for the network's threads, `look` for this one, all else for any."""
+    """Listens for the awaited pairs of a vehicle. `take_*` are for the network's threads, `look` for this thread, all
+    else for any."""
 
     def __init__(self, config: Config, earlier: Mapping[str, Found]) -> None:
-        """`config` is as it was read; `earlier` are those of its awaited pairs that are built with what was found
-        before the start."""
+        """`config` is the configuration as it was read. `earlier` holds those of its awaited pairs that are built with
+        values from before the start."""
         self.thread = ServiceThread("nominal", self._run)
         self._config = config
         asked = {pair.name: pair for pair in config.awaited}
@@ -142,18 +145,18 @@ class NominalWatch:
     # --- on any -----------------------------------------------------------------------------------------------------
 
     def nominal(self, pair: str) -> Nominal:
-        """Of a pair; that of one whose configuration gives everything is empty."""
+        """The nominal calibration of a pair; empty for a pair whose configuration gives everything."""
         return self._nominals.get(pair, Nominal())
 
     def ready(self) -> dict[str, Found]:
-        """Pairs that were found and nobody has taken yet."""
+        """Takes out the pairs that were completed since the last call."""
         with self._condition:
             ready, self._ready = self._ready, {}
         return ready
 
     def end(self, pair: str, outcome: Found | Reason) -> None:
-        """What became of a pair that was ready: it is built of what was found; or why it cannot be, and is awaited
-        until something else is heard."""
+        """Reports what became of a pair that was ready: it is built; or it cannot be built, for a reason, and is
+        awaited until something else is heard."""
         with self._condition:
             self._outcomes[pair] = outcome
 
@@ -166,7 +169,7 @@ class NominalWatch:
             time.sleep(IDLE_S)
 
     def look(self) -> None:
-        """Take what has come, and see what it comes to."""
+        """Takes what has come, and judges each pair anew."""
         with self._condition:
             count = min(len(self._waiting), TRANSFORMS_A_TURN)
             transforms = [self._waiting.popleft() for _ in range(count)]
@@ -257,7 +260,7 @@ class NominalWatch:
 
 
 def _attempt(take: Callable[[], None]) -> str | None:
-    """Take a sample; the cause for which it could not be. A fault of a decoder costs the sample, not the service."""
+    """Takes a sample; returns the cause if that fails. A fault of a decoder costs the sample, not the service."""
     try:
         take()
     except DecodeError as error:
@@ -269,7 +272,7 @@ def _attempt(take: Callable[[], None]) -> str | None:
 
 
 def _tell_lost(place: str, cause: str, count: int) -> None:
-    """The first of each kind, and then every 2^n-th."""
+    """Logs the first loss of each kind, and then every 2^n-th."""
     if count & (count - 1) == 0:
         _log.warning(f"lost: {cause}", extra={"fields": {"place": place, "count": count}})
 
@@ -282,7 +285,7 @@ def _payload(sample: Sample, expected: str) -> bytes:
     """The bytes of a sample of this type.
 
     Raises:
-        DecodeError: it says that it is something else.
+        DecodeError: the sample says that it is of another type.
     """
     encoding, _, type_name = sample.encoding.partition(";")
     if encoding == CDR and type_name not in ("", expected):
@@ -291,5 +294,5 @@ def _payload(sample: Sample, expected: str) -> bytes:
 
 
 def _readers(pair: OpenPairConfig, config: Config) -> dict[str, SampleReader]:
-    """By stream."""
+    """Readers of the pair's streams, by stream."""
     return {name: SampleReader(name, stream, config.limits) for name, stream in pair.streams.items()}

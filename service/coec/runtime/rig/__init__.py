@@ -1,1 +1,1 @@
-"""What the pairs of one vehicle say together: in one order, by one thread."""
+"""Puts together what the pairs of one vehicle report, in one order and on one thread."""

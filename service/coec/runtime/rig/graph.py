@@ -1,4 +1,4 @@
-"""The sensors of a vehicle, by the configuration of its pairs: nodes and edges of its rig."""
+"""The rig of a vehicle as a graph, from the configuration of its pairs: sensors are nodes, pairs are edges."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from coec.config import LinkConfig, PairConfig
 def graph_of(
     pairs: Mapping[str, tuple[PairConfig, Matrix4]], links: Sequence[LinkConfig], of_lidars: Sequence[Edge] = ()
 ) -> RigGraph:
-    """Of pairs by name, each with its nominal calibration (4, 4), and edges between their LiDARs. Edges and links of
-    sensors that are not there yet are left out.
+    """The graph of pairs by name, each with its nominal calibration (4, 4), and of edges between their LiDARs. Edges
+    and links of sensors that no pair has yet are left out.
 
     Raises:
-        ValueError: more sensors than a rig may have.
+        ValueError: there are more sensors than a rig may have.
     """
     sensors: dict[str, Sensor] = {}
     edges = []
@@ -33,7 +33,7 @@ def graph_of(
 
 
 def sensors_of(pair: PairConfig) -> tuple[str, str]:
-    """What its camera and its LiDAR are called, whatever other pairs they are of."""
+    """Names of a pair's camera and LiDAR; they are the same in every pair that shares the sensor."""
     camera, lidar = pair.camera.sensor, pair.lidar.sensor
     return camera, f"{lidar} (LiDAR)" if lidar == camera else lidar
 

@@ -1,8 +1,8 @@
-"""The thread that puts together what the pairs of a vehicle say: it alone changes what is known of the rig.
+"""The thread that puts together what the pairs of a vehicle report. Only this thread changes what is known of the rig.
 
-Pairs hand in what they say from their own threads; here it is taken in one order (`order`). What the rig has to tell a
-pair counts `LAG_NS` later in the choice of the pair's frames, which wait for it: as what a pair asks of the worker, it
-then changes the same things at the same sensor time, however long it takes to be known.
+Pairs hand in their reports from their own threads; here they are taken in one order (`order`). What the rig tells a
+pair counts `LAG_NS` later in the choice of the pair's frames, and the frames wait for it. So it changes the same things
+at the same sensor time, however long it takes to compute, just like the worker's answers to a pair.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ from coec.runtime.rig.wishes import Wish, wishes
 _log = logging.getLogger(__name__)
 
 LAG_NS = 15 * NS_PER_S
-"""Sensor time from what the pairs say to what they are told: a pair that is slower by that than another, for its
-windows take the worker so long, holds the other up."""
+"""Sensor time from a report of a pair until what the rig tells the pairs counts. If the windows of one pair take the
+worker so long that the pair is this far behind another, it holds the other up."""
 
 QUIET_TICKS = 4
-"""Looks at the clock without a frame of any pair, after which, once every question is answered, what was said is taken
-as it came: nothing earlier can come. Looks, not seconds: a process that slept has samples to take first."""
+"""Ticks without a frame of any pair after which, once every question is answered, all reports are taken: nothing
+earlier can come. Ticks are counted instead of seconds, because a process that slept has samples to take first."""
 
 TICK_S = 1.0
 
 MOST_CORRECTIONS = 4
-"""Of one pair that wait for its frames: of a pair without frames the newest ones are the truth."""
+"""How many corrections of one pair may wait for its frames. If a pair has no frames, the newest ones stay."""
 
 SAVE_NS = 60 * NS_PER_S
-"""Sensor time between two savings while nothing happens: what is lost by a kill is a minute of looks."""
+"""Sensor time between two savings while nothing happens. If the process is killed, a minute of looks is lost."""
 
 ONE_PAIR = Reason("one_pair", "One pair cannot tell its camera from its LiDAR: its `health` says whether either moved.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigKnown:
-    """All that is known at one moment, for whoever tells it.
+    """Everything that is known of the rig at one moment, from which the answers are made.
 
     Attributes:
         graph: the sensors and pairs; None before the first pair.
-        rig: None while there is no rig to speak of; `why` not, then.
-        stamp_ns: all that counts up to this sensor time is in it; None before any.
-        correction: the latest, and from when it counts.
-        lidars: every two of them.
-        losses: by cause.
+        rig: what is known of the rig; None while there is none, and then `why` says why.
+        stamp_ns: everything that counts up to this sensor time is included; None before anything is.
+        from_ns: sensor time from which the latest correction counts.
+        lidars: every two LiDARs.
+        losses: number of losses, by cause.
     """
 
     graph: RigGraph | None = None
@@ -78,12 +78,12 @@ class RigKnown:
 
 
 class _SteppedBack:
-    """Sensor time did."""
+    """Report that sensor time has stepped back."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Joined:
-    """A pair that is new."""
+    """A new pair."""
 
     config: PairConfig
     nominal: Matrix4
@@ -92,11 +92,11 @@ class _Joined:
 
 
 class RigKeeper:
-    """Of one vehicle. `put`, `at`, `step_back`, `corrections`, `window_wanted`, `join` and `join_lidars` are for any
-    thread; everything else belongs to `thread`."""
+    """The rig of one vehicle. `put`, `at`, `step_back`, `corrections`, `window_wanted`, `join` and `join_lidars` are
+    for any thread; everything else belongs to `thread`."""
 
     def __init__(self, folder: Path, links: Sequence[LinkConfig], scribe: Scribe) -> None:
-        """`listen` is to be called before anything is told."""
+        """Call `listen` before the first report."""
         self.thread = ServiceThread("rig", self._run)
         self._links = tuple(links)
         self._scribe = scribe
@@ -120,8 +120,8 @@ class RigKeeper:
         self._wake: Callable[[], None] = lambda: None
 
     def listen(self, tell: Callable[[RigKnown], None], wake: Callable[[], None]) -> None:
-        """`tell` hears what is known whenever it has changed, now for the first time; `wake` is called when frames that
-        wait for the rig may be looked at."""
+        """Sets two callbacks. `tell` is called with what is known: now, and whenever it has changed. `wake` is called
+        when frames that wait for the rig may be looked at."""
         self._tell, self._wake = tell, wake
         self._tell_now()
 
@@ -130,8 +130,8 @@ class RigKeeper:
     def join(
         self, pair: PairConfig, nominal: Matrix4, state: PairState, has_all_answers: Callable[[], bool]
     ) -> PairOfRig:
-        """A pair is of the rig from now on: its nominal calibration (4, 4), its state at the start, and whether
-        whatever it asked is answered."""
+        """Adds a pair to the rig: with its nominal calibration (4, 4) and its state at the start. `has_all_answers`
+        says whether all its questions are answered."""
         accepted = state.accepted
         window = None if accepted is None else Windowed(Measurement.of(accepted), start_ns_of(accepted.window_id))
         serves = served_by(state, prior_sigma(pair.tracker))
@@ -144,8 +144,8 @@ class RigKeeper:
         return PairOfRig(pair, self)
 
     def join_lidars(self, known: LidarsKnown, has_all_answers: Callable[[], bool]) -> None:
-        """Two LiDARs of pairs that have joined are looked at, or are not and that is to be told. Of them is spoken by
-        the name of their edge; it is of the rig once a look has told where it is."""
+        """Adds two LiDARs of pairs that have joined, whether they are looked at or not. The name of their edge stands
+        for them. The edge belongs to the rig once a look has measured it."""
         with self._condition:
             self._have_all_answers.append(has_all_answers)
             self._order.put(known.edge.name, None, known)
@@ -157,7 +157,7 @@ class RigKeeper:
             if self._count < 2:
                 if isinstance(said, Look):
                     return
-                due_ns = None  # there is nobody whose word it could overtake
+                due_ns = None  # there is no other pair whose report it could overtake
             self._order.put(pair, due_ns, said)
             if self._order.is_ready:
                 self._condition.notify_all()
@@ -204,7 +204,7 @@ class RigKeeper:
             return wish.since_ns
 
     def request_stop(self) -> None:
-        """Take what was said, and end the thread."""
+        """Has the thread take what was reported, and end."""
         self.thread.request_stop()
         with self._condition:
             self._condition.notify_all()
@@ -218,13 +218,13 @@ class RigKeeper:
         self.finish()
 
     def finish(self) -> None:
-        """Take all that was said, in its order, and put what is known on the disk; for the end of the service."""
+        """Takes all reports in their order, and saves what is known; for the end of the service."""
         while self._take_one(silent=True):
             pass
         self._save()
 
     def work(self, timeout_s: float) -> bool:
-        """Take what comes next, waiting for it for so long; whether something came."""
+        """Takes the next report, waiting for it up to `timeout_s`; returns whether one came."""
         with self._condition:
             if not self._order.is_ready and timeout_s > 0.0 and not self._condition.wait(timeout_s):
                 self._quiet_ticks += 1
@@ -240,7 +240,7 @@ class RigKeeper:
         before = self._rig
         try:
             self._after(said.pair, said.due_ns, said.what)
-        except ValueError as error:  # numbers that are no evidence: of an estimate that went wrong
+        except ValueError as error:  # unusable numbers, from an estimate that went wrong
             self._losses["refused"] += 1
             _log.warning(f"the rig does without what {said.pair} said: {error}")
         with self._condition:
@@ -280,14 +280,14 @@ class RigKeeper:
             self._rig = vehicle.after_lidars(self._rig, said.told.look, said.told.window)
 
     def _meanwhile(self, pair: str, what: Said | _SteppedBack) -> None:
-        """There is no rig yet: what a pair comes to until there is one."""
+        """While there is no rig, keeps what a pair serves and its window."""
         if isinstance(what, Served):
             self._pairs[pair] = replace(self._pairs[pair], serves=what)
         elif isinstance(what, Windowed):
             self._pairs[pair] = replace(self._pairs[pair], window=what)
 
     def _grow(self) -> None:
-        """There is one more pair, or edge between two LiDARs."""
+        """Builds the rig anew, after one more pair or one more edge between two LiDARs."""
         measured = [known.edge for known in self._lidars.values() if known.looks]
         try:
             told = {name: (joined.config, joined.nominal) for name, joined in self._pairs.items()}
@@ -300,15 +300,15 @@ class RigKeeper:
             return
         self._why = self._file.damage
         serves = {name: joined.serves for name, joined in self._pairs.items()}
-        # As built; it is no pose that the first look, which is one of many, were to replace.
+        # LiDAR edges begin with the pose as built. A single look must not replace it: it is only one of many.
         serves |= {edge.name: Served(edge.T_a_b, KNOWN_BEFORE, order.NEVER_NS) for edge in measured}
         windows = {name: joined.window for name, joined in self._pairs.items() if joined.window is not None}
         fresh = self._file.recalled(vehicle.begun(self._graph, serves, windows))
         self._rig = fresh if self._rig is None else vehicle.grown(self._rig, fresh)
 
     def _tell_pairs(self, before: VehicleRig | None, stamp_ns: int) -> None:
-        """Hand a new correction to the pairs that it is for, and say of which a window is awaited now. With the
-        lock."""
+        """Hands a new correction to its pairs, and wishes to the pairs of which a window is awaited now. Called with
+        the lock."""
         rig = self._rig
         self._wishes |= wishes(before, rig, stamp_ns + LAG_NS)
         if rig is None or rig.correction is None or (before is not None and before.correction is rig.correction):

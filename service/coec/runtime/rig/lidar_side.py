@@ -1,4 +1,4 @@
-"""Two LiDARs of a vehicle as the rig is told of them: what a look at them came to, or why there was none."""
+"""What the rig is told of two LiDARs of a vehicle: the result of a look at them, or why there was none."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from coec.calibration.types import Reason
 
 
 class LidarState(StrEnum):
-    """Of two LiDARs. `not_measured`: nothing ever looks at them; `waiting`: nothing has yet; `measured`: the latest
-    look tells where the one sits in the other; `refused`: it does not, or there was none."""
+    """State of two LiDARs. `not_measured`: nothing ever looks at them. `waiting`: nothing has looked at them yet.
+    `measured`: the latest look gives the pose of one in the other. `refused`: it does not, or no look was possible."""
 
     NOT_MEASURED = "not_measured"
     WAITING = "waiting"
@@ -25,14 +25,14 @@ class LidarState(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """What a look told.
+    """The result of a look at two LiDARs a and b.
 
     Attributes:
-        look: where b sits in a, for who asks which sensor moved.
+        look: the pose of b in a, as evidence of which sensor moved.
         window: the same for the joint estimate.
-        range_bias: by how much b measures longer than a.
+        range_bias: by how much b measures longer ranges than a.
         rms_m: distance of the points of b from the surfaces of a.
-        points, share: of b that met one.
+        points, share: number and share of the points of b that met a surface.
     """
 
     look: Look
@@ -45,13 +45,13 @@ class Registration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarsSaid:
-    """What came of a look, or of the sweeps that should have made one.
+    """The outcome of a look, or of the sweeps that should have given one.
 
     Attributes:
-        stamp_ns: of its last sweep.
-        told: what it told; None where it was refused.
-        reasons: why, exactly where it was.
-        losses: sweeps and looks that were lost up to there, by cause.
+        stamp_ns: stamp of the last sweep of the look.
+        told: the result; None if the look was refused.
+        reasons: why it was refused; empty exactly if it was not.
+        losses: number of sweeps and looks that were lost so far, by cause.
     """
 
     stamp_ns: int
@@ -62,15 +62,15 @@ class LidarsSaid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarsKnown:
-    """All that is known of two LiDARs.
+    """Everything that is known of two LiDARs.
 
     Attributes:
-        edge: as they were built.
-        state: see there.
-        reasons: of the state; empty where they are measured.
-        stamp_ns: of the latest look that was done or refused; None before the first.
-        told: by the latest that was not refused.
-        looks: that told something.
+        edge: the two LiDARs and their pose as built.
+        state: see `LidarState`.
+        reasons: reasons for the state; empty if they are measured.
+        stamp_ns: stamp of the latest look that was done or refused; None before the first.
+        told: result of the latest look that was not refused.
+        looks: number of looks that had a result.
         losses: see `LidarsSaid`.
     """
 
@@ -83,7 +83,7 @@ class LidarsKnown:
     losses: Mapping[str, int] = field(default_factory=dict)
 
     def after(self, said: LidarsSaid) -> LidarsKnown:
-        """With what came of one more look."""
+        """This knowledge with the outcome of one more look."""
         known = replace(self, stamp_ns=said.stamp_ns, reasons=said.reasons, losses=said.losses)
         if said.told is None:
             return replace(known, state=LidarState.REFUSED)

@@ -1,10 +1,11 @@
-"""One order for what several pairs say, whatever the order in which it is known.
+"""Puts the reports of several pairs into one order, whatever the order in which they arrive.
 
-What a pair says has a sensor time: that from which it counts (`decisions.queue`). A pair that is at some sensor time
-has said everything that counts up to there. What all pairs have passed is taken in the order of these times, and of the
-names of the pairs where they are the same. So a drive that is replayed, at any rate, is put together in the same way.
+Every report has a sensor time from which it counts (`decisions.queue`). A pair that has come to some sensor time has
+made all its reports that count up to there. Reports up to the time that all pairs have passed are taken, in the order
+of these times; for equal times, in the order of the pairs' names. So a replay of a drive gives the same order at any
+rate.
 
-A pair whose streams have stopped is not waited for.
+The order does not wait for a pair whose streams have stopped.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from coec.runtime.ingest.sensor_clock import NS_PER_S
 T = TypeVar("T")
 
 SILENT_NS = 3 * NS_PER_S
-"""Sensor time by which a pair that has nothing to wait for may be behind the foremost: cameras of a rig come within a
-tenth of a second of each other, and networks within one."""
+"""Sensor time by which a pair that waits for no answer may be behind the foremost pair before its streams count as
+stopped. Cameras of a rig come within a tenth of a second of each other, and over a network within one second."""
 
 MOST_WAITING = 4096
-"""Of what was said and is not taken. Pairs wait for each other long before: a pair says three things in a second at
-most, of which 32 pairs say so many in 40 s."""
+"""How many reports may wait to be taken. Pairs wait for each other long before: a pair makes at most three reports a
+second, so 32 pairs need 40 s for so many."""
 
 NEVER_NS = -(2**62)
 """Before any sensor time."""
@@ -32,7 +33,7 @@ NEVER_NS = -(2**62)
 
 @dataclass(frozen=True, slots=True, order=True)
 class Said(Generic[T]):
-    """Something that a pair said, and the sensor time from which it counts."""
+    """A report of a pair, and the sensor time from which it counts."""
 
     due_ns: int
     pair: str
@@ -42,18 +43,18 @@ class Said(Generic[T]):
 
 @dataclass(slots=True)
 class _Place:
-    """Where a pair is: all that counts up to `at_ns` is said, and pairs of frames have come up to `head_ns`."""
+    """Where a pair is: all its reports that count up to `at_ns` are made, and its frames have come up to `head_ns`."""
 
     at_ns: int
     head_ns: int
 
 
 class Order(Generic[T]):
-    """Of one vehicle. Not safe for use from several threads at once: its owner has a lock.
+    """The order of the reports of one vehicle. Not safe for use from several threads at once: its owner has a lock.
 
     Attributes:
-        taken_ns: all that counts up to here was taken.
-        losses: what came out of order, by cause.
+        taken_ns: all reports that count up to here were taken.
+        losses: number of reports that came out of order or were lost, by cause.
     """
 
     def __init__(self) -> None:
@@ -65,8 +66,8 @@ class Order(Generic[T]):
         self._taking = False
 
     def at(self, pair: str, stamp_ns: int, *, waits: bool) -> None:
-        """A pair has frames of this sensor time; it `waits` to look at them for answers that count up to there, or has
-        said all of them."""
+        """A pair has frames of this sensor time. If it `waits`, answers that count up to there are still missing; else
+        it has made all its reports up to there."""
         place = self._places.get(pair)
         if place is None:
             place = self._places[pair] = _Place(stamp_ns - 1 if waits else stamp_ns, stamp_ns)
@@ -76,7 +77,7 @@ class Order(Generic[T]):
         self._advance()
 
     def put(self, pair: str, due_ns: int | None, what: T) -> None:
-        """A pair says something that counts from a sensor time on; None: from now on."""
+        """Takes in a report of a pair that counts from a sensor time on (None: from now on)."""
         if due_ns is None:
             due_ns = self.taken_ns
         elif due_ns <= self.taken_ns:
@@ -89,27 +90,27 @@ class Order(Generic[T]):
         self._advance()
 
     def take(self, *, all_are_silent: bool) -> Said[T] | None:
-        """What is to be taken next, and to be followed by `took`; None while that is not certain. Once the streams of
-        all pairs have stopped, nothing is waited for."""
+        """Takes out the next report; `took` has to follow. None while an earlier report may still come. Once the
+        streams of all pairs have stopped, nothing is waited for."""
         if not self._waiting or not (all_are_silent or self._waiting[0].due_ns <= self._passed_ns()):
             return None
         self._taking = True
         return heapq.heappop(self._waiting)
 
     def took(self, said: Said[T]) -> None:
-        """All that follows from it is known."""
+        """Everything that follows from a report that was taken is known now."""
         self._taking = False
         self.taken_ns = max(self.taken_ns, said.due_ns if not self._waiting else self.taken_ns)
         self._advance()
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is something that is to be taken."""
+        """Whether a report can be taken."""
         return bool(self._waiting) and self._waiting[0].due_ns <= self._passed_ns()
 
     def step_back(self, stamp_ns: int, what: T) -> None:
-        """Sensor time has stepped back, to this stamp. What waits counts still, then comes `what`, and with it the new
-        time."""
+        """Sensor time has stepped back to this stamp. Waiting reports still count; then comes `what`, and after it the
+        new time."""
         self.losses["time_stepped_back"] += 1
         waiting = [replace(said, due_ns=stamp_ns, pair="") for said in sorted(self._waiting)]
         self._number += len(waiting) + 1
@@ -122,7 +123,7 @@ class Order(Generic[T]):
         self._advance()
 
     def _passed_ns(self) -> int:
-        """Where all pairs are whose streams have not stopped."""
+        """Sensor time up to which all pairs whose streams have not stopped have made their reports."""
         foremost_ns = max((place.head_ns for place in self._places.values()), default=NEVER_NS)
         return min(
             (

@@ -1,4 +1,4 @@
-"""One pair of a rig, as the threads of the pair see it: what it says, and what it is told."""
+"""The rig as the threads of one pair use it: what the pair reports to it, and what it tells the pair."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from coec.config import PairConfig
 from coec.runtime.recording.window_store import start_ns_of
 
 Said = Look | Windowed | Served
-"""What a pair may say."""
+"""What a pair may report."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
-    """What a pair is told of itself, decided at a sensor time with all others; it counts `from_ns` on.
+    """A correction of one pair, which was decided at a sensor time together with those of the other pairs.
 
     Attributes:
+        from_ns: sensor time from which it counts.
         text: why, in one sentence.
     """
 
@@ -40,25 +41,26 @@ class Keeps(Protocol):
     """The rig; see `keeper`."""
 
     def put(self, pair: str, due_ns: int | None, said: Said) -> None:
-        """A pair says something that counts from a sensor time on; None: from now on."""
+        """Takes in a report of a pair that counts from a sensor time on (None: from now on)."""
 
     def at(self, pair: str, stamp_ns: int, *, waits: bool) -> bool:
-        """A pair has frames of this sensor time; it `waits` for answers of its own, or has said all that counts up to
-        there. Whether the rig may still have something to tell it that counts by then."""
+        """A pair has frames of this sensor time. If it `waits`, answers to its own questions are missing; else it has
+        made all its reports up to there. Returns whether the rig may still tell it something that counts by then."""
 
     def step_back(self, pair: str, stamp_ns: int) -> None:
         """Sensor time has stepped back for a pair, to this stamp."""
 
     def corrections(self, pair: str, stamp_ns: int) -> list[Correction]:
-        """Those that count from this sensor time on, or from an earlier one, each told once."""
+        """Corrections of a pair that count from this sensor time or an earlier one; each is returned once."""
 
     def window_wanted(self, pair: str, stamp_ns: int) -> int | None:
-        """Since which sensor time the rig wants pairs of frames for a window, as it counts at this one; told once."""
+        """Sensor time since which the rig wants pairs of frames for a window, if the wish counts by `stamp_ns`;
+        returned once."""
 
 
 class PairOfRig:
-    """Of one pair. What it says is for the thread that decides about the pair, what it is told for that of its
-    stream."""
+    """One pair of the rig. The thread that decides about the pair makes its reports; the thread of its stream takes
+    what the rig tells it."""
 
     def __init__(self, pair: PairConfig, rig: Keeps) -> None:
         self._name = pair.name
@@ -68,7 +70,7 @@ class PairOfRig:
     # --- on the thread that decides ---------------------------------------------------------------------------------
 
     def looked(self, due_ns: int, before: PairState, after: PairState, observation: Observation) -> None:
-        """A check of what was served `before` was completed."""
+        """A check of the extrinsic that was served `before` was completed."""
         share = share_told(before.monitor, observation)
         look = of_check(self._name, before.T_camera_lidar, observation, share, after.flagged_since_ns)
         if look is not None:
@@ -85,17 +87,17 @@ class PairOfRig:
     # --- on the thread of the stream --------------------------------------------------------------------------------
 
     def must_wait(self, stamp_ns: int, *, for_own: bool) -> bool:
-        """Whether the rig may still have something to tell that counts before a pair of frames of this stamp is looked
-        at. `for_own`: answers of this pair are awaited anyway."""
+        """Whether the rig may still tell something that counts before a pair of frames of this stamp is looked at.
+        `for_own`: the pair waits for answers to its own questions anyway."""
         return self._rig.at(self._name, stamp_ns, waits=for_own)
 
     def corrections(self, stamp_ns: int) -> list[Correction]:
-        """Those that count before a pair of frames of this stamp is looked at, each told once."""
+        """Corrections that count before a pair of frames of this stamp is looked at; each is returned once."""
         return self._rig.corrections(self._name, stamp_ns)
 
     def window_wanted(self, stamp_ns: int) -> int | None:
-        """Since which sensor time the rig wants pairs of frames for a window, before one of this stamp is looked at;
-        told once. None: it wants none."""
+        """Sensor time since which the rig wants pairs of frames for a window, asked before a pair of this stamp is
+        looked at; returned once. None: it wants no window."""
         return self._rig.window_wanted(self._name, stamp_ns)
 
     def time_stepped_back(self, stamp_ns: int) -> None:
@@ -104,7 +106,7 @@ class PairOfRig:
 
 
 Joins = Callable[[PairConfig, PairState], PairOfRig]
-"""How a pair becomes one of the rig, with what it serves at its start."""
+"""Adds a pair to the rig, with what it serves at its start."""
 
 
 def served_by(state: PairState, prior: NDArray[np.float64]) -> Served:

@@ -1,7 +1,7 @@
-"""What is known of a rig over a restart, `sensors.json`: where its pairs were, which of its sensors had moved, and what
-was known before they did.
+"""The file `sensors.json` keeps over a restart what is known of a rig: where its pairs were, which of its sensors had
+moved, and what was known before they did.
 
-A sensor that is knocked while the service is down is told by the first looks after it.
+If a sensor is knocked while the service is down, the first looks after the start show it.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ from coec.schemas.replies import Maybe6x6, Row4, Vector6
 FILE = "sensors.json"
 
 MOST_PAIRS = 128
-"""In a file that is looked at: twice as many as a vehicle may have, and as many edges between its LiDARs."""
+"""Most pairs that a file may hold to be read: twice as many as a vehicle may have, and as many edges between its
+LiDARs."""
 
 MOST_TERMS = 32
-"""Of a covariance, in a file that is looked at: three times as many as there are."""
+"""Most terms of a covariance that a file may hold to be read: three times as many as there are."""
 
 Rows = tuple[Row4, Row4, Row4, Row4]
 Sigma = Annotated[float, Field(gt=0, lt=MOST_SIGMA)]
@@ -45,7 +46,7 @@ Name = Annotated[str, Field(max_length=256)]
 
 
 class StoredEdge(Part):
-    """A pair: its nominal calibration, and where it was before the looks that were kept, as well as that was known."""
+    """A pair: its nominal calibration, and its pose before the looks that were kept, with standard deviations."""
 
     nominal: Rows
     T_camera_lidar: Rows
@@ -53,7 +54,7 @@ class StoredEdge(Part):
 
 
 class StoredKnown(Part):
-    """Where a pair was by all its windows, exact: its covariance in parts, as those of a window are."""
+    """The pose of a pair by all its windows, exactly; its covariance is in parts, like that of a window."""
 
     T_camera_lidar: Rows
     noise: Maybe6x6
@@ -62,7 +63,7 @@ class StoredKnown(Part):
 
 
 class StoredEvent(Part):
-    """A move that was not over, and what was known before it of the pairs of its sensors."""
+    """A move that is not over, and what was known before it of the pairs of its sensors."""
 
     sensors: tuple[Name, ...] = Field(min_length=1, max_length=MOST_SENSORS)
     since_ns: Stamp
@@ -79,10 +80,11 @@ class StoredRig(Part):
 
 
 class RigFile:
-    """`recalled` and `remember` belong to the rig's thread, `flush` to the one that waits for the disk.
+    """The file of one rig. `recalled` and `remember` belong to the rig's thread, `flush` to the one that waits for the
+    disk.
 
     Attributes:
-        damage: what was wrong with the file that was found; empty when nothing was.
+        damage: what was wrong with the file at the start; empty if nothing was.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -104,11 +106,11 @@ class RigFile:
         self.damage = (Reason("rig_state_damaged", text),) if damage else ()
 
     def recalled(self, rig: VehicleRig) -> VehicleRig:
-        """A rig of which nothing was looked at, with what was known before the restart."""
+        """Adds to a fresh rig, before any look, what was known before the restart."""
         histories = dict(rig.believed.histories)
         for name, edge in rig.graph.edge.items():
             stored = self._found.edges.get(name)
-            # Of another nominal calibration it is another mount.
+            # With another nominal calibration the mount is another one.
             if stored is not None and np.array_equal(_pose(stored.nominal), edge.T_a_b):
                 sigma = np.array([np.nan if value is None else value for value in stored.sigma])
                 histories[name] = History.at(_pose(stored.T_camera_lidar), sigma)
@@ -122,7 +124,7 @@ class RigFile:
         return vehicle.going_on(replace(rig, believed=believed), going_on, Before(event.sensors, known))
 
     def remember(self, rig: VehicleRig) -> None:
-        """Keep what is known; on the disk with the next `flush`."""
+        """Keeps what is known; the next `flush` writes it."""
         edges = {}
         for name, edge in rig.graph.edge.items():
             kept = rig.believed.histories[name]
@@ -143,10 +145,10 @@ class RigFile:
             self._body = {"edges": edges, "event": told}
 
     def flush(self) -> None:
-        """Put it on the disk.
+        """Writes what is kept to the disk.
 
         Raises:
-            StateError: it is not possible; the next call tries again.
+            StateError: the disk refuses; the next call tries again.
         """
         with self._lock:
             body, self._body = self._body, None
@@ -161,10 +163,10 @@ class RigFile:
 
 
 def _sound(stored: StoredRig) -> StoredRig:
-    """A checksum tells that a file is as it was written, not that who wrote it was this service.
+    """The file, with its poses and covariances checked: the checksum does not prove that this service wrote it.
 
     Raises:
-        ValueError: a pose is no rigid transform, or a covariance is none.
+        ValueError: a pose is no rigid transform, or a matrix is no covariance.
     """
     for known in () if stored.event is None else stored.event.before.values():
         measured = _measurement(known)
@@ -191,7 +193,8 @@ def _stored(known: Measurement) -> dict[str, Any]:
 
 
 def _measurement(stored: StoredKnown) -> Measurement:
-    """How many looks the windows were worth is asked of no mount that is gone."""
+    """The measurement on the disk. How many looks its windows were worth is not kept, because it does not matter for a
+    mount that has moved since."""
     noise = np.array([[np.nan if value is None else value for value in row] for row in stored.noise])
     systematic = {name: np.array(shift) for name, shift in stored.systematic.items()}
     return Measurement(_pose(stored.T_camera_lidar), Uncertainty(noise, systematic, np.nan), stored.stamp_ns)

@@ -1,5 +1,5 @@
-"""Of which pairs a window is wanted soon: a sensor was named, and one correction for all of its pairs waits for a
-window of each. A pair that suspects nothing itself would come to one with its ordinary slice, minutes later."""
+"""Says of which pairs a window is wanted soon. When a sensor was named, one correction for all its pairs waits for a
+window of each. A pair that suspects nothing itself would end its window minutes later, with its ordinary slice."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class Wish:
     """A window of a pair is wanted.
 
     Attributes:
-        since_ns: of pairs of frames since this sensor time: those before it are of another mount.
-        from_ns: it counts from this sensor time on.
+        since_ns: only frames since this sensor time are wanted; earlier ones show the mount before the move.
+        from_ns: sensor time from which the wish counts.
     """
 
     since_ns: int
@@ -23,7 +23,7 @@ class Wish:
 
 
 def wishes(before: VehicleRig | None, rig: VehicleRig | None, from_ns: int) -> Mapping[str, Wish]:
-    """By pair, what is wanted of it now and was not before; it counts from a sensor time on."""
+    """The new wishes, by pair: those that hold for `rig` and did not for `before`. They count from `from_ns` on."""
     if rig is None or rig.event is None:
         return {}
     known = _awaited(before)
@@ -31,8 +31,8 @@ def wishes(before: VehicleRig | None, rig: VehicleRig | None, from_ns: int) -> M
 
 
 def _awaited(rig: VehicleRig | None) -> tuple[str, ...]:
-    """Pairs of the sensors that moved, while they are not put right, that have no window of after the move. Two LiDARs
-    have no windows: they are registered, in their own time."""
+    """Pairs of the moved sensors without a window since the move, until the sensors are put right. Edges between LiDARs
+    are left out: they have no windows, but are registered at their own times."""
     if rig is None or rig.event is None or rig.event.corrected:
         return ()
     pairs = pairs_of(rig.graph, rig.event.sensors)

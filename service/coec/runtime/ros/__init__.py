@@ -1,1 +1,1 @@
-"""What ROS 2 nodes are told: diagnostics, the calibrated frames, intrinsics, pictures."""
+"""Output to ROS 2: diagnostics, the calibrated frames, intrinsics, pictures."""

@@ -1,4 +1,4 @@
-"""What is published to ROS 2, and when: one thread that tells at least once a second, whatever else stands still."""
+"""Publishes to ROS 2, on one thread that does so at least once a second, whatever else stands still."""
 
 from __future__ import annotations
 
@@ -25,24 +25,25 @@ from coec.schemas import ros_names
 _log = logging.getLogger(__name__)
 
 PERIOD_S: Final = 0.5
-"""Between two diagnostics: twice as often as they are promised, so that a busy processor does not break the promise."""
+"""Longest time between two diagnostics, s. Half of what is promised, so that a busy processor does not break the
+promise."""
 
 LEAST_GAP_S: Final = 0.1
-"""Between two, however often something changes."""
+"""Shortest time between two diagnostics, s, however often something changes."""
 
 CAMERA_INFO_PERIOD_S: Final = 1.0
-"""Between two intrinsics, for subscribers that ask for no latched ones."""
+"""Time between two intrinsics, s, for subscribers that do not ask for latched ones."""
 
 DIAGNOSTICS: Final = Qos(depth=1)
-"""Of `diagnostic_updater`; one message has all pairs."""
+"""QoS of `diagnostic_updater`. Depth 1, because one message holds all pairs."""
 
 PICTURES: Final = Qos(depth=1)
-"""Reliable, so that both kinds of subscribers get them; only the newest is worth anything."""
+"""Reliable, so that both kinds of subscribers get the pictures. Depth 1, because only the newest is useful."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sayable:
-    """A camera as ROS is told of it, as a rig; None where it cannot be. `word` is for people."""
+    """A camera in a form that ROS has words for, as a rig; None if ROS has none. `word` explains it to people."""
 
     source: Rig
     rig: Rig | None
@@ -50,11 +51,11 @@ class _Sayable:
 
 
 class RosOutputs:
-    """Everything that `ros.publish` names, which may be nothing. Its thread is the only one that publishes, but for
-    pictures."""
+    """Publishes everything that `ros.publish` names, which may be nothing. Its thread is the only one that publishes,
+    except for pictures."""
 
     def __init__(self, publishers: RosPublishers | None, config: Config, worker: Asks) -> None:
-        """`publishers` are those of the session, None where it does not speak to ROS. Nothing is declared yet."""
+        """`publishers` are those of the session; None if it does not speak to ROS. Declares nothing yet."""
         self._publishers = publishers
         self._ros = config.ros
         self._frames = CalibratedFrames(config.ros)
@@ -69,26 +70,27 @@ class RosOutputs:
         self._info_s = -CAMERA_INFO_PERIOD_S
         self._woken, self._ending = threading.Event(), threading.Event()
         self.threads: tuple[ServiceThread, ...] = ()
-        """Its thread, where there is something to say, and somebody to say it to."""
+        """The thread that publishes; empty if there is nothing to publish, or the session does not speak to ROS."""
         if publishers is not None and config.ros.publish:
             self.threads = (ServiceThread("ros", partial(self._run, publishers)),)
 
     def start(self, view: Callable[[], View]) -> None:
-        """Tell of what `view()` gives, on the thread of these outputs."""
+        """Starts to publish what `view()` returns, on the thread of these outputs."""
         self._view = view
         for thread in self.threads:
             thread.start()
 
     def wake(self) -> None:
-        """Something has changed. Any thread."""
+        """Something has changed: publishes soon. For any thread."""
         self._woken.set()
 
     def show(self, pair: PairConfig, drawn: FramePair, T_camera_lidar: Matrix4) -> None:
-        """A pair of the stream is being looked at, at an extrinsic (4, 4). Any thread."""
+        """Publishes a picture of a pair of the stream that is being checked at an extrinsic (4, 4), if somebody
+        subscribes. For any thread."""
         self._pictures.show(pair, drawn, T_camera_lidar)
 
     def close(self, within_s: float) -> bool:
-        """Say the last word, and withdraw everything; False when the thread does not end in time."""
+        """Publishes a last time, and withdraws everything; False if the thread does not end in time."""
         for thread in self.threads:
             thread.request_stop()
         self._ending.set()
@@ -112,14 +114,14 @@ class RosOutputs:
         self._tell(publishers)
 
     def _declare(self, publishers: RosPublishers) -> None:
-        """The topics of the whole service."""
+        """Declares the topics of the whole service."""
         if "diagnostics" in self._ros.publish:
             self._diagnostics = publishers.publisher(ros_names.DIAGNOSTICS, messages.DIAGNOSTICS, DIAGNOSTICS)
         if "tf_static" in self._ros.publish:
             self._tf_static = publishers.publisher(ros_names.TF_STATIC, messages.TF, STATIC)
 
     def _declare_of(self, publishers: RosPublishers, pair: str) -> None:
-        """Those of a pair, when it is heard of for the first time."""
+        """Declares the topics of a pair, if it is new."""
         if "camera_info" in self._ros.publish and pair not in self._camera_info:
             topic = ros_names.camera_info_topic(pair)
             self._camera_info[pair] = publishers.publisher(topic, messages.CAMERA_INFO, STATIC)
@@ -150,7 +152,8 @@ class RosOutputs:
             self._diagnostics.put(outgoing.encode_diagnostics(now_ns, statuses), now_ns)
 
     def _tell_frames(self, topic: RosPublisher, view: View, now_ns: int, words: Mapping[str, dict[str, str]]) -> None:
-        """A latched topic holds its last message only: every message has all frames."""
+        """Publishes all frames if any has changed. A latched topic holds only its last message, so every message has
+        all frames."""
         told = self._frames.transforms([pair.extrinsic for pair in view.pairs if pair.extrinsic is not None])
         for pair, word in told.words.items():
             words[pair]["tf"] = word
@@ -189,5 +192,5 @@ def _sayable(rig: Rig) -> _Sayable:
 
 
 def _essence(placed: Sequence[Placed]) -> bytes:
-    """The message as if it were always made at the same time."""
+    """The message with a fixed stamp, for comparison with other messages."""
     return outgoing.encode_transforms(placed, 0)

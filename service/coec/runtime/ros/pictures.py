@@ -1,4 +1,4 @@
-"""Pictures of what is being checked, for whoever looks: asked for only then, one at a time."""
+"""Pictures of the pairs that are being checked. They are drawn only while somebody subscribes, one at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from coec.runtime.worker import jobs
 from coec.runtime.worker.jobs import Drawn, Job, JobOutcome
 
 PERIOD_S = 1.0
-"""Between two pictures of a pair, s; one takes the worker some tenths of a second."""
+"""Time between two pictures of a pair, s. A picture takes the worker some tenths of a second."""
 
 
 class Asks(Protocol):
@@ -30,17 +30,17 @@ class Topic(Protocol):
 
     @property
     def is_heard(self) -> bool:
-        """Whether somebody looks."""
+        """Whether somebody subscribes."""
 
     def put(self, payload: bytes, source_ns: int) -> None:
-        """Publish a message in CDR."""
+        """Publishes a message in CDR."""
 
 
 class Pictures:
-    """Those of all pairs. Any thread."""
+    """The pictures of all pairs. For any thread."""
 
     def __init__(self, worker: Asks, topics: Mapping[str, Topic]) -> None:
-        """`topics` by the names of the pairs; more may be put into it meanwhile."""
+        """`topics` holds the publishers by names of pairs; further ones may be added later."""
         self._worker = worker
         self._topics = topics
         self._lock = threading.Lock()
@@ -48,8 +48,8 @@ class Pictures:
         self._under_way: set[str] = set()
 
     def show(self, pair: PairConfig, drawn: FramePair, T_camera_lidar: Matrix4) -> None:
-        """A pair of the stream is being looked at, at an extrinsic (4, 4): draw it, if somebody looks and the last
-        picture is done and old enough."""
+        """Has a pair of the stream drawn that is being checked at an extrinsic (4, 4), if somebody subscribes and the
+        last picture is done and old enough."""
         topic = self._topics.get(pair.name)
         if topic is None or not topic.is_heard or not self._begin(pair.name):
             return

@@ -1,4 +1,4 @@
-"""What the service is asked for whenever ROS is told something."""
+"""The state of the service from which messages to ROS are made."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coec.schemas.rig_state import RigReply
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairTold:
-    """One pair. `serial` is its camera's; `extrinsic` and `rig` are None while the pair itself is not known yet."""
+    """One pair. `serial` is that of its camera; `extrinsic` and `rig` are None while the pair is awaited."""
 
     health: HealthReply
     serial: str | None
@@ -22,7 +22,7 @@ class PairTold:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The service, its pairs and their rig at one moment; `rig` is None where there is only one pair."""
+    """The service, its pairs and their rig at one moment; `rig` is None if there is only one pair."""
 
     service: Service
     pairs: tuple[PairTold, ...]

@@ -1,4 +1,4 @@
-"""Which transforms are told on `/tf_static`: what is served, under names that say what it is."""
+"""Chooses the transforms for `/tf_static`: the served extrinsics, under frame names that mark them as calibrated."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from coec.schemas.ros_names import ros_name
 
 @dataclass(frozen=True, slots=True)
 class Transforms:
-    """Those to tell, all of one message, and of each pair in a word what is told, or why nothing is."""
+    """The transforms of one message, and for each pair a short text: what is published of it, or why nothing is."""
 
     placed: tuple[Placed, ...]
     words: dict[str, str]
 
 
 class CalibratedFrames:
-    """Each camera's calibrated frame, a child of its LiDAR's: of tf a transform is the pose of the child in the parent,
-    the inverse of T_camera_lidar.
+    """Each camera's calibrated frame, as a child of its LiDAR's frame. In tf a transform is the pose of the child in
+    the parent, so it is the inverse of T_camera_lidar.
 
-    A frame is called calibrated only once something but the nominal calibration is served: until then nobody finds it,
-    and the vehicle's own tree has the nominal one. What was told once stays in the buffers of whoever heard it: after a
-    reset to nominal the frame therefore follows what is served.
+    A calibrated frame is published only once something else than the nominal calibration is served; the vehicle's own
+    tree has the nominal one. A published transform stays in the buffers of its subscribers. Therefore the frame stays
+    published after a reset to nominal, and follows what is served.
     """
 
     def __init__(self, ros: RosConfig) -> None:
@@ -37,7 +37,7 @@ class CalibratedFrames:
         self._told: set[str] = set()
 
     def transforms(self, served: Sequence[ExtrinsicReply]) -> Transforms:
-        """Of what is served of all pairs."""
+        """The transforms for what is served of all pairs."""
         cameras = Counter(_frame(extrinsic.camera_frame) for extrinsic in served)
         placed, words = [], {}
         for extrinsic in served:
@@ -60,7 +60,7 @@ class CalibratedFrames:
         return self._ros.replace_camera_frames or extrinsic.provenance != "nominal" or extrinsic.pair in self._told
 
     def _child(self, pair: str, camera: str, *, shared: bool) -> str | None:
-        """Name of the frame that is told; None where there is none that has no other parent."""
+        """Name of the frame to publish; None if every possible one has another parent already."""
         if self._ros.replace_camera_frames:
             return None if shared else camera
         own = f"{camera}_{ros_name(pair)}" if shared else camera
@@ -68,5 +68,5 @@ class CalibratedFrames:
 
 
 def _frame(frame_id: str) -> str:
-    """As tf2 has it: without the slash that ROS 1 began with."""
+    """The name as tf2 has it, without the leading slash of ROS 1."""
     return frame_id.lstrip("/")
