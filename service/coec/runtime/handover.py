@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class BusyError(CoecError):
-    """The other thread did not begin the work in time, so nothing was done; or the work has begun and not ended."""
+    """The service did not begin the work in time, so nothing was done; or the work has begun and has not ended."""
 
     reply_code = "busy"
 

@@ -1,1 +1,1 @@
-"""What the service says when it is asked."""
+"""The answers of the service to queries and commands."""

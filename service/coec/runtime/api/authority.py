@@ -1,4 +1,5 @@
-"""Who may give which command: asked for each one, whatever the router let through (`config.AuthorityConfig`)."""
+"""Who may give which command. This is checked for each command, whatever the router let through
+(`config.AuthorityConfig`)."""
 
 from __future__ import annotations
 
@@ -9,31 +10,31 @@ from coec.errors import CoecError
 
 
 class NotAllowedError(CoecError):
-    """Its sender may not give this command."""
+    """The sender may not give this command."""
 
     reply_code = "not_allowed"
 
 
 class Authority:
-    """That of a vehicle."""
+    """Decides who may command a vehicle."""
 
     def __init__(self, config: AuthorityConfig, reached_from_outside: Callable[[], str | None]) -> None:
-        """`reached_from_outside()` says in a clause why programs on other computers may reach the service; None: they
-        do not."""
+        """`reached_from_outside()` says in a clause why programs on other computers can reach the service; None: they
+        cannot."""
         self._config = config
         self._allowed = {sender.name: frozenset(sender.commands) for sender in config.senders}
         self._reached_from_outside = reached_from_outside
 
     @property
     def senders(self) -> tuple[str, ...]:
-        """The names that may give commands once they are proven."""
+        """The names whose owners may give commands once they have proven them."""
         return tuple(self._allowed)
 
     def require(self, name: str | None, command: str) -> None:
-        """That the sender with this name, which he has proven, may give the command; None: he has proven none.
+        """Returns if the sender may give the command. `name` is the name that he has proven; None: he has proven none.
 
         Raises:
-            NotAllowedError: he may not.
+            NotAllowedError: he may not give it.
         """
         if name is None:
             self._require_anonymous(command)

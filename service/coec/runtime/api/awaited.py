@@ -1,4 +1,4 @@
-"""What is answered about a pair that is awaited: that it is, and what is missing. Any thread."""
+"""Answers about an awaited pair: that it is awaited, and what is missing. For any thread."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from coec.schemas.keys import Format
 
 
 class AwaitedError(CoecError):
-    """The pair has no nominal calibration yet, so that there is nothing to serve."""
+    """The pair has no nominal calibration yet, so there is nothing to serve."""
 
     reply_code = "awaiting"
 
 
 class AwaitedAnswers:
-    """Of one pair. `renew` is for the main thread, once a second."""
+    """The answers of one pair. `renew` is for the main thread, once a second."""
 
     def __init__(self, pair: OpenPairConfig, vehicle: str, outside: Outside) -> None:
         self.name = pair.name
@@ -52,7 +52,7 @@ class AwaitedAnswers:
         return self._outside.nominal(self.name)
 
     def renew(self) -> None:
-        """Serialise what is served anew, and publish what changed."""
+        """Serialises the answers anew, and publishes what has changed."""
         awaits = self._nominal.awaits
         reasons = (*awaits, *self._outside.vehicle_troubles(), *self._fault)
         self.health_reply = replies.HealthReply(
@@ -75,7 +75,7 @@ class AwaitedAnswers:
             self._outside.publish(self._outside.keys.health(self.name), self._snapshot.answer("msgpack"))
 
     def _absent(self) -> list[str]:
-        """Sentences on the topics that nobody publishes, with those that are there."""
+        """A sentence for each wanted topic that nobody publishes; it lists the topics that exist."""
         topics, pair = self._outside.topics(), self._pair
         wanted = [(stream.topic, stream.types) for stream in pair.streams.values()]
         wanted.append((info_topic_of(pair), (CAMERA_INFO,)))
@@ -83,12 +83,12 @@ class AwaitedAnswers:
         return [sentence for sentence in told if sentence is not None]
 
     def fail(self, reason: Reason) -> None:
-        """The service is about to end, for this reason: say it."""
+        """Reports that the service is about to end, for this reason."""
         self._fault = (reason,)
         self.renew()
 
     def status(self) -> replies.PairStatus:
-        """What is missing; there is nothing to count."""
+        """Status with what is missing; there is hardly anything to count."""
         return replies.PairStatus(
             name=self.name,
             ego=replies.StreamStatus() if self._pair.ego is not None else None,
@@ -99,12 +99,14 @@ class AwaitedAnswers:
         )
 
     def health(self, form: Format) -> Answer:
-        """The health: unknown, and why."""
+        """The health: unknown, with the reasons."""
         return self._snapshot.answer(form)
 
     def extrinsic(self, form: Format) -> Answer:
-        """Raises:
-        AwaitedError: always; there is no nominal calibration.
+        """Always refuses.
+
+        Raises:
+            AwaitedError: there is no nominal calibration yet.
         """
         del form
         self._refuse()
@@ -115,7 +117,7 @@ class AwaitedAnswers:
         self._refuse()
 
     def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
-        """As `extrinsic`: whose history it is depends on the rig."""
+        """As `extrinsic`, because it depends on the rig whose history it is."""
         del since_ns, until_ns, limit
         self._refuse()
 
@@ -153,7 +155,7 @@ class AwaitedAnswers:
 
 
 class AwaitedCommands:
-    """Of one pair: all are understood, and refused with what is missing."""
+    """The commands of one pair: every command is understood, and refused with what is missing."""
 
     def __init__(self, pair: str, vehicle: str, sentence: Callable[[], str]) -> None:
         self._pair = pair
@@ -171,7 +173,7 @@ class AwaitedCommands:
     def carry_out(
         self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = 0.0
     ) -> replies.Acknowledgement:
-        """Say why not."""
+        """Refuses the command, and says why."""
         del arguments, sender, deadline_s
         self._count(f"{name}_refused")
         return replies.Acknowledgement(
@@ -184,10 +186,10 @@ class AwaitedCommands:
         )
 
     def reserve_for(self, senders: Sequence[str]) -> None:
-        """Nothing is kept of anybody's commands here."""
+        """Does nothing: there is no rate limit here."""
 
     def note_refused(self, name: str, sender: str, why: CoecError) -> None:
-        """Count a command that is not its sender's to give."""
+        """Counts a command that its sender may not give."""
         del sender, why
         self._count(f"{name if name in NAMES else 'unknown'}_not_allowed")
 

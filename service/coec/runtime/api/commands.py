@@ -1,5 +1,6 @@
-"""Commands of people: each is carried out whole by the thread that owns what it changes, or not at all; either is
-acknowledged, logged and written down. Those that come faster than their sender may give them are only answered."""
+"""Commands of people. Each is carried out completely, by the thread that owns what it changes, or not at all. Either
+outcome is acknowledged, logged and written into the history. Commands that exceed their sender's rate are only
+answered."""
 
 from __future__ import annotations
 
@@ -34,16 +35,16 @@ from coec.schemas.replies import Acknowledgement
 _log = logging.getLogger(__name__)
 
 TIMEOUT_S = 4.0
-"""To begin a command, and again to end it: together below the 10 s after which clients give up."""
+"""Time to begin a command, and again to end it, s: together below the 10 s after which clients give up."""
 
 EXPIRED = "The command waited for longer than its sender does; nothing was done. Send it again."
 
 COMMISSIONING_WINDOWS = 8
-"""Windows that a rig is commissioned from, the newest: 200 pairs."""
+"""How many windows, the newest, a rig is commissioned from: 200 pairs."""
 
 
 class Commands:
-    """Those of one pair. Any thread."""
+    """The commands of one pair. For any thread."""
 
     def __init__(
         self,
@@ -76,24 +77,25 @@ class Commands:
         self._counts: Counter[str] = Counter()
 
     def use(self, pair: PairConfig) -> None:
-        """Carry out by these settings from now on."""
+        """Carries out commands by these settings from now on."""
         self._pair, self._rules = pair, lifecycle.Rules(pair.policy, pair.tracker, pair.monitor)
 
     def reserve_for(self, proven: Iterable[str]) -> None:
-        """Let others take nothing from senders who can prove who they are, as `payloads.proven_sender` writes them."""
+        """Reserves a rate for each sender who can prove his name, so that others cannot use it up. The names are those
+        of `payloads.proven_sender`."""
         self._rate.reserve_for(proven)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Commands since the start, by name and whether they were accepted, refused, or not their sender's to give."""
+        """Number of commands since the start, by name and outcome: accepted, refused, or not allowed."""
         with self._lock:
             return dict(self._counts)
 
     def carry_out(
         self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = math.inf
     ) -> Acknowledgement:
-        """Carry out a command of `payloads.NAMES`, or say why not. What is not begun by the deadline (steady clock), at
-        which its sender gives up, is not done."""
+        """Carries out a command of `payloads.NAMES`, or says why not. A command that is not begun by the deadline
+        (steady clock), at which its sender gives up, is not carried out."""
         reason = arguments.get(REASON.name) or None
         decided: dict[str, Callable[[], Acknowledgement]] = {
             "apply": self._apply,
@@ -134,8 +136,8 @@ class Commands:
         return acknowledged
 
     def note_refused(self, name: str, sender: str, why: CoecError) -> None:
-        """Count a command that is not its sender's to give. The first is logged, and then every 2^n-th: who may do
-        nothing shall not fill the disk either."""
+        """Counts a command that its sender may not give. Only the first and then every 2^n-th is logged, so that
+        senders without rights cannot fill the disk."""
         known = name if name in NAMES else "unknown"
         with self._lock:
             self._counts[f"{known}_not_allowed"] += 1
@@ -145,7 +147,7 @@ class Commands:
             _log.warning(f"a command was not allowed: {why}", extra={"fields": {**fields, "count": count}})
 
     def _noted(self, done: Acknowledgement, sender: str, reason: str | None) -> Acknowledgement:
-        """What is done has to be written down, and is, whether that can be waited for or not."""
+        """Has a command that was carried out written into the history, and waits a limited time for that."""
         noted = threading.Event()
 
         def note() -> None:
@@ -213,7 +215,7 @@ class Commands:
         return self._acknowledge(name, code, text, window_id=window_id)
 
     def _commission(self) -> Acknowledgement:
-        """Have the worker learn the baseline from the windows that agree with what is served."""
+        """Has the worker learn the baseline from the windows that agree with what is served."""
         pose = self._store.state.T_camera_lidar
         agreeing = [
             self._folder.path(result.window_id)
@@ -234,7 +236,7 @@ class Commands:
     # --- on the stream's thread -------------------------------------------------------------------------------------
 
     def _calibrate(self) -> Acknowledgement:
-        """Finish the open window now if it has enough pairs, and solve it; else solve the latest window again."""
+        """Finishes the open window now and solves it, if it has enough pairs; else solves the latest window again."""
         lacking = self._pair.window.min_pairs - self._chooser.chosen.selected
         if lacking <= 0 and (ended := self._chooser.finish()) is not None:
             text = f"The window of {ended.pairs} pairs is being solved."

@@ -1,4 +1,4 @@
-"""What `config` says: the effective configuration, without what only the service itself may know."""
+"""The answer to `config`: the effective configuration without secrets."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from coec.config import Config
 
 
 def shown(config: Config) -> dict[str, Any]:
-    """The configuration as JSON-like values. Endpoints may hold keys and passwords: these are hidden. What
-    `zenoh.file` holds is not looked at."""
+    """The configuration as JSON-like values. Keys and passwords in endpoints are hidden. The content of `zenoh.file` is
+    not read."""
     document = config.model_dump(mode="json")
     for name in ("connect", "listen"):
         document["zenoh"][name] = [redacted(endpoint) for endpoint in document["zenoh"][name]]

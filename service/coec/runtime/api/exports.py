@@ -1,4 +1,4 @@
-"""What is served of a pair, ready for the files of other programs."""
+"""The served extrinsic of a pair in the form that exports need."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from coec.runtime.api.extrinsic import uncertainty_of_served
 def exported(
     state: PairState, vehicle: str, pair: str, own: tuple[str, str], camera: CameraIntrinsics | None, frames: Frames
 ) -> Extrinsic:
-    """The extrinsic of a state with its whole covariance; `own` are the frames of the LiDAR and the camera. That it is
-    the nominal calibration still is all that can speak against it."""
+    """The extrinsic of a state with its whole covariance; `own` are the frames of the LiDAR and the camera. The only
+    possible objection to it is that it is still the nominal calibration."""
     accepted, uncertainty = state.accepted, uncertainty_of_served(state)
     origin = Origin(
         vehicle=vehicle,

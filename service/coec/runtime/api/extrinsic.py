@@ -1,4 +1,4 @@
-"""What `extrinsic` says: from the state of a pair to the reply."""
+"""The answer to `extrinsic`, made from the state of a pair."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNITS: tuple[Literal["deg", "m"], ...] = ("deg", "deg", "deg", "m", "m", "m")
 
 
 def axes_of(result: CalibrationResult | None, status: Status) -> replies.Axes:
-    """Correction and spread per axis, of a result or of the nominal calibration (None)."""
+    """Correction and standard deviation per axis, of a result or (None) of the nominal calibration."""
 
     def axis(index: int) -> replies.AxisReply:
         if result is None:
@@ -50,7 +50,8 @@ def extrinsic_of(
     percent_complete: float,
     config_hash: str,
 ) -> replies.ExtrinsicReply:
-    """What to use now. `accepted` is `state.accepted` in its wire form; `config_hash` is said while there is none."""
+    """The calibration to use now. `accepted` is `state.accepted` in its wire form; `config_hash` is used while there is
+    none."""
     of, cloud = uncertainty_of_served(state), rig.cloud
     return replies.ExtrinsicReply(
         vehicle=vehicle,
@@ -79,7 +80,7 @@ def extrinsic_of(
 
 
 def hold_of(state: PairState) -> replies.Hold | None:
-    """Who holds what is served; None while nobody does."""
+    """Who holds the served extrinsic; None if nobody does."""
     hold = state.hold
     if hold is None:
         return None
@@ -87,7 +88,7 @@ def hold_of(state: PairState) -> replies.Hold | None:
 
 
 def candidate_of(state: PairState) -> replies.Candidate | None:
-    """What waits for `apply`; None when nothing does."""
+    """The candidate that waits for `apply`; None if there is none."""
     if state.pending is None:
         return None
     pending = state.pending
@@ -101,21 +102,22 @@ def candidate_of(state: PairState) -> replies.Candidate | None:
 
 
 def degrees_and_metres(rad_m: NDArray[np.float64]) -> replies.Vector6:
-    """(6,) in the units of the wire."""
+    """(6,) radians and metres in the units of the wire, degrees and metres."""
     a, b, c, x, y, z = (float(value) for value in rad_m)
     return degrees(a), degrees(b), degrees(c), x, y, z
 
 
 def uncertainty_of_served(state: PairState) -> Uncertainty | None:
-    """Of what is served: the track's where it holds more than one window, else that of the accepted window; None while
-    nothing was accepted."""
+    """Uncertainty of what is served: that of the track if it holds more than one window, else that of the accepted
+    window. None while nothing was accepted."""
     if state.accepted is None:
         return None
     return state.accepted.uncertainty if state.track is None or state.track.windows <= 1 else state.track.uncertainty
 
 
 def axes_of_served(state: PairState, rig: Rig, accepted: CalibrationResult | None) -> replies.Axes:
-    """Correction and spread per axis of what is served: the track's where it holds more than one window."""
+    """Correction and standard deviation per axis of what is served: those of the track if it holds more than one
+    window."""
     axes = axes_of(accepted, Status.ACCEPTED)
     if accepted is None or state.track is None or state.track.windows <= 1:
         return axes

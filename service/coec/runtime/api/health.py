@@ -1,4 +1,4 @@
-"""What `health` says: the state of a pair with every reason and figure that anyone may want beside it."""
+"""The answer to `health`: the state of a pair with its reasons and figures."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.schemas import replies
 
 OLD_S = 5.0
-"""Age of a reply above which the thread that makes one every second must be stuck: then it is not the truth any
-more."""
+"""Oldest reply that is still true, s. The thread that makes one every second must be stuck if the reply is older."""
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A reply, and when (steady clock) it was made."""
+    """A reply, and the time (steady clock) at which it was made."""
 
     reply: replies.HealthReply
     monotonic_s: float
 
     def now(self) -> replies.HealthReply:
-        """The reply, if it is not too old; else one that says so, and is not green."""
+        """The reply if it is not too old; else one that says that it is, and is not green."""
         age_s = time.monotonic() - self.monotonic_s
         if age_s <= OLD_S:
             return self.reply
@@ -55,11 +54,12 @@ def health_of(
     rig: Rig,
     vehicle: str,
 ) -> replies.HealthReply:
-    """
+    """The health of a pair.
+
     Args:
-        losses: of the pair, by place and cause.
-        troubles: what ails more than this pair, its streams, or the part that writes its windows.
-        missed: sentences on streams that nobody sends.
+        losses: losses of the pair, by place and cause.
+        troubles: troubles of the whole service, of the pair's streams, or of its recorder.
+        missed: sentences about streams that nobody sends.
     """
     latest = known.state.latest
     result = None if latest is None else result_of(latest, rig, vehicle)
@@ -97,7 +97,8 @@ def _alarms_of(record: AlarmRecord) -> replies.Alarms:
 
 
 def with_troubles(health: Health, troubles: tuple[Reason, ...]) -> Health:
-    """What ails the service makes a healthy pair degraded, and is said in every state."""
+    """The health with troubles of the service added to its reasons. They make a healthy pair degraded, except for a
+    hold."""
     if not troubles:
         return health
     worse = health.state is HealthState.HEALTHY and any(reason.code != HELD for reason in troubles)
@@ -124,7 +125,7 @@ def needs_of(report: StreamStatistics, pair: PairConfig, latest: Estimate | None
 
 
 def data_quality_of(report: StreamStatistics, losses: Mapping[tuple[str, str], int]) -> replies.DataQuality:
-    """What the streams are like."""
+    """The quality of the streams."""
     chosen, quality = report.chosen, report.chosen.quality
     drops = drops_of(losses, report.unpaired)
     if chosen.rejections:

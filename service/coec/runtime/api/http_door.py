@@ -1,4 +1,4 @@
-"""The HTTP server of a service, as its configuration has it at the moment."""
+"""The HTTP server of a service, by its present configuration."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from coec.errors import UnavailableError
 _log = logging.getLogger(__name__)
 
 STOP_S = 1.0
-"""For the thread to end: it looks five times a second."""
+"""Time for the thread to end, s: it looks five times a second."""
 
 
 class HttpDoor:
-    """Opened, moved and closed by the main thread. Metrics are for people who look after the service: that they cannot
-    be had is said, and is no reason not to calibrate.
+    """The HTTP server, which the main thread opens, moves and closes. Metrics are for people who look after the
+    service. If they cannot be served, that is reported, but the service calibrates all the same.
 
     Attributes:
-        server: who answers now; None while nobody does.
-        trouble: why nobody does though somebody should; None otherwise. It ails no calibration.
-        insecure: that other computers get in; None otherwise.
+        server: the present server; None if there is none.
+        trouble: why there is no server although there should be one; else None. It does not affect calibrations.
+        insecure: the reason to report if other computers can reach the server; else None.
     """
 
     def __init__(self, find: Callable[[str], Page | None]) -> None:
@@ -35,7 +35,7 @@ class HttpDoor:
         self.insecure: Reason | None = None
 
     def use(self, config: MetricsConfig) -> None:
-        """Answer where this says, and nowhere else."""
+        """Answers at the address of this configuration, and nowhere else."""
         if config == self._config and self.trouble is None:
             return
         self.close(STOP_S)
@@ -55,6 +55,6 @@ class HttpDoor:
             self.insecure = Reason("http_insecure", text)
 
     def close(self, deadline_s: float) -> bool:
-        """Answer nobody any more; False when that took longer than the deadline."""
+        """Ends the server; False if that took longer than the deadline."""
         server, self.server = self.server, None
         return server is None or server.close(deadline_s)

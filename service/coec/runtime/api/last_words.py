@@ -1,4 +1,5 @@
-"""The last word of each pair, said so that it can be kept: when it changes, from time to time, and at the end."""
+"""The last word of each pair, a short report that others can keep. It is published when it changes, from time to time,
+and at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ ServiceState = Literal["starting", "running", "stopping", "failing"]
 
 
 class LastWords:
-    """Of one vehicle. `renew` and `use` are for the main thread, `answer` for any."""
+    """The last words of one vehicle. `renew` and `use` are for the main thread, `answer` for any."""
 
     def __init__(
         self,
@@ -30,7 +31,7 @@ class LastWords:
         publish: Callable[[str, Answer], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`clock` tells seconds that never go back."""
+        """`clock`: a clock in seconds that never goes back."""
         self._keys = keys
         self._version = version
         self._config = config
@@ -40,11 +41,11 @@ class LastWords:
         self._published: dict[str, tuple[object, float]] = {}
 
     def use(self, config: UplinkConfig) -> None:
-        """Say them as often as this says."""
+        """Publishes as often as this configuration says."""
         self._config = config
 
     def renew(self, service: ServiceState, config_hash: str, answering: Iterable[PairAnswers | AwaitedAnswers]) -> None:
-        """Take down what each pair says now, and publish what has changed or was not said for a period."""
+        """Makes the present word of each pair, and publishes it if it has changed or was not published for a period."""
         now_s = self._clock()
         for answers in answering:
             word = self._word_of(service, config_hash, answers)
@@ -56,7 +57,7 @@ class LastWords:
                 self._publish(self._keys.last(word.pair), answer_of(word, "msgpack"))
 
     def answer(self, pair: str, form: Format) -> Answer:
-        """What a pair would say now.
+        """The present word of a pair.
 
         Raises:
             NotFoundError: there is no such pair.
@@ -108,7 +109,7 @@ class LastWords:
 
 
 def _essence(word: LastWord) -> object:
-    """What is said again as soon as it differs."""
+    """The part of a word whose change makes it published at once."""
     codes = tuple(reason.code for reason in word.reasons)
     served = (word.provenance, word.status, word.correction, word.held)
     return (word.service, word.config_hash, word.state, codes, word.since_ns, served, word.event)

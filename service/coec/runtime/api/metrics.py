@@ -1,7 +1,7 @@
 """The state of the daemon as OpenMetrics text: base units, `_total` for counters, one help line each.
 
-Every family is declared once, in `FAMILIES`: the text and the page of the documentation (`docs/metrics.md`) are made of
-the same declarations.
+Every family is declared once, in `FAMILIES`. Both this text and the documentation page `docs/metrics.md` are made from
+these declarations.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from coec.schemas.rig_state import RigReply, SensorState
 ENCODING = "application/openmetrics-text"
 
 Sample = tuple[tuple[str, ...], float]
-"""Values of the labels of a family, in their order, and of the sample."""
+"""Values of a family's labels in their order, and the value of the sample."""
 
 
 @dataclass(frozen=True, slots=True)
 class Took:
-    """Durations: `label` is that of the part whose they are, in front of the histogram's own labels; empty for none."""
+    """Durations of one part of the service. `label` names the part, in front of the histogram's own labels; it may be
+    empty."""
 
     label: tuple[str, ...]
     histogram: Histogram
@@ -35,15 +36,15 @@ class Took:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What there is to tell at one moment.
+    """Everything that the metrics show at one moment.
 
     Attributes:
-        status: of the service.
-        health: of each pair.
-        memory_bytes, worker_memory_bytes: resident, of the service and of its worker.
+        status: status of the service.
+        health: health of each pair.
+        memory_bytes, worker_memory_bytes: resident memory of the service and of its worker.
         took: durations, by the name of their family.
         rig: what all pairs say together.
-        uplink: what went out of evidence.
+        uplink: counts of the evidence that went out.
     """
 
     status: StatusReply
@@ -67,11 +68,11 @@ class Family:
 
     @property
     def unit(self) -> str:
-        """Base unit; empty for what has none, or another for each sample."""
+        """Base unit; empty for a family without a unit, or with another unit for each sample."""
         return next((unit for unit in ("seconds", "bytes") if self.name.endswith(f"_{unit}")), "")
 
     def lines(self, view: View) -> Iterable[str]:
-        """As OpenMetrics writes them."""
+        """The lines of the family in OpenMetrics."""
         yield f"# TYPE {self.name} {self.kind}"
         if self.unit:
             yield f"# UNIT {self.name} {self.unit}"
@@ -217,7 +218,7 @@ def _figures(which: Literal["value", "limit"]) -> Callable[[View], Iterable[Samp
 
 
 def _axes(choose: Callable[[HealthReply], Maybe6 | None]) -> Callable[[View], Iterable[Sample]]:
-    """By pair, axis and unit; without those that are not known."""
+    """Samples by pair, axis and unit, without unknown values."""
 
     def samples(view: View) -> Iterable[Sample]:
         for pair, reply in view.health.items():
@@ -233,7 +234,7 @@ def _check_axes(choose: Callable[[CheckReply], Maybe6 | None]) -> Callable[[View
 
 
 def _derivatives(choose: Callable[[CheckReply], Maybe6]) -> Callable[[View], Iterable[Sample]]:
-    """By pair and axis: the help line names the units."""
+    """Samples by pair and axis, without the unit, which the help line names."""
     by_unit = _check_axes(choose)
     return lambda view: (((pair, axis), value) for (pair, axis, _), value in by_unit(view))
 
@@ -278,7 +279,7 @@ def _escaped(label: str) -> str:
 
 QUERY, DECODE, PAIR_WAIT = "coec_query_seconds", "coec_decode_seconds", "coec_pair_wait_seconds"
 WRITE, JOB, WORK = "coec_write_seconds", "coec_worker_job_seconds", "coec_worker_work_seconds"
-"""Names of the histograms, by which `View.took` tells of them."""
+"""Names of the histograms; the keys of `View.took`."""
 
 _PAIR, _STREAM, _AXIS = ("pair",), ("pair", "stream"), ("pair", "axis", "unit")
 
@@ -504,4 +505,4 @@ FAMILIES: tuple[Family, ...] = (
         _of_worker(lambda view: view.status.storage.losses),
     ),
 )
-"""All of them, in the order in which they are told."""
+"""All families, in the order of the text."""

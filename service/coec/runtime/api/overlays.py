@@ -1,4 +1,5 @@
-"""Pictures of a pair on demand: drawn by the worker, the latest ones kept, never made on a thread that others need."""
+"""Pictures of a pair on demand. The worker draws them, so that no thread of the service is held up; the latest ones are
+kept."""
 
 from __future__ import annotations
 
@@ -15,10 +16,10 @@ from coec.runtime.worker.jobs import Drawn, JobOutcome
 from coec.runtime.worker.supervisor import Worker
 
 KEPT = 4
-"""Pictures, some hundred kB each."""
+"""How many pictures are kept, some hundred kB each."""
 
 TIMEOUT_S = 8.0
-"""Below the 10 s after which clients give up; the worker may be solving."""
+"""Longest wait for a picture, s: below the 10 s after which clients give up. The worker may be solving."""
 
 
 class NotDrawnError(CoecError):
@@ -37,10 +38,10 @@ class Overlays:
         self._kept: OrderedDict[tuple[str, bytes], bytes] = OrderedDict()
 
     def jpeg(self, path: Path, T_camera_lidar: Matrix4, title: str) -> bytes:
-        """The points of a window at an extrinsic (4, 4); waits for the worker.
+        """JPEG of a window with its points drawn at an extrinsic (4, 4); waits for the worker.
 
         Raises:
-            NotDrawnError: it did not come.
+            NotDrawnError: the picture did not come.
         """
         key = (path.stem, T_camera_lidar.tobytes())
         with self._lock:
@@ -69,8 +70,8 @@ class Overlays:
         done: Callable[[bytes | Reason], None],
         deadline_s: float | None = None,
     ) -> None:
-        """The same without waiting: `done` is called once with the picture, or with why there is none: in the worst
-        case after `deadline_s` that the worker was busy with something else (None: the default of pictures)."""
+        """Asks for the picture without waiting. `done` is called once, with the picture or with the reason why there is
+        none, at the latest after `deadline_s` if the worker is busy (None: the default of pictures)."""
 
         def ended(outcome: JobOutcome) -> None:
             match outcome:

@@ -1,4 +1,4 @@
-"""What is told over HTTP, to whoever scrapes or probes on the same computer: `/metrics` and `/health`."""
+"""The HTTP pages `/metrics` and `/health`, for programs on the same computer that scrape or probe."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ GOOD_ENOUGH = frozenset({0, 1})
 def pages(
     metrics: Callable[[], bytes], status: Callable[[], StatusReply], health: Callable[[], Mapping[str, HealthReply]]
 ) -> Callable[[str], Page | None]:
-    """Who makes the page of a path; None for all that there are not. `/health` is 200 when the service runs and every
-    pair may be used, else 503: not having looked is not healthy."""
+    """A function that makes the page of a path (None for an unknown path). `/health` is 200 if the service runs and
+    every pair may be used, else 503: a pair that was not looked at is not healthy."""
 
     def page(path: str) -> Page | None:
         match path:

@@ -1,4 +1,4 @@
-"""What is answered about one pair: from snapshots that the deciding thread made, and from the disk. Any thread."""
+"""Answers about one pair, from snapshots that the deciding thread made and from the disk. For any thread."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from coec.schemas.keys import Format
 
 
 class PairAnswers:
-    """Of one pair."""
+    """The answers of one pair."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class PairAnswers:
         outside: Outside,
         commands: Callable[[], dict[str, int]],
     ) -> None:
-        """Nothing can be asked before `hear` was called once. `commands()` counts those that came."""
+        """Nothing can be asked before `hear` was called once. `commands()` returns the counts of commands."""
         self.name = pair.name
         self._pair = pair
         self._vehicle = config.vehicle
@@ -70,13 +70,13 @@ class PairAnswers:
         self._published: dict[str, object] = {}
 
     def use(self, pair: PairConfig) -> None:
-        """Tell of these settings from now on. Any thread."""
+        """Answers by these settings from now on. For any thread."""
         self._pair, self._config_hash = pair, config_hash(pair.calibration)
 
     # --- on the thread that decides; `fail` on the main thread --------------------------------------------------------
 
     def hear(self, known: Known) -> None:
-        """Serialise what is served anew, and publish what changed."""
+        """Serialises the answers anew, and publishes what has changed."""
         report, rig = self._stream.report, self.rig
         accepted = None if known.state.accepted is None else result_of(known.state.accepted, rig, self._vehicle)
         extrinsic = extrinsic_of(self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash)
@@ -101,7 +101,7 @@ class PairAnswers:
                 self._outside.publish(key, self._snapshots[name].answer("msgpack"))
 
     def fail(self, reason: Reason) -> None:
-        """The service is about to end, for this reason: say it, whatever the thread that decides is doing."""
+        """Reports that the service is about to end, for this reason, whatever the thread that decides is doing."""
         reply = self._health.reply
         health = with_troubles(Health(HealthState(reply.state), ()), (reason,))
         update = {
@@ -118,12 +118,12 @@ class PairAnswers:
 
     @property
     def recorded(self) -> int:
-        """Windows since the start."""
+        """Number of windows recorded since the start."""
         return self._recorder.recorded
 
     @property
     def newest_event(self) -> str | None:
-        """Id of the newest red event that is kept; None: there is none."""
+        """Id of the newest red event that is kept; None if there is none."""
         newest = self._store.incidents.newest
         return None if newest is None else newest.event_id
 
@@ -134,18 +134,18 @@ class PairAnswers:
 
     @property
     def percent_complete(self) -> float:
-        """Of the open window."""
+        """How complete the open window is, percent."""
         return 100.0 * min(self._stream.report.chosen.selected / self._pair.window.pairs, 1.0)
 
     def extrinsic(self, form: Format) -> Answer:
-        """The current calibration, serialised before."""
+        """The current calibration, serialised in advance."""
         return self._snapshots["extrinsic"].answer(form)
 
     def exported(self, form: str, frames: Frames) -> Answer:
         """The current calibration as a file of another program.
 
         Raises:
-            NotAcceptedError: it is the nominal calibration still.
+            NotAcceptedError: it is still the nominal calibration.
             OutputError: a frame has a name that not every format can hold.
         """
         camera, lidar = self._pair.camera, self._pair.lidar
@@ -157,13 +157,13 @@ class PairAnswers:
         return Answer(written.text(told, None).encode(), written.encoding)
 
     def health(self, form: Format) -> Answer:
-        """The health, serialised at most a second ago; what is older is answered as what it is."""
+        """The health, serialised at most a second ago. If it is much older, the answer says so."""
         told, reply = self._health, self._health.now()
         return self._snapshots["health"].answer(form) if reply is told.reply else answer_of(reply, form)
 
     def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
-        """Past results and other entries with a sensor stamp in the bounds, the newest `limit` of each; entries that
-        have none are dated by the wall clock."""
+        """Past results, other entries and checks with a sensor stamp in the bounds, the newest `limit` of each. Entries
+        without a sensor stamp are dated by the wall clock."""
         told = self._store.told()
         results = told.results
 
@@ -180,7 +180,7 @@ class PairAnswers:
         )
 
     def windows(self, form: Format) -> Answer:
-        """The recorded windows, and what was kept of the seconds around events."""
+        """The recorded windows, and the snippets of the seconds around events."""
         return self._windows.answer(form)
 
     def read_window(self, window_id: str, offset: int, length: int) -> bytes:
@@ -188,7 +188,7 @@ class PairAnswers:
 
         Raises:
             NotFoundError: no such window of this pair.
-            UsageError: the offset lies behind its end.
+            UsageError: the offset lies behind the end of the file.
         """
         snippets = self._outside.snippets
         if snippets is not None and window_id.endswith(SNIPPET):
@@ -196,12 +196,12 @@ class PairAnswers:
         return self._folder.read(self.name, window_id, offset, length)
 
     def events(self) -> replies.EvidenceReply:
-        """Red events that are kept."""
+        """The red events that are kept, without their figures."""
         bare = tuple(event.model_copy(update={"metrics": ()}) for event in self._store.told().events)
         return replies.EvidenceReply(vehicle=self._vehicle, pair=self.name, events=bare)
 
     def event(self, event_id: str) -> replies.EvidenceEvent:
-        """One of them, with its figures.
+        """One red event with its figures.
 
         Raises:
             NotFoundError: no such event.
@@ -220,11 +220,11 @@ class PairAnswers:
         return self._store.incidents.overlay(event_id, side)
 
     def overlay(self, window_id: str | None, *, nominal: bool) -> bytes:
-        """JPEG of a window's (None: the latest one's) points at the current, or the nominal, extrinsic.
+        """JPEG of a window (None: the latest) with its points drawn at the current or the nominal extrinsic.
 
         Raises:
             NotFoundError: no such window.
-            NotDrawnError: the worker has no time, or cannot.
+            NotDrawnError: the worker has no time for it, or cannot draw it.
         """
         latest = self._recorder.latest
         if window_id is None and (latest is None or not latest.exists()):

@@ -1,4 +1,4 @@
-"""Commands of people, before anything is done: what a payload may say, and how a sender is written down."""
+"""Checks commands of people before anything is done: reads the payload, and makes a safe name of the sender."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from coec.errors import UsageError
 from coec.schemas.commands import MAX_REASON, NAMES, REASON, arguments_of
 
 MAX_SENDER: Final = 96
-"""Characters of a sender in log and history."""
+"""Most characters of a sender in log and history."""
 
 MAX_PAYLOAD: Final = 4096
-"""Bytes of a payload. Ours have below 100; a message of 32 MB in JSON would unpack to a gigabyte."""
+"""Largest payload, bytes. coec's own have less than 100; a JSON message of 32 MB would unpack to a gigabyte."""
 
 MAX_ATTACHMENT: Final = 4096
-"""Bytes of an attachment that are looked at."""
+"""How many bytes of an attachment are read."""
 
 ANONYMOUS: Final = "anonymous"
-"""Who says nothing of himself."""
+"""Name of a sender that does not name itself."""
 
 _HARMLESS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789 ._:/@+-=,")
 
 
 def parse(name: str, payload: bytes, *, for_rig: bool = False) -> dict[str, Any]:
-    """The arguments of a command for a pair, or for the rig: nothing, or a map in msgpack or JSON.
+    """The arguments of a command for a pair or for the rig. A payload is empty, or a map in msgpack or JSON.
 
     Raises:
-        UsageError: no such command, or its payload is not what it takes.
+        UsageError: no such command, or the payload does not hold the arguments that it takes.
     """
     if name not in NAMES:
         raise UsageError(f"no such command; known: {', '.join(NAMES)}")
@@ -48,7 +48,7 @@ def parse(name: str, payload: bytes, *, for_rig: bool = False) -> dict[str, Any]
 
 
 def sender_of(attachment: bytes | None) -> str:
-    """The attachment of a query as one short harmless line; what is not readable text is told by its hash."""
+    """The attachment of a query as one short harmless line. If it is no readable text, the line shows its hash."""
     if not attachment:
         return ANONYMOUS
     start = attachment[:MAX_ATTACHMENT]
@@ -60,15 +60,15 @@ def sender_of(attachment: bytes | None) -> str:
 
 
 def proven_sender(name: str) -> str:
-    """A sender whose certificate has this common name, as one short harmless line that no attachment can come to."""
+    """A sender whose certificate has this common name, as one short harmless line that no attachment can imitate."""
     return f"{sender_of(name.encode('ascii', errors='replace'))} (certificate)"
 
 
 def _one_line(reason: str) -> str:
-    """Words of a person in one line that steers no terminal.
+    """The words of a person as one line without control characters.
 
     Raises:
-        UsageError: there are too many of them.
+        UsageError: the line is too long.
     """
     line = " ".join("".join(letter if letter.isprintable() else " " for letter in reason).split())
     if len(line) > MAX_REASON:

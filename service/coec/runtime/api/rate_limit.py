@@ -1,8 +1,8 @@
-"""How often a sender may give commands: a bucket of tokens for each, filled at a constant rate.
+"""How often a sender may give commands: each sender has a bucket of tokens that is filled at a constant rate.
 
-Who has proven his name has a bucket that nobody else draws from. All others are what the attachments of their queries
-say, which anyone may write (a query tells nothing else of who asks): so the number of their buckets is bounded, and
-those for whom there is none share one. Whoever invents a name for each command is in that one with all of his kind.
+A sender who has proven his name has a bucket that nobody else draws from. All other senders are known only by the
+attachments of their queries, which anyone may write. So the number of their buckets is bounded, and those without one
+share a common bucket. A sender who invents a new name for each command ends up in the common one.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 BURST = 20
-"""Commands at once: more than a person, or a script that works through all of them, gives in a row."""
+"""How many commands may come at once: more than a person gives in a row, or a script that uses every command."""
 
 PER_S = 1.0
-"""Commands per second afterwards. Nothing that a command does makes sense more often: each is written down, with two
-fsyncs, by the one thread that also takes the answers to checks."""
+"""Commands per second after that. No command makes sense more often, and each one is written down, with two fsyncs, by
+the same thread that takes the answers to checks."""
 
 SENDERS = 64
-"""Buckets of their own: some 10 kB."""
+"""How many senders have their own bucket: some 10 kB."""
 
 
 @dataclass(slots=True)
@@ -30,10 +30,10 @@ class _Bucket:
 
 
 class RateLimit:
-    """Of one pair. Safe to use from several threads."""
+    """The rate limit of one pair. Safe to use from several threads."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock` tells seconds."""
+        """`clock`: a clock in seconds."""
         self._clock = clock
         self._lock = threading.Lock()
         self._reserved: dict[str, _Bucket] = {}
@@ -41,14 +41,14 @@ class RateLimit:
         self._others = _Bucket(BURST, clock())
 
     def reserve_for(self, proven: Iterable[str]) -> None:
-        """These senders, whom nobody can pass himself off as, and no others, have buckets of their own for good. Who
-        had one keeps what is in it."""
+        """Gives these proven senders, and no others, buckets of their own for good. A sender who had one keeps its
+        content."""
         with self._lock:
             before, now_s = self._reserved, self._clock()
             self._reserved = {sender: before.get(sender, _Bucket(BURST, now_s)) for sender in proven}
 
     def take(self, sender: str) -> float:
-        """0 when `sender` may give a command now, which is counted; else how many seconds he has to wait for that."""
+        """0 if `sender` may give a command now, which is then counted; else how many seconds he has to wait."""
         with self._lock:
             now_s = self._clock()
             bucket = self._bucket_of(sender, now_s)
@@ -63,7 +63,7 @@ class RateLimit:
         if sender in self._reserved:
             return self._reserved[sender]
         if sender not in self._buckets and len(self._buckets) >= SENDERS:
-            # Who has given none for so long that his bucket is full again is not told from one who is new.
+            # A sender whose bucket is full again is treated like a new one, so his bucket can go.
             self._buckets = {name: held for name, held in self._buckets.items() if _filled(held, now_s) < BURST}
         if sender not in self._buckets:
             if len(self._buckets) >= SENDERS:
@@ -73,5 +73,5 @@ class RateLimit:
 
 
 def _filled(bucket: _Bucket, now_s: float) -> float:
-    """Tokens by now."""
+    """Tokens in the bucket by now."""
     return min(BURST, bucket.tokens + (now_s - bucket.at_s) * PER_S)

@@ -1,4 +1,5 @@
-"""Commands as they come in: who gives them, whether he may, what they say. Then they are carried out. One thread."""
+"""Takes commands as they come in: finds out who gives them, whether he may, and what they say; then has them carried
+out. One thread."""
 
 from __future__ import annotations
 
@@ -26,31 +27,30 @@ SEALED = "application/octet-stream"
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """Who may give commands. `listener` is None where the service has no certificate; then nobody can prove who he
-    is."""
+    """Who may give commands. `listener` is None if the service has no certificate; then nobody can prove his name."""
 
     authority: Authority
     listener: Listener | None
 
     @property
     def digest(self) -> str | None:
-        """Of the files of the certificate; None: there is none."""
+        """Digest of the files of the certificate; None: there is no certificate."""
         return None if self.listener is None else self.listener.digest
 
 
 class Reception:
-    """Of all pairs of a vehicle, and of their rig."""
+    """Takes the commands for all pairs of a vehicle and for their rig."""
 
     def __init__(
         self, rules: Rules, commands: Mapping[str, Commands | AwaitedCommands], rig: RigCommands | None = None
     ) -> None:
-        """`commands` of a pair may be replaced while queries come; `rig` are those for all of them."""
+        """`commands` are those of each pair, and may be replaced while queries come; `rig` are those for all pairs."""
         self._pairs = commands
         self._rig = rig
         self.use(rules)
 
     def use(self, rules: Rules) -> None:
-        """Hold every command to these rules from the next one on. For any thread."""
+        """Applies these rules from the next command on. For any thread."""
         proven = [payloads.proven_sender(name) for name in rules.authority.senders]
         for commands in self._pairs.values():
             commands.reserve_for(proven)
@@ -60,9 +60,9 @@ class Reception:
         """The answer to a query for `command/<name>`.
 
         Raises:
-            UsageError: no such command, or it does not fit its grammar.
-            NotAllowedError: its sender may not give it.
-            NotProvenError: he has not shown who he is, though he meant to.
+            UsageError: no such command, or it does not fit the grammar.
+            NotAllowedError: the sender may not give it.
+            NotProvenError: the sender has tried to prove his name and failed.
         """
         chosen, rules = parse_command_selector(request.parameters), self._rules
         if chosen.conversation is None:

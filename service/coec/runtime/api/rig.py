@@ -1,4 +1,4 @@
-"""What is answered about the rig: from a snapshot that its thread made. Any thread."""
+"""Answers about the rig, from a snapshot that the rig's thread made. For any thread."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from coec.schemas.replies import Maybe6x6, Vector6
 
 
 class RigAnswers:
-    """Of one vehicle. `hear` is for the rig's thread, everything else for any."""
+    """The answers about the rig of one vehicle. `hear` is for the rig's thread, everything else for any."""
 
     def __init__(self, keys: Keys, publish: Callable[[str, Answer], None]) -> None:
         self._keys = keys
@@ -39,7 +39,8 @@ class RigAnswers:
         self.hear(RigKnown())
 
     def hear(self, known: RigKnown) -> None:
-        """Serialise what is served anew, and publish it if it says something else of a sensor, or of all together."""
+        """Serialises the answer anew, and publishes it if it says something new about a sensor or about all of
+        them."""
         self.reply = reply_of(self._keys.vehicle, known)
         self._snapshot = Snapshot.of(self.reply)
         self._troubles = {} if known.rig is None else troubles_of(known.rig)
@@ -58,16 +59,16 @@ class RigAnswers:
                 self._publish(self._keys.rig, self._snapshot.answer("msgpack"))
 
     def answer(self, form: Format) -> Answer:
-        """The reply, serialised before."""
+        """The reply, serialised in advance."""
         return self._snapshot.answer(form)
 
     def troubles(self, pair: str) -> tuple[Reason, ...]:
-        """Why a pair cannot be called healthy, though it may be so by itself."""
+        """Why the rig does not let a pair count as healthy, even if the pair is healthy by itself."""
         return self._troubles.get(pair, ())
 
 
 def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
-    """The wire form of what is known."""
+    """What is known of the rig in its wire form."""
     rig = known.rig
     if rig is None:
         return rig_state.RigReply(
@@ -105,7 +106,7 @@ def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
 
 
 def _untold(graph: RigGraph, why: tuple[Reason, ...]) -> tuple[rig_state.SensorReply, ...]:
-    """Sensors of which nothing can be told."""
+    """Replies for sensors of which nothing can be said."""
     undecided = ONE_PAIR in why
     return tuple(
         rig_state.SensorReply(
@@ -153,7 +154,7 @@ def _moved(moved: Moved) -> rig_state.SensorMove:
 
 
 def _pairs(graph: RigGraph, sensor: str) -> tuple[str, ...]:
-    """Of a sensor: those that serve something."""
+    """Pairs of a sensor that serve something, so no edges between LiDARs."""
     return tuple(name for name in pairs_of(graph, (sensor,)) if name not in graph.of_lidars)
 
 
@@ -226,5 +227,5 @@ def _degrees(values: NDArray[np.float64]) -> Vector6:
 
 
 def _share(probability: float) -> float:
-    """A probability, whatever rounding did to it."""
+    """A probability, with rounding errors cut off to stay within 0 and 1."""
     return min(max(probability, 0.0), 1.0)

@@ -1,7 +1,7 @@
-"""Commands for a sensor, or for the whole rig: each is given to all of its pairs. Any thread.
+"""Commands for a sensor or for the whole rig: each is given to all pairs concerned. For any thread.
 
-A sensor is served by its pairs, and what is held, put back or accepted is what they serve: a command for it is one for
-each of them, carried out by the thread that decides about the pair, one after the other.
+A sensor has no extrinsic of its own: what a command holds, puts back or accepts is what the sensor's pairs serve. So a
+command for a sensor is given to each of its pairs in turn, and the thread that decides about the pair carries it out.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ Given = Commands | AwaitedCommands
 
 
 class RigCommands:
-    """Of one vehicle. `pairs` may gain pairs while commands come."""
+    """The rig commands of one vehicle. `pairs` may gain pairs while commands come."""
 
     def __init__(self, vehicle: str, pairs: Mapping[str, Given], rig: Callable[[], RigReply]) -> None:
-        """`rig()` says which pairs a sensor has."""
+        """`rig()` gives the reply that names the pairs of each sensor."""
         self._vehicle = vehicle
         self._pairs = pairs
         self._rig = rig
 
     def reserve_for(self, proven: Iterable[str]) -> None:
-        """Every pair does so for itself."""
+        """Does nothing: every pair reserves for itself."""
 
     def carry_out(
         self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = math.inf
     ) -> Acknowledgement:
-        """Give a command to every pair of `arguments["sensor"]`, or of the vehicle where that is not named.
+        """Gives a command to every pair of `arguments["sensor"]`, or of the vehicle if no sensor is named.
 
         Raises:
             NotFoundError: there is no such sensor.
@@ -65,7 +65,7 @@ class RigCommands:
         )
 
     def note_refused(self, name: str, sender: str, why: CoecError) -> None:
-        """Of every pair: it was meant for all of them."""
+        """Counts the refusal for every pair, because the command was meant for all of them."""
         for commands in self._pairs.values():
             commands.note_refused(name, sender, why)
 

@@ -1,4 +1,4 @@
-"""Why a pair cannot be called healthy by what the rig has against it, in words."""
+"""Puts into words why the rig does not let a pair count as healthy."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ INCONSISTENT = "inconsistent_rig"
 """Code of the reason that a pair does not fit the others of its vehicle."""
 
 MOVED = "sensor_moved"
-"""That a sensor of it moved, and it serves what was before."""
+"""Code of the reason that a sensor of the pair moved, and the pair serves the extrinsic from before."""
 
 SUSPECTED = "sensor_suspected"
-"""That it does not fit, and a sensor of it may have moved."""
+"""Code of the reason that the pair does not fit the others, and a sensor of it may have moved."""
 
 
 def troubles_of(rig: VehicleRig) -> dict[str, tuple[Reason, ...]]:
-    """By pair, one reason each; of those that fit there is none."""
+    """A reason for each pair to which the rig objects, by pair; pairs that fit are left out."""
     return {pair: (_reason(rig, pair, objection),) for pair, objection in objections(rig).items()}
 
 

@@ -1,5 +1,5 @@
-"""Whether the router is there: in the log when it goes and comes, and now and then while it is away; as a reason of
-health all that time."""
+"""Watches whether the router is there. The log says when it goes and comes, and now and then while it is away; `health`
+gives it as a reason all that time."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from coec.calibration.types import Reason
 _log = logging.getLogger(__name__)
 
 FIRST_REMINDER_S, LONGEST_REMINDER_S = 60.0, 3600.0
-"""After which the log says once more that there is none: a minute, then twice as long each time, up to an hour. Who
-reads the last screen of a log finds it, and a night without a router is twenty lines."""
+"""Times after which the log repeats that there is no router, s: a minute, then twice as long each time, up to an hour.
+So the last screen of a log shows it, and a night without a router gives twenty lines."""
 
 
 class RouterWatch:
     """For one thread.
 
     Attributes:
-        trouble: None while somebody is there.
+        trouble: the reason while there is no router; None while there is one.
     """
 
     def __init__(
         self, endpoints: Sequence[str], is_there: Callable[[], bool], now_s: Callable[[], float] = time.monotonic
     ) -> None:
-        """`endpoints` as they may be shown; none where the service is the router itself."""
+        """`endpoints` are in the form that may be shown; empty if the service is the router itself."""
         self._endpoints = ", ".join(endpoints)
         self._is_there = is_there
         self._now_s = now_s
@@ -36,7 +36,7 @@ class RouterWatch:
         self.trouble: Reason | None = None
 
     def look(self) -> None:
-        """Look now. Zenoh itself tries again and again, without end."""
+        """Looks now. Zenoh itself tries to connect again and again, without end."""
         if not self._endpoints:
             return
         there = self._is_there()

@@ -1,4 +1,4 @@
-"""Which key is answered by what: the routes of a vehicle (CONTRACT, "Keys")."""
+"""The routes of a vehicle: which function answers which key (CONTRACT, "Keys")."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ JPEG = "image/jpeg"
 
 
 Answering = PairAnswers | AwaitedAnswers
-"""Who answers about a pair."""
+"""What answers about a pair."""
 
 
 class VehicleAnswers:
     """Routes of the vehicle and of each of its pairs.
 
     Attributes:
-        took: from the arrival of a query to its answer or refusal, by what was asked for.
+        took: time from the arrival of a query to its answer or refusal, by what was asked for.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class VehicleAnswers:
         last_words: LastWords,
         uplink: Uplink,
     ) -> None:
-        """`status()` and `config()` are serialised before; `metrics()` is rendered when asked."""
+        """`status()` and `config()` are serialised in advance; `metrics()` is rendered when it is asked for."""
         self.took = Histogram(QUICK_S)
         self._keys = keys
         self._pairs = dict(pairs)
@@ -79,25 +79,25 @@ class VehicleAnswers:
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
 
     def replace(self, pair: PairAnswers) -> None:
-        """From now on this one answers about the pair."""
+        """Answers about the pair with this object from now on."""
         self._pairs[pair.name], self._pair_routes[pair.name] = pair, self._readable(pair)
 
     def declare(self, bus: Bus) -> None:
-        """Serve everything on the bus. The last queryable is there for the keys of pairs that are not: it does not
-        claim to be `complete`, so that it takes no query from another service of the vehicle."""
+        """Serves everything on the bus. The last queryable answers for keys of pairs that do not exist. It does not
+        claim to be `complete`, so that it takes no query away from another service of the vehicle."""
         for key, route in self._vehicle_routes.items():
             bus.serve(key, _always(self._timed(route, key.rpartition("/")[2])))
         for name in self._pairs:
             bus.serve(f"{self._keys.root}/{name}/**", self._finder(name))
         bus.serve(f"{self._keys.rig}/**", self._find_of_rig)
         for name in self._pairs:
-            # Each by its own key: what a router has seen declared it finds again when it is put, however many vehicles
-            # there are; it would look for others among all of them each time (docs/fleet.md).
+            # Each by its own key: a router finds a declared key at once when something is put there, however many
+            # vehicles there are. A key that is not declared it would look for among all of them (docs/fleet.md).
             bus.serve(self._keys.last(name), self._find_last(name))
         bus.serve(f"{self._keys.root}/**", self._find_unknown, complete=False)
 
     def _finder(self, pair: str) -> Callable[[str], Sequence[Route]]:
-        """Who answers, on the clock."""
+        """A function that finds the routes for a key of the pair; their answers are timed."""
 
         def find(key: str) -> Sequence[Route]:
             return [self._timed(route, self._keys.parse(route.key).resource) for route in self._find(pair, key)]
@@ -114,10 +114,10 @@ class VehicleAnswers:
         return replace(route, answer=answer)
 
     def _find(self, pair: str, key: str) -> Sequence[Route]:
-        """Who answers a key, or a key expression, of the pair.
+        """The routes for a key, or a key expression, of the pair.
 
         Raises:
-            UsageError: nobody.
+            UsageError: no route answers it.
         """
         readable = self._pair_routes[pair]
         if key in readable:
@@ -125,7 +125,7 @@ class VehicleAnswers:
         if _has_wildcard(key):
             asked = zenoh.KeyExpr(key)
             matching = [route for known, route in readable.items() if asked.intersects(zenoh.KeyExpr(known))]
-            # A picture is drawn for whoever asks for one, not for everything at once.
+            # A picture is drawn only for those who ask for one, not for a query of everything.
             return (
                 matching
                 if key.endswith("/overlay")
@@ -141,10 +141,10 @@ class VehicleAnswers:
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_of_rig(self, key: str) -> Sequence[Route]:
-        """Who answers a key, or a key expression, below that of the rig; which itself has a route of its own.
+        """The routes for a key, or a key expression, below that of the rig. The rig's own key has another route.
 
         Raises:
-            UsageError: nobody.
+            UsageError: no route answers it.
         """
         if key == self._keys.rig or _has_wildcard(key):
             return []
@@ -155,8 +155,8 @@ class VehicleAnswers:
         return [self._timed(command, "command")]
 
     def _find_last(self, pair: str) -> Callable[[str], Sequence[Route]]:
-        """Who says the last word of a pair to those who ask for it, or for those of all: not to who asks for something
-        else of a pair that happens to be called `last`."""
+        """A function that finds the route for the last word of a pair, for queries of that word or of all last words.
+        It finds none for queries of something else about a pair that happens to be called `last`."""
         route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), Lane.AT_ONCE), LAST)
         return lambda key: [route] if key.split("/")[-2] == LAST else []
 
@@ -164,7 +164,7 @@ class VehicleAnswers:
         return self._last_words.answer(pair, _format(request))
 
     def _find_unknown(self, key: str) -> Sequence[Route]:
-        """Nobody, in silence where another queryable answers: a session hands a query to all that match.
+        """No routes. Does not raise if another queryable answers, because a session hands a query to all that match.
 
         Raises:
             UsageError: the key names no pair of this vehicle.
@@ -187,7 +187,7 @@ class VehicleAnswers:
         return {route.key: route for route in routes}
 
     def _metered(self, route: Route) -> Route:
-        """The same, as far as the uplink allows."""
+        """The same route, as far as the uplink allows."""
         resource = self._keys.parse(route.key).resource
         return replace(route, answer=lambda request: self._uplink.metered(resource, lambda: route.answer(request)))
 

@@ -1,4 +1,4 @@
-"""Replies, serialised before anyone asks."""
+"""Replies that are serialised in advance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coec.schemas.keys import Format
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A reply, serialised before anyone asks."""
+    """A reply in both encodings, serialised before anyone asks."""
 
     msgpack: bytes
     json: bytes
@@ -34,7 +34,7 @@ class Snapshot:
         return cls(msgpack.packb(json.loads(text)), text.encode())
 
     def answer(self, form: Format) -> Answer:
-        """The one that was asked for."""
+        """The reply in the encoding that was asked for."""
         return Answer(self.json, JSON) if form == "json" else Answer(self.msgpack, MSGPACK)
 
 

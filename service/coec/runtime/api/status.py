@@ -1,4 +1,4 @@
-"""What `status` says of each pair and of the worker: counters since the start."""
+"""The answer to `status` for each pair, the worker and the budget: counters since the start."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def pair_status_of(
     *,
     has_ego: bool,
 ) -> replies.PairStatus:
-    """`losses` are those of the pair by place and cause, `recorded` its windows on the disk, `unwritten` the pairs that
-    wait for it."""
+    """Status of a pair. `losses` are its losses by place and cause, `recorded` the number of its windows on the disk,
+    `unwritten` the number of pairs that wait for the disk."""
     drops, chosen = drops_of(losses, report.unpaired), report.chosen
 
     def stream(name: str) -> replies.StreamStatus:
@@ -64,7 +64,7 @@ def pair_status_of(
 
 
 def worker_status_of(worker: Worker) -> replies.WorkerStatus:
-    """The worker as `status` tells it."""
+    """Status of the worker."""
     status = worker.status()
     states: dict[WorkerState, Literal["starting", "idle", "busy", "stopped"]] = {
         WorkerState.STARTING: "starting",
@@ -88,7 +88,7 @@ def worker_status_of(worker: Worker) -> replies.WorkerStatus:
 
 
 def budget_status_of(report: BudgetReport) -> replies.BudgetStatus:
-    """The budget as `status` tells it."""
+    """Status of the budget."""
     kinds = sorted({kind for kind, _ in report.totals_s})
     return replies.BudgetStatus(
         cores=report.cores,

@@ -1,4 +1,4 @@
-"""What there is to say of a pair's streams as their senders are: who sends, by which clock, and who does not."""
+"""Troubles with the senders of a pair's streams: two senders at once, stamps by the wrong clock, no sender at all."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from coec.runtime.ingest.decoder import StreamCounts
 from coec.runtime.ingest.inbox import Arrivals
 
 SILENT_S = 5.0
-"""Without a sample for so long, a stream whose topic nobody publishes is missed."""
+"""After this time without a sample, s, a stream whose topic nobody publishes is reported as missing."""
 
 
 def troubles_of(streams: Mapping[str, StreamCounts], pair: PairConfig, topics: Topics) -> tuple[Reason, ...]:
-    """What ails the streams, for `health`."""
+    """Troubles of the streams, for `health`."""
     found = []
     for name, stream in pair.streams.items():
         counts = streams.get(name)
@@ -33,7 +33,7 @@ def troubles_of(streams: Mapping[str, StreamCounts], pair: PairConfig, topics: T
 
 
 def missed_of(arrivals: Mapping[str, Arrivals], pair: PairConfig, topics: Topics) -> tuple[str, ...]:
-    """Sentences on the streams that nobody publishes, for what is needed."""
+    """Sentences about the streams that nobody publishes, for `needs` of `health`."""
     found = []
     for name, stream in pair.streams.items():
         age_s = arrivals[name].age_s

@@ -1,6 +1,6 @@
-"""What may ail the service itself: reasons that health and status give beside the state of the calibration.
+"""Possible troubles of the service itself: reasons that `health` and `status` give beside the state of the calibration.
 
-One table: `docs/operations.md` and the advice of `coec doctor` are made of it.
+`docs/operations.md` and the advice of `coec doctor` are made from this one table.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What it means, and what to do about it."""
+    """What a trouble means, and what to do about it."""
 
     meaning: str
     advice: str
@@ -219,4 +219,4 @@ TROUBLES: Mapping[str, Trouble] = {
         "`coec query command/hold --release` releases it.",
     ),
 }
-"""By the code of the reason."""
+"""Troubles by the code of the reason."""

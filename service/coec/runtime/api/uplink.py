@@ -1,4 +1,4 @@
-"""What the vehicle's link carries of evidence: so many bytes a second in the long run, whoever asks for them."""
+"""Limits the evidence that goes out over the vehicle's link to so many bytes a second in the long run, whoever asks."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from coec.errors import CoecError
 from coec.schemas.keys import MAX_LENGTH
 
 BURST_BYTES = MAX_LENGTH
-"""That may go out at once after a rest: the largest answer there is."""
+"""How many bytes may go out at once after a rest: the largest possible answer."""
 
 
 class UplinkBusyError(CoecError):
-    """What the uplink may carry is spent for now."""
+    """The uplink may carry nothing more for now."""
 
     reply_code = "uplink_busy"
 
 
 class Uplink:
-    """A bucket of bytes, filled at the configured rate. An answer may take more than is in it: then nothing more goes
-    out until that is paid back, so that answers of any size keep to the rate. Safe to use from several threads."""
+    """A bucket of bytes, filled at the configured rate. An answer may take more than the bucket holds; then nothing
+    goes out until the debt is paid back, so that answers of any size keep to the rate. Safe to use from several
+    threads."""
 
     def __init__(self, config: UplinkConfig, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock` tells seconds that never go back."""
+        """`clock`: a clock in seconds that never goes back."""
         self._clock = clock
         self._lock = threading.Lock()
         self._rate = config.evidence_bytes_per_s
@@ -37,28 +38,28 @@ class Uplink:
         self._refused: Counter[str] = Counter()
 
     def use(self, config: UplinkConfig) -> None:
-        """Keep to this rate from now on."""
+        """Keeps to this rate from now on."""
         with self._lock:
             self._fill()
             self._rate = config.evidence_bytes_per_s
 
     @property
     def sent(self) -> Mapping[str, int]:
-        """Bytes since the start, by what was asked for."""
+        """Bytes sent since the start, by what was asked for."""
         with self._lock:
             return dict(self._sent)
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Answers since the start that had to wait, likewise."""
+        """Number of refused answers since the start, by what was asked for."""
         with self._lock:
             return dict(self._refused)
 
     def metered(self, resource: str, make: Callable[[], Answer]) -> Answer:
-        """An answer, made only when it may go out.
+        """Makes an answer, but only if it may go out.
 
         Raises:
-            UplinkBusyError: it may not now; says for how long.
+            UplinkBusyError: it may not go out now; the message says how long to wait.
         """
         with self._lock:
             self._fill()

@@ -1,4 +1,4 @@
-"""The list of a pair's recordings, serialised once as long as nothing comes or goes: of thousands it is a megabyte."""
+"""The list of a pair's recordings. It is serialised only when it has changed, because thousands make a megabyte."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
 
 @dataclass(frozen=True, slots=True)
 class _Told:
-    """What was listed, and the answers that were made of it."""
+    """A listing, and the answers that were made of it."""
 
     windows: tuple[WindowInfo, ...]
     snippets: tuple[SnippetInfo, ...]
@@ -22,7 +22,7 @@ class _Told:
 
 
 class WindowsList:
-    """Of one pair. Any thread."""
+    """The list of one pair. For any thread."""
 
     def __init__(self, vehicle: str, pair: str, windows: WindowStore, snippets: SnippetStore | None) -> None:
         self._vehicle, self._pair = vehicle, pair
@@ -30,11 +30,12 @@ class WindowsList:
         self._told = _Told((), ())
 
     def answer(self, form: Format) -> Answer:
-        """What is there now, in the encoding that is asked for."""
+        """The present list in the encoding that is asked for."""
         windows = self._windows.listing(self._pair)
         snippets = () if self._snippets is None else self._snippets.listing(self._pair)
         told = self._told
-        # The store hands out the same list until it changes; to compare thousands takes as long as to pack them.
+        # The store hands out the same tuple until it changes. Identity is compared, because comparing thousands of
+        # entries takes as long as packing them.
         if told.windows is not windows or told.snippets != snippets:
             told = self._told = _Told(windows, snippets)
         answer = told.answers.get(form)
