@@ -1,1 +1,1 @@
-"""Many windows on an existing engine: jobs in, tables out."""
+"""Judges many windows again on an existing engine: jobs in, tables out."""

@@ -1,4 +1,4 @@
-"""How often a fleet's pairs were accused without cause: counted by the vehicles, added up here."""
+"""False alarms of a fleet's pairs: the vehicles count them, and this adds them up."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from coec.schemas.replies import Alarms
 S_PER_H = 3600.0
 
 CONFIDENCE = 0.95
-"""Of the bound."""
+"""Confidence of the upper bound on the rate."""
 
 
 def false_alarms(words: Iterable[LastWord]) -> FalseAlarms:
-    """Of all pairs together; those that have not told, as they are awaited, are left out."""
+    """False alarms of all pairs together. Pairs whose word has no counts, because they are awaited, are left out."""
     told = [(f"{word.vehicle}/{word.pair}", word.alarms) for word in words if word.alarms is not None]
     watched_h = sum(alarms.watched_s for _, alarms in told) / S_PER_H
     withdrawn = sum(alarms.withdrawn for _, alarms in told)

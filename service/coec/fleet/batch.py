@@ -1,4 +1,4 @@
-"""Many windows judged again, on one page: jobs -> engine -> rows -> tables."""
+"""Judges many windows again, on one page: jobs -> engine -> rows -> tables."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def run(
     *,
     resume: bool,
 ) -> BatchReport:
-    """Judge windows, and make tables of what is said of them in a folder.
+    """Judges windows, and writes tables of the results into a folder.
 
     Args:
         jobs: the windows.
-        terms: on which all are judged.
-        engine: that judges them.
-        folder: of the tables; one that holds a batch already is gone on with.
-        told: called with every row, when it is on the disk.
-        resume: whether the folder may hold a batch.
+        terms: the terms on which all windows are judged.
+        engine: the engine that judges them.
+        folder: folder for the tables. If it already holds a batch, that batch is continued.
+        told: called with every row, once it is on the disk.
+        resume: whether the folder may already hold a batch.
 
     Raises:
         UsageError, OutputError, SourceError: the folder cannot be used; see `Results`.
-        FleetError: the engine failed. What was finished is kept.
+        FleetError: the engine failed. Finished rows are kept.
     """
     results = Results(folder, terms, resume=resume)
     known = results.urls
@@ -47,14 +47,14 @@ def run(
             results.add(row)
             tally.add(row)
             told(row)
-    finally:  # an interrupted batch has its tables, too
+    finally:  # so that an interrupted batch has its tables, too
         results.finish()
     elapsed_s = time.monotonic() - began_s
     return tally.report(folder, len(jobs), len(jobs) - len(left), elapsed_s, engine.cores)
 
 
 class _Tally:
-    """Of the rows of one run."""
+    """Counts of the rows of one run."""
 
     def __init__(self) -> None:
         self._accepted = self._refused = self._compared = self._differing = 0
@@ -62,7 +62,7 @@ class _Tally:
         self._seconds = self._cpu_s = 0.0
 
     def add(self, row: WindowRow) -> None:
-        """One more."""
+        """Counts one more row."""
         self._seconds += row.seconds
         self._cpu_s += row.cpu_s
         if row.error_code is not None:
@@ -75,7 +75,7 @@ class _Tally:
             self._differing += row.recorded not in (None, row.decided)
 
     def report(self, folder: Path, windows: int, kept: int, elapsed_s: float, cores: int) -> BatchReport:
-        """Of this run."""
+        """The report of this run."""
         judged = windows > kept and elapsed_s > 0.0
         return BatchReport(
             output=str(folder),

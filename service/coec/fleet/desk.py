@@ -1,4 +1,4 @@
-"""Where windows are judged, one at a time, in a process of its own: a job in, a row out, whatever the window is."""
+"""Judges windows, one at a time, in a process of its own: a job in, a row out, whatever is wrong with the window."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from coec.schemas.replies import CalibrationResult
 _log = logging.getLogger(__name__)
 
 NETWORKS_KEPT = 4
-"""Open at a time; a fleet has one or two, and each takes a hundred megabytes."""
+"""How many networks are open at a time. A fleet has one or two, and each takes a hundred megabytes."""
 
 
 class Desk:
-    """Judges windows on the same terms. `row` may be called on several threads: one fetches while another's window is
-    solved."""
+    """Judges windows on the same terms. `row` may be called on several threads, so that one fetches a window while
+    another's is solved."""
 
     def __init__(self, terms: Terms) -> None:
         self._terms = terms
@@ -43,7 +43,7 @@ class Desk:
         self._versions = provenance.versions()
 
     def row(self, job: Job) -> WindowRow:
-        """The row of a window; what is wrong with it stands in the row."""
+        """The row of a window. If anything is wrong with the window, the row says so."""
         row = begun(job, self._versions)
         try:
             with fetched(job.url) as path:
@@ -60,7 +60,7 @@ class Desk:
                         row = row.model_copy(update={"seconds": took_s, "cpu_s": cpu_s})
         except CoecError as error:
             return failed(row, error.reply_code, str(error))
-        except Exception as error:  # a fault of ours; the other windows are judged all the same
+        except Exception as error:  # a fault of coec; the other windows are judged all the same
             _log.exception("a window could not be judged", extra={"fields": {"url": job.url}})
             return failed(row, CoecError.reply_code, f"{type(error).__name__}: {error}")
         return row.model_copy(update=update)
@@ -81,7 +81,7 @@ class Desk:
         }
 
     def _network(self, config: DepthConfig) -> DepthModel:
-        # The process has one core: more threads would only wait for each other. What is inferred does not hang on it.
+        # The process has one core, so more threads would only wait for each other. The depth does not depend on it.
         config = config.model_copy(update={"threads": 1})
         if config not in self._networks:
             while len(self._networks) >= NETWORKS_KEPT:

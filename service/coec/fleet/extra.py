@@ -1,4 +1,4 @@
-"""The optional extra `fleet`: tables and what asks them."""
+"""The optional extra `fleet`: the libraries for tables and for queries of them."""
 
 from __future__ import annotations
 

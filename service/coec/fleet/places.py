@@ -1,4 +1,4 @@
-"""Where windows are: on this machine, or behind a URL of a store that fsspec knows."""
+"""Finds and fetches windows, on this machine or behind a URL of a store that fsspec knows."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from coec.errors import SourceError, UsageError
 SUFFIX = ".mcap"
 
 SUMS = "SHA256SUMS"
-"""File beside windows with their hashes, as `sha256sum *.mcap` prints it; what it names is checked before use."""
+"""File beside windows with their hashes, as `sha256sum *.mcap` prints them. Windows that it names are checked before
+use."""
 
 MAX_SUMS_BYTES = 64 * 2**20
-"""Of such a file: half a million windows."""
+"""Largest such file, bytes: half a million windows."""
 
 _SUM = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
 
 _DEEP = re.compile(r"(^|/)\*\*([^/]+)$")
-"""`**.mcap`, which shells and stores read differently: all names that end so, at any depth."""
+"""Matches `**.mcap`, which shells and stores read differently. Here it means all names that end so, at any depth."""
 
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs", "az": "az", "abfs": "az", "abfss": "az"}
-"""Of coec, that bring what speaks to a store, by the scheme of its URLs."""
+"""coec's optional extra that installs the client of a store, by the scheme of the store's URLs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ class Job:
 
     Attributes:
         url: a path, or a URL with its scheme.
-        sha256: of the file, as it is stated beside it; None: nobody states it.
+        sha256: hash of the file, as `SHA256SUMS` beside it states; None: it is not stated.
     """
 
     url: str
@@ -46,11 +47,11 @@ class Job:
 
 
 def jobs_of(patterns: Sequence[str]) -> list[Job]:
-    """The windows that patterns name, in order of their URLs, each once. A pattern is a file, a folder (all windows
-    in and below it) or has `*`, `?`, `[...]` and `**`, by path or by URL.
+    """The windows that patterns name, in the order of their URLs, each once. A pattern is a path or a URL: of a file,
+    of a folder (all windows in and below it), or with `*`, `?`, `[...]` and `**`.
 
     Raises:
-        UsageError: one names no window.
+        UsageError: a pattern names no window.
         SourceError: a store cannot be asked, or the hashes beside windows cannot be read.
     """
     found: set[str] = set()
@@ -67,10 +68,10 @@ def jobs_of(patterns: Sequence[str]) -> list[Job]:
 
 @contextmanager
 def fetched(url: str) -> Iterator[Path]:
-    """A window as a file of this machine, for as long as it is needed.
+    """A window as a file on this machine, for the duration of the block.
 
     Raises:
-        SourceError: it cannot be had.
+        SourceError: the window cannot be fetched.
     """
     if not _scheme(url):
         yield Path(url)
@@ -85,10 +86,10 @@ def fetched(url: str) -> Iterator[Path]:
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file, hexadecimal.
+    """Hash of a file, hexadecimal.
 
     Raises:
-        SourceError: it cannot be read.
+        SourceError: the file cannot be read.
     """
     try:
         with path.open("rb") as stream:
@@ -102,7 +103,7 @@ def _local(pattern: str) -> list[str]:
     if path.is_dir():
         found = path.rglob(f"*{SUFFIX}")
     elif not _is_pattern(pattern):
-        return [pattern]  # one that is not there is a row with its error, as those of a store are
+        return [pattern]  # if the file is absent, its row gets the error, as for a store
     else:
         fixed = next(index for index, part in enumerate(path.parts) if _is_pattern(part))
         found = Path(*path.parts[:fixed]).glob(str(Path(*path.parts[fixed:])))
@@ -124,7 +125,7 @@ def _remote(pattern: str) -> list[str]:
 
 
 def _sums(folder: str) -> dict[str, str]:
-    """Hashes by name, that are stated in a folder; none where they are not."""
+    """Hashes that a folder's `SHA256SUMS` states, by name; empty if there is no such file."""
     url = f"{folder}{SUMS}"
     try:
         if _scheme(url):
@@ -145,13 +146,13 @@ def _sums(folder: str) -> dict[str, str]:
 
 
 def _scheme(url: str) -> str:
-    """Of a URL; empty for a path."""
+    """Scheme of a URL; empty for a path."""
     scheme, colon, _ = url.partition("://")
     return scheme if colon else ""
 
 
 def _folder(url: str) -> str:
-    """All of it before the last name."""
+    """Everything before the last name."""
     return url[: url.rfind("/") + 1]
 
 
@@ -160,7 +161,7 @@ def _name(url: str) -> str:
 
 
 def _store(url: str) -> tuple[Any, str]:
-    """What speaks to the store of a URL, and the place in it."""
+    """The client of the store of a URL, and the place in the store."""
     try:
         import fsspec
     except ImportError as error:
@@ -178,7 +179,7 @@ def _store(url: str) -> tuple[Any, str]:
 
 @contextmanager
 def _asking(url: str) -> Iterator[None]:
-    """Whatever a library for a store raises is an error of that store: they have no class in common."""
+    """Turns whatever a store's library raises into a `SourceError`, because these libraries share no error class."""
     try:
         yield
     except (SourceError, UsageError):

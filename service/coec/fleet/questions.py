@@ -1,4 +1,4 @@
-"""Asking the tables of a batch: one view, SQL, and examples of what it answers."""
+"""Queries of the tables of a batch: one view, SQL, and example queries."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from coec.errors import UsageError
 from coec.fleet.extra import library
 
 WINDOWS = "windows"
-"""The view: a row a window, with `date` and `vehicle` from the folders."""
+"""Name of the view. It has one row per window, with `date` and `vehicle` from the folders."""
 
 EXAMPLES: Mapping[str, str] = {
     "Which vehicles have drifted most in pitch over the last weeks?": f"""
@@ -32,14 +32,14 @@ FROM (SELECT unnest(map_entries(figures)) AS figure FROM {WINDOWS} WHERE accepte
 SELECT versions['coec'] AS version, median(seconds) AS s, quantile_cont(seconds, 0.99) AS s_99, count(*) AS windows
 FROM {WINDOWS} WHERE error IS NULL GROUP BY ALL ORDER BY ALL""",
 }
-"""By what they answer."""
+"""Example queries, by the question that each answers."""
 
 
 def ask(folder: Path) -> Any:
     """A connection (`duckdb.DuckDBPyConnection`) with the view `windows` over the tables of a batch.
 
     Raises:
-        UsageError: there are none.
+        UsageError: there are no tables.
         SourceError: the optional extra is not installed.
     """
     connection = library("duckdb").connect(":memory:", config={"autoinstall_known_extensions": "false"})
@@ -48,10 +48,10 @@ def ask(folder: Path) -> Any:
 
 
 def view(connection: Any, name: str, folder: Path) -> None:
-    """Another view, over the tables of another batch.
+    """Creates a view over the tables of another batch.
 
     Raises:
-        UsageError: there are none.
+        UsageError: there are no tables.
     """
     if next(folder.glob("date=*/vehicle=*/*.parquet"), None) is None:
         raise UsageError(f"{folder} holds no tables of a batch (date=.../vehicle=.../*.parquet): coec batch makes them")
@@ -59,7 +59,7 @@ def view(connection: Any, name: str, folder: Path) -> None:
 
 
 def statement(name: str, folder: Path) -> str:
-    """SQL that creates a view over the tables of a batch. A vehicle called 007 stays text."""
+    """SQL that creates a view over the tables of a batch. Names of vehicles stay text, even 007."""
     pattern = str(folder / "date=*" / "vehicle=*" / "*.parquet").replace("'", "''")
     return (
         f"CREATE VIEW {name} AS SELECT * FROM read_parquet('{pattern}', hive_partitioning = true, "

@@ -1,4 +1,5 @@
-"""What many windows say of a fleet: drift of every pair, what is refused and why, what another batch decided."""
+"""The report on a fleet from many windows: drift of every pair, refusals and their reasons, and differences from
+another batch."""
 
 from __future__ import annotations
 
@@ -24,33 +25,34 @@ from coec.schemas.fleet_now import FleetNow
 from coec.schemas.replies import Maybe6
 
 READ, BEFORE = "read", "before"
-"""The table of what a report takes, and the view of the batch that is compared with."""
+"""Names of the table with the columns that a report needs, and of the view of the batch to compare with."""
 
 ENDS = 5
-"""Accepted windows whose median is where a pair began, and is now: one that is far off moves none of both."""
+"""How many accepted windows at each end give, by their median, where a pair began and where it is now. A single outlier
+moves neither."""
 
 MONTH_S = 30 * 86_400.0
 
 LISTED = 50
-"""Windows decided otherwise that are listed."""
+"""How many windows with a different decision are listed."""
 
 NS_PER_S = 1e9
 
 _TOLD = ", ".join(f"CASE WHEN observed[{index}] THEN {axis} END AS {axis}" for index, axis in enumerate(AXES, 1))
-"""The corrections, null where a window does not tell them."""
+"""The corrections; null for axes that a window does not observe."""
 
 _READ = (
     "vehicle, pair, date, stamp_ns, window_id, url, sha256, accepted, observed, reason_codes, error_code, decision,"
     f" figures, {', '.join(AXES)}"
 )
-"""Columns that a report takes: from thousands of files, each of which is opened once."""
+"""Columns that a report needs. They are copied into a table, so that each of thousands of files is opened only once."""
 
 _ACCEPTED = f"(SELECT vehicle, pair, date, stamp_ns, {_TOLD} FROM {READ} WHERE accepted)"
 
 
 def report(folder: Path, against: Path | None, now: FleetNow | None = None) -> FleetReport:
-    """Of the tables in a folder; `against`: those of an earlier batch over the same windows; `now`: what the vehicles
-    said last, of their alarms.
+    """The report from the tables in a folder. `against`: folder of an earlier batch over the same windows. `now`: the
+    last words of the vehicles, for their alarms.
 
     Raises:
         UsageError: there are no tables.
@@ -121,13 +123,14 @@ def _six(values: Sequence[float | None]) -> Maybe6:
 
 
 def _ends(connection: Any) -> dict[tuple[str, str], tuple[Maybe6, Maybe6, Maybe6]]:
-    """By vehicle and pair: medians of the first and of the last accepted windows, and the slope of all."""
+    """By vehicle and pair: medians of the first and of the last accepted windows, and the slope over all, per month."""
     medians = ", ".join(
         f"median({axis}) FILTER (up <= {ENDS}), median({axis}) FILTER (down <= {ENDS}),"
         f" regr_slope({axis}, stamp_ns / {NS_PER_S}) * {MONTH_S}"
         for axis in AXES
     )
-    # Over each axis by itself would be eighteen sorts; a pair has the same axes in all its windows, nearly.
+    # Windows are ranked once for all axes, because ranking each axis by itself would take eighteen sorts. Nearly all
+    # windows of a pair observe the same axes.
     rows = connection.execute(
         f"SELECT vehicle, pair, count(DISTINCT date) > 1, {medians} FROM (SELECT *,"
         " row_number() OVER (PARTITION BY vehicle, pair ORDER BY stamp_ns) AS up,"
@@ -172,7 +175,7 @@ def _figures(connection: Any) -> tuple[FigureOfFleet, ...]:
 
 
 def _once(name: str) -> str:
-    """The windows of a view, of copies the one with the first URL."""
+    """The windows of a view; of several copies only the one with the first URL."""
     return f"(SELECT * FROM {name} QUALIFY row_number() OVER (PARTITION BY sha256 ORDER BY url) = 1)"
 
 

@@ -1,7 +1,7 @@
-"""The folder of a batch: its terms, the rows that are finished, the tables that are made of them.
+"""The folder of a batch: its terms, the finished rows, and the tables that are made of them.
 
-A finished row is on the disk before the next is waited for: a batch that is stopped at any point, or whose machine
-loses its power, loses the windows under way. Rows wait in a journal until there are enough for a file of a table.
+A finished row is on the disk before the next one is awaited. So a batch that is stopped at any point, or whose machine
+loses its power, loses only the windows under way. Rows wait in a journal until there are enough for a file of a table.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from coec.schemas.fleet import WindowRow
 TERMS, JOURNAL = "terms.json", "journal.jsonl"
 
 ROWS_A_FILE = 512
-"""Of a table: files of some megabytes, and no more than that many rows are read again at a start."""
+"""Rows in one file of a table: files then have some megabytes, and at most so many rows are read again at a start."""
 
 
 class Results:
-    """Of one batch. Call `finish` at its end, however it ends."""
+    """The results of one batch. Call `finish` at its end, however it ends."""
 
     def __init__(self, folder: Path, terms: Terms, *, resume: bool) -> None:
-        """Begin a folder, or go on with one.
+        """Begins a folder, or continues one.
 
         Raises:
-            UsageError: there is a batch already, or it was on other terms.
+            UsageError: the folder holds a batch already, or one on other terms.
             OutputError: the folder cannot be written.
             SourceError: a table in it is damaged.
         """
@@ -43,19 +43,19 @@ class Results:
         self._journal = durable.Log(folder / JOURNAL, 2 * ROWS_A_FILE, self._lines)
         with self._writing(folder / JOURNAL):
             rows = [_row(line) for line in self._journal.load()]
-        # A run that ended when tables were made may not have come to empty the journal.
+        # A run that ended just after it wrote tables may have left their rows in the journal.
         self._rows = [row for row in rows if row is not None and row.url not in self._made]
 
     @property
     def urls(self) -> frozenset[str]:
-        """Of the windows that have a row."""
+        """URLs of the windows that have a row."""
         return frozenset(self._made | {row.url for row in self._rows})
 
     def add(self, row: WindowRow) -> None:
-        """A window is finished; on the disk when this returns.
+        """Adds the row of a finished window; it is on the disk when this returns.
 
         Raises:
-            OutputError: it is not.
+            OutputError: it cannot be written.
         """
         self._rows.append(row)
         with self._writing(self._folder / JOURNAL):
@@ -65,14 +65,14 @@ class Results:
             self.finish()
 
     def finish(self) -> None:
-        """Make tables of the rows that wait.
+        """Writes the waiting rows into tables.
 
         Raises:
-            OutputError: one cannot be written; the rows are in the journal, and the next run makes them.
+            OutputError: a table cannot be written. The rows stay in the journal, and the next run writes the tables.
         """
         if not self._rows:
             return
-        # The name hangs on what is in it, so that no file replaces another's rows.
+        # The name depends on the rows in the file, so that no file replaces one with other rows.
         urls = [row.url for row in self._rows]
         name = hashlib.sha256("\n".join(sorted(urls)).encode()).hexdigest()[:16]
         tables.write(self._folder, self._rows, f"part-{name}")
@@ -89,7 +89,7 @@ class Results:
         path = self._folder / TERMS
         try:
             there = json.loads(path.read_bytes())["fingerprint"]
-        except (FileNotFoundError, NotADirectoryError):  # a folder that cannot be made is told by whoever makes it
+        except (FileNotFoundError, NotADirectoryError):  # if the folder cannot be made, `output.replace` raises
             there = None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UsageError(f"{path} cannot be read ({error}): choose another folder") from error
@@ -113,7 +113,7 @@ class Results:
 
 
 def _row(line: bytes) -> WindowRow | None:
-    """None: the line was damaged, and its window is judged again."""
+    """The row in a line of the journal. None: the line is damaged, and its window is judged again."""
     try:
         return from_json(WindowRow, line)
     except DecodeError:

@@ -1,8 +1,8 @@
-"""Who of a fleet said what last, and how urgent that is. Pure: it is told what came, and what time it is.
+"""The last word of each pair of a fleet, and how urgent it is. Pure: words and times come from the caller.
 
-Nothing is invented: a pair that is silent keeps the state that it had said, and is shown as silent, never as healthy.
-No clock but one's own is trusted with an age where it can be helped: of a word that was heard as it was said the age
-counts from then; of one that was kept, there is only its vehicle's clock to go by.
+Nothing is invented: a silent pair keeps the last state that it reported, and is shown as silent, never as healthy. Ages
+are counted by the watcher's own clock where possible. If a word was heard as it was said, its age counts from then; for
+a word that was kept elsewhere, only its vehicle's clock is available.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from coec.schemas.replies import HealthState
 AXES: Final = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 MAX_PAIRS: Final = 200_000
-"""That are kept, some 3 kB each: who floods takes no more memory than a fleet does."""
+"""How many pairs are kept, some 3 kB each. So a flood of words takes no more memory than a fleet does."""
 
 OVERDUE_PERIODS: Final = 2.5
-"""Of a pair's own period without a word, after which it is silent: one word may be lost on the way."""
+"""After so many of its own periods without a word a pair is silent: one word may be lost on the way."""
 
 RANKS: Final = ("miscalibrated", "suspect", "degraded", "silent", "stale", "unknown", "healthy", "parked")
-"""The most urgent first. Who knows that it is wrong comes before who says nothing."""
+"""States, the most urgent first. A pair that knows that it is wrong comes before one that says nothing."""
 
 Name = tuple[str, str]
 """Vehicle and pair."""
 
 _Place = tuple[int, float, float, Name]
-"""In the order of urgency."""
+"""Sort key of a pair in the order of urgency."""
 
 
 @dataclass(slots=True)
 class _Heard:
-    """A word, when it was said by the watcher's steady clock, which axis drifted furthest and how far, in multiples of
-    what a monitor has to see; and whether its vehicle has gone since."""
+    """A word; when it was said, by the watcher's steady clock; which axis drifted furthest and how far, in multiples of
+    the drift that a monitor has to detect; and whether its vehicle has gone since."""
 
     word: LastWord
     said_s: float
@@ -50,14 +50,14 @@ class _Heard:
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """Which pairs are looked at: those in one of the states (or `parked`, `silent`; none: all), with a text in the
-    name of vehicle or pair."""
+    """Which pairs are shown: those in one of the states (or `parked`, `silent`; empty: all states) whose name contains
+    the text. The name is that of the vehicle and the pair."""
 
     states: frozenset[str] = frozenset()
     text: str = ""
 
     def passes(self, name: Name, told: str) -> bool:
-        """Whether a pair, that is told as in this state, is looked at."""
+        """Whether a pair that is shown in state `told` passes."""
         return (not self.states or told in self.states) and (not self.text or self.text in f"{name[0]}/{name[1]}")
 
 
@@ -65,7 +65,7 @@ EVERYTHING: Final = Filter()
 
 
 class Roster:
-    """Of one fleet. Owned by one thread."""
+    """The last words of one fleet. Owned by one thread."""
 
     def __init__(self, most: int = MAX_PAIRS) -> None:
         self._most = most
@@ -73,13 +73,13 @@ class Roster:
         self._refused: Counter[str] = Counter()
 
     def hear(self, key: str, payload: bytes, now_s: float) -> None:
-        """A word as it is said; `now_s` by the steady clock. What is none is counted."""
+        """Takes in a word as it is said, at `now_s` by the steady clock. Invalid words are counted."""
         word = self._read(key, payload)
         if word is not None:
             self._take(word, now_s)
 
     def recall(self, key: str, payload: bytes, now_s: float, wall_ns: int) -> None:
-        """A word that was kept, or that was asked for: it stands where none is known that was said later."""
+        """Takes in a word that was kept or asked for, unless a later one is known."""
         word = self._read(key, payload)
         if word is None:
             return
@@ -88,18 +88,18 @@ class Roster:
             self._take(word, now_s - max((wall_ns - word.said_ns) * 1e-9, 0.0))
 
     def present(self, vehicle: str, pair: str, *, is_there: bool) -> None:
-        """Its token came or went. That one came says nothing yet of what it says."""
+        """The liveliness token of a pair came or went. A token that came does not say what the pair's state is."""
         known = self._heard.get((vehicle, pair))
         if known is not None and not is_there:
             known.gone = True
 
     def refuse(self, cause: str, count: int = 1) -> None:
-        """Something that was no word."""
+        """Counts something that was no word."""
         self._refused[cause] += count
 
     def overdue(self, now_s: float, most: int) -> list[Name]:
-        """Pairs that are silent though nobody said that they have gone, those that have been the longest first: a word
-        of theirs may have been lost, and they can be asked."""
+        """Pairs that are silent although their token has not gone, the longest silent first. Their word may have been
+        lost, so they can be asked."""
         found = [
             (heard.said_s, name)
             for name, heard in self._heard.items()
@@ -108,7 +108,7 @@ class Roster:
         return [name for _, name in sorted(found)[:most]]
 
     def now(self, now_s: float, chosen: Filter = EVERYTHING, most: int = MAX_PAIRS) -> FleetNow:
-        """What there is to tell, at most so many pairs of it."""
+        """The fleet as it is now, with at most `most` of the chosen pairs."""
         states: Counter[str] = Counter()
         order: list[tuple[_Place, Standing, _Heard]] = []
         for name, heard in self._heard.items():
@@ -144,10 +144,10 @@ class Roster:
 
 
 def of_states(names: Iterable[str], refuse: Callable[[str], Exception]) -> frozenset[str]:
-    """States that a filter may name.
+    """The names of a filter as a set of states.
 
     Raises:
-        Exception: that which `refuse(text)` makes, where one is none.
+        Exception: what `refuse(text)` returns, if a name is no state.
     """
     chosen = frozenset(names)
     known = (*get_args(HealthState), "parked", "silent")
@@ -165,7 +165,7 @@ def _standing(heard: _Heard, now_s: float) -> Standing:
 
 
 def _rank(word: LastWord, standing: Standing) -> int:
-    """A pair that was last known to be wrong stays in front, wherever it is now."""
+    """Rank of a pair. One that was last known to be wrong stays in front, even if it is silent or parked now."""
     by_state = RANKS.index(word.state)
     if standing == "live" or word.state == "miscalibrated":
         return by_state
@@ -173,7 +173,7 @@ def _rank(word: LastWord, standing: Standing) -> int:
 
 
 def _drift(word: LastWord) -> tuple[int | None, float]:
-    """The axis that drifted furthest, and how far, in multiples of what a monitor has to see."""
+    """The axis that drifted furthest, and how far, in multiples of the drift that a monitor has to detect."""
     shares = [0.0 if moved is None else abs(moved) / seen for moved, seen in zip(word.drift or (), SEEN, strict=False)]
     furthest = max(shares, default=0.0)
     return (shares.index(furthest) if furthest > 0.0 else None), furthest

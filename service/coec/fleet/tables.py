@@ -1,4 +1,4 @@
-"""Rows as Parquet: one file after another, in folders by date and vehicle, as DuckDB, Spark and pandas read them."""
+"""Writes rows as Parquet files in folders by date and vehicle, as DuckDB, Spark and pandas read them."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from coec.schemas.replies import Maybe6, Maybe6x6
 NS_PER_S = 1_000_000_000
 
 UNDATED, NAMELESS = "unknown", "unknown"
-"""Date and vehicle of windows that could not be read; a vehicle cannot be called so, as a folder's name, by accident:
-its rows still hold its own."""
+"""Folder names for date and vehicle of windows that could not be read. If a vehicle happens to have this name, its rows
+still hold their own data."""
 
 
 def schema() -> Any:
@@ -76,10 +76,10 @@ def schema() -> Any:
 
 
 def write(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
-    """Writes a file of this name for each date and vehicle; each is there whole or not at all.
+    """Writes a file of this name for each date and vehicle, each completely or not at all.
 
     Raises:
-        OutputError: one cannot be written.
+        OutputError: a file cannot be written.
     """
     groups: dict[str, list[WindowRow]] = defaultdict(list)
     for row in rows:
@@ -89,7 +89,7 @@ def write(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
 
 
 def urls(folder: Path) -> set[str]:
-    """Of all windows that have a row in a folder.
+    """URLs of all windows that have a row in a folder.
 
     Raises:
         SourceError: a file is damaged.
@@ -124,7 +124,8 @@ def _parquet(rows: Sequence[WindowRow]) -> bytes:
 
 
 def _values(row: WindowRow) -> dict[str, Any]:
-    """What is kept by name is in the order of the names: equal rows are equal bytes, those of a resumed batch, too."""
+    """The values of a row. Maps are in the order of their names, so that equal rows give equal bytes, also in a resumed
+    batch."""
     told: dict[str, Any] = {
         "url": row.url,
         "sha256": row.sha256,
@@ -177,7 +178,7 @@ def _values(row: WindowRow) -> dict[str, Any]:
 
 
 def _correlation(noise: Maybe6x6) -> list[float | None]:
-    """Row by row, of what differs from window to window; null where an axis is not known."""
+    """Correlations of the noise, which differs from window to window, row by row; null where an axis is not known."""
     variances: Maybe6 = tuple(noise[axis][axis] for axis in range(6))  # type: ignore[assignment]
     return [
         None

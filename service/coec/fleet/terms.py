@@ -1,4 +1,4 @@
-"""On what terms windows are judged again: each as it was recorded, or all by another configuration or rig."""
+"""The terms on which windows are judged again: each as it was recorded, or all by another configuration or rig."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from coec.config.reading import load_config
 from coec.errors import ConfigError, UsageError, WindowError
 
 MAX_RIG_BYTES = 2**20
-"""Of a file that describes a rig: a thousand times what intrinsics and a pose take."""
+"""Largest file that describes a rig, bytes: a thousand times what intrinsics and a pose take."""
 
 
 class Terms(BaseModel):
-    """What windows are judged by; travels to the processes that judge.
+    """The settings by which windows are judged. They are sent to the processes that judge.
 
     Attributes:
-        calibrations: of another configuration, by pair; empty: each window by the one that it carries.
-        any_pair: of the same, for windows of pairs that it does not name; None: such a window is refused.
+        calibrations: settings of another configuration, by pair; empty: each window is judged by its own.
+        any_pair: settings of that configuration for pairs that it does not name; None: such windows are refused.
         rig: another rig (`rig_to_json`) for the windows of its pair; None: each window's own.
-        depth: another depth network for all: where that of the vehicles lies elsewhere, or a new one is tried. It is no
-            part of what a result says of its configuration, which has the hash of the network.
+        depth: another depth network for all windows, if the vehicles' network lies elsewhere or a new one is tried. It
+            does not enter the configuration in a result, which has the hash of the network.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -41,12 +41,12 @@ class Terms(BaseModel):
 
     @property
     def fingerprint(self) -> str:
-        """Equal for equal decisions: of the terms, and of the program that decides."""
+        """Hash of the terms and of coec's version: equal fingerprints give equal decisions."""
         told = json.dumps([__version__, self.model_dump(mode="json")], sort_keys=True)
         return hashlib.sha256(told.encode()).hexdigest()
 
     def applied(self, window: Window, carried: CalibrationConfig) -> tuple[Window, CalibrationConfig]:
-        """A window and the configuration that it carries, as they are judged on these terms.
+        """A window and its own configuration, replaced by what these terms say.
 
         Raises:
             ConfigError: the configuration does not name the pair of the window.
@@ -59,7 +59,7 @@ class Terms(BaseModel):
         return replace(window, rig=replace(rig, mask=mask)), calibration
 
     def network(self, configured: DepthConfig) -> DepthConfig:
-        """The network by which a window is judged that is configured for one."""
+        """The network by which a window is judged, given the one that is configured for it."""
         return configured if self.depth is None else configured.model_copy(update={"model": self.depth})
 
     def _calibration(self, pair: str, carried: CalibrationConfig) -> CalibrationConfig:
@@ -73,11 +73,11 @@ class Terms(BaseModel):
 
 
 def terms_of(config: Path | None, rig: Path | None, depth: str | None) -> Terms:
-    """The terms that a user states, each of which may be missing.
+    """The terms from what a user gives. Each argument may be None: the windows' own is used.
 
     Args:
         config: configuration of a daemon (YAML).
-        rig: JSON of a rig, as windows have it attached.
+        rig: JSON file of a rig, as it is attached to windows.
         depth: an ONNX file, or the name of a network that comes with coec.
 
     Raises:
@@ -88,16 +88,16 @@ def terms_of(config: Path | None, rig: Path | None, depth: str | None) -> Terms:
     if config is not None:
         pairs = load_config(config).every_pair
         calibrations = {pair.name: pair.calibration for pair in pairs}
-        # One pair says how windows are calibrated, whatever the vehicles call theirs.
+        # If there is only one pair, its settings are for all windows, whatever the vehicles call their pairs.
         any_pair = pairs[0].calibration if len(pairs) == 1 else None
     return Terms(calibrations=calibrations, any_pair=any_pair, rig=None if rig is None else _rig(rig), depth=depth)
 
 
 def _rig(path: Path) -> dict[str, Any]:
-    """The rig in a file as windows have it attached, with or without what else stands there.
+    """The rig in a file that was attached to a window, either the whole attachment or only its `rig`.
 
     Raises:
-        UsageError: there is none.
+        UsageError: the file holds no rig.
     """
     try:
         if path.stat().st_size > MAX_RIG_BYTES:

@@ -18,5 +18,5 @@ def failed(row: WindowRow, code: str, text: str) -> WindowRow:
 
 
 def lost(job: Job, code: str, text: str) -> WindowRow:
-    """The row of a window with which a process ended."""
+    """The row of a window whose process ended."""
     return failed(begun(job, {"coec": __version__}), code, text)

@@ -1,4 +1,4 @@
-"""Recordings as input: one door, `open_source`, for every layout."""
+"""Recordings as input: one function, `open_source`, opens every layout."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def open_source(spec: str) -> Recording:
 
     Raises:
         UsageError: the argument does not fit the grammar, or its query has an unknown key.
-        SourceError: the recording is absent, incomplete or not in the layout its name promises.
-        WindowError: a recorded window that is damaged.
+        SourceError: the recording is absent, incomplete or not in the layout that its name promises.
+        WindowError: a recorded window is damaged.
     """
     parsed = parse_spec(spec)
-    # Each layout is imported when it is asked for: OpenCV, rosbags and the MCAP readers are not needed by all.
+    # Each layout is imported when it is asked for, because not all need OpenCV, rosbags and the MCAP readers.
     match parsed.layout:
         case "kitti360":
             from coec.sources.kitti360 import open_kitti360

@@ -1,4 +1,4 @@
-"""The thinned pairs between those of a window, from a recording that holds more than the window."""
+"""Adds to a window the thinned pairs between its own, from a recording that holds more than the window."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from coec.sources.windows import RECORDED_GAP_S
 
 
 def with_between(window: Window, recording: Recording, config: WindowConfig) -> Window:
-    """The window with the pairs that the daemon would have recorded between its own, of a recording that holds those,
-    too: its slice is from its first to its last pair.
+    """The window with the pairs between its own that the daemon would have recorded, taken from a recording that holds
+    them. The window's slice runs from its first to its last pair.
 
     Raises:
         SourceError: a file cannot be read.
@@ -27,7 +27,7 @@ def with_between(window: Window, recording: Recording, config: WindowConfig) -> 
     rig = window.rig
     lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
     picked = BetweenPairs(Compressed(LimitsConfig()), half_field_of_view_rad(rig.camera, lit))
-    # From the first of n to the last there are n - 1 times the distance of two, in a slice n times.
+    # From the first of n pairs to the last there are n - 1 intervals; a slice of n pairs has n.
     of_window = config.model_copy(update={"pairs": max(1, len(stamps_ns) - 1)})
     picked.begin(of_window, stamps_ns[0], stamps_ns[-1] - stamps_ns[0])
     own, between = set(stamps_ns), []
@@ -40,7 +40,7 @@ def with_between(window: Window, recording: Recording, config: WindowConfig) -> 
 
 
 def _pairs(recording: Recording, window: Window, config: WindowConfig) -> list[FramePair]:
-    """Those of the window, and whatever lies as far apart as asked for."""
+    """The pairs of the window, and those between them at the configured distance (`between_s`)."""
     own, chosen, last_ns = {pair.stamp_ns for pair in window.pairs}, [], window.pairs[0].stamp_ns
     for index, stamp_ns in enumerate(recording.camera_stamps_ns):
         if not window.pairs[0].stamp_ns <= stamp_ns <= window.stamp_ns:

@@ -35,7 +35,7 @@ def load_cloud(stamp_ns: int, frame_id: str, path: Path) -> LidarFrame:
     columns = loader(path)
     if len(columns["xyz"]) > MAX_POINTS:
         raise SourceError(f"{path} has {len(columns['xyz'])} points; no sweep has more than {MAX_POINTS}")
-    # A double that no float holds becomes infinite, and its point is dropped.
+    # A double that is too large for a float becomes infinite, and its point is dropped.
     with np.errstate(over="ignore", invalid="ignore"):
         return _frame(stamp_ns, frame_id, path, columns)
 
@@ -46,7 +46,8 @@ def measured_from(
     """A sweep in the LiDAR's own frame, see `from_origin`.
 
     Raises:
-        SourceError: its points contradict that they were measured from there; `advice` says by its cause what to do.
+        SourceError: the points were not measured from the origin of that frame. The message ends with the entry of
+            `advice` for the cause.
     """
     sweep = from_origin(cloud, T_cloud_lidar, frame_id)
     contradiction = apparent_origin(sweep)

@@ -3,8 +3,8 @@
 Time. The sweep carries the stamp of the *camera*. The HDL-64 triggers the cameras when its beam looks forward, so the
 exposure is the instant at which azimuth 0 is measured, and `SweepTiming(sign=-1, stamp_azimuth_rad=0)` counts from it.
 The recording agrees: over the 11,518 frames of drive 0000 the two `timestamps.txt` differ by -0.2 to 0.9 ms, a slow
-drift of two clocks with only 0.05 ms of noise within 20 frames, and their frame periods correlate at 0.88: one trigger,
-stamped twice. The camera's copy is the one the image and the poses share.
+drift of two clocks with only 0.05 ms of noise within 20 frames, and their frame periods correlate at 0.88. So there is
+one trigger, which is stamped twice. The camera's stamp is the one that the image and the poses share.
 
 Extrinsics. `calib_cam_to_velo.txt` maps the unrectified camera 0 to the Velodyne, `calib_cam_to_pose.txt` every
 unrectified camera to the pose frame (GPS/IMU). With R_rect of the perspective pair:
@@ -49,23 +49,24 @@ FISHEYE = ("image_02", "image_03")
 LIDAR_FRAME = "velodyne"
 
 NOMINAL_PERIOD_S = 0.1
-"""Revolution of the HDL-64 at 10 Hz, for a drive of one frame, seconds."""
+"""Time of one revolution of the HDL-64 at 10 Hz, seconds; used for a drive of one frame."""
 
 MAX_POSE_GAP_S = 1.0
 MAX_GAP_MOTION_M = 0.5
-"""Poses are recorded every 0.2 to 1.4 m of way. A gap longer than a second in which the vehicle moved less than half a
-metre is a halt and the mean over it is right enough; one with more motion is an outage, and no ego-motion is given."""
+"""Poses are recorded every 0.2 to 1.4 m of travel. A gap longer than a second in which the vehicle moved less than half
+a metre is a halt, and the mean over it is accurate enough. A gap with more motion is an outage: no ego-motion is
+given."""
 
 
 def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
     """`kitti360:ROOT?drive=…&camera=image_00[&depth=FOLDER]`.
 
-    The drive defaults to the only one there, `depth` to `stereo_disparity_<camera number>` where ROOT has it. Frames
-    exist where both image and scan exist.
+    The drive defaults to the only one there is, `depth` to `stereo_disparity_<camera number>` if ROOT has it. There is
+    a frame wherever both image and scan exist.
 
     Raises:
         UsageError: unknown query key.
-        SourceError: anything missing or malformed, by file name.
+        SourceError: something is missing or malformed; names the file.
     """
     query, root = spec.only("drive", "camera", "depth"), spec.path
     images_root = root / "data_2d_raw"
@@ -120,7 +121,7 @@ def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
 
 
 def _stamps_path(images: Path, camera: str, velodyne: Path) -> Path:
-    """Stamps of the camera, else of another camera (all have one trigger), else of the Velodyne (within 1.2 ms)."""
+    """Stamps of the camera, else of another camera (all share one trigger), else of the Velodyne (within 1.2 ms)."""
     candidates = [images / name / "timestamps.txt" for name in (camera, *PERSPECTIVE, *FISHEYE)]
     candidates.append(velodyne / "timestamps.txt")
     for path in candidates:
@@ -166,7 +167,7 @@ def _perspective(calibration: Path, number: str, width: int, height: int) -> cam
 
 
 def _fisheye(path: Path) -> cameras.Camera:
-    """MEI intrinsics as OpenCV's FileStorage wrote them: YAML after a `%YAML:1.0` line of its own."""
+    """MEI intrinsics as OpenCV's FileStorage writes them: YAML after a separate line `%YAML:1.0`."""
     text = read_text(path)
     if text.startswith("%YAML"):
         text = text.partition("\n")[2]
@@ -230,11 +231,11 @@ def _read_poses(path: Path, frames: int) -> tuple[list[int], NDArray[np.float64]
 def _twist_at(
     index: int, numbers: list[int], poses: NDArray[np.float64], stamps_ns: list[int]
 ) -> NDArray[np.float64] | None:
-    """(6,) twist (ω rad/s, v m/s) of the pose frame in itself at frame `index`, or None where poses are too far.
+    """(6,) twist (ω rad/s, v m/s) of the pose frame in itself at frame `index`; None if poses are too far away.
 
-    With ξ(a→b) = log(T_a⁻¹ T_b) / (t_b - t_a), the mean body twist between two poses: where the frame has a pose, the
-    means before and after it are weighted by the *other* interval, which is exact for constant acceleration; where it
-    has none, the mean over the gap around it.
+    ξ(a→b) = log(T_a⁻¹ T_b) / (t_b - t_a) is the mean body twist between two poses. If the frame has a pose, the means
+    before and after it are weighted by the *other* interval, which is exact for constant acceleration. If it has none,
+    the result is the mean over the gap around it.
     """
     before, after = bisect_left(numbers, index) - 1, bisect_right(numbers, index)
     if before < 0 or after >= len(numbers):

@@ -18,7 +18,7 @@ from coec.sources.reading import read_bytes
 NS_PER_S = 1_000_000_000
 
 MAX_TEXT_BYTES = 32 * 2**20
-"""Of a text file. The poses of the longest drive of KITTI-360, 19,240 frames, have 4 MB."""
+"""Largest text file, bytes. The poses of the longest drive of KITTI-360, 19,240 frames, have 4 MB."""
 
 _STAMP = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(?:\.(\d{1,9}))?")
 
@@ -57,7 +57,7 @@ def numbers_of(path: Path, numbers: dict[str, NDArray[np.float64]], key: str, co
     """The `count` finite numbers of a key.
 
     Raises:
-        SourceError: the key is absent, or has another count, or NaN; names file and key.
+        SourceError: the key is absent, has another count, or holds NaN; names file and key.
     """
     values = numbers.get(key)
     if values is None:
@@ -76,9 +76,9 @@ def homogeneous(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rigid(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """T with its rotation made orthonormal: the files print six digits, and products of them are off by 1e-6.
+    """T with its rotation made orthonormal. The files print six digits, so products of their matrices are off by 1e-6.
 
-    The nearest rotation in the Frobenius norm, by singular value decomposition.
+    Takes the nearest rotation in the Frobenius norm, by singular value decomposition.
     """
     u, _, vt = np.linalg.svd(T[:3, :3])
     result = T.copy()
@@ -90,7 +90,7 @@ def read_stamps(path: Path) -> list[int]:
     """Stamps of `timestamps.txt` (`2013-05-28 08:46:02.904483072`, taken as UTC), nanoseconds since 1970.
 
     Raises:
-        SourceError: absent, or a line that is no stamp; names the line.
+        SourceError: the file is absent, or a line is no stamp; names the line.
     """
     stamps = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -122,7 +122,8 @@ def the_only(candidates: list[str], asked: str | None, what: str, root: Path) ->
     """The candidate that was asked for, or the only one there.
 
     Raises:
-        SourceError: none, several without a choice, or not the one asked for; lists what is there.
+        SourceError: there is none, there are several and none was asked for, or the one asked for is absent; lists what
+            is there.
     """
     there = ", ".join(candidates[:12]) or "none"
     if asked is not None:
@@ -148,7 +149,7 @@ def stamp_of(stamps_ns: list[int], index: int, path: Path) -> int:
 
 
 def median_period_s(stamps_ns: list[int], default_s: float) -> float:
-    """Median distance of consecutive stamps in seconds, or the default where there are no two."""
+    """Median distance of consecutive stamps in seconds; the default if there are fewer than two."""
     if len(stamps_ns) < 2:
         return default_s
     return float(np.median(np.diff(np.array(stamps_ns, dtype=np.int64)))) / NS_PER_S
@@ -158,7 +159,7 @@ def load_image(path: Path) -> EncodedImage:
     """A JPEG or PNG file as it is, its size read from its header.
 
     Raises:
-        SourceError: absent, or not an image; names the file.
+        SourceError: the file is absent or not an image; names it.
     """
     try:
         return probe(read_bytes(path), LimitsConfig())
@@ -170,6 +171,6 @@ def load_camera(stamp_ns: int, frame_id: str, image: Path, depth: Path | None) -
     """A camera frame from its image file and, where there is one, its depth map (16-bit PNG).
 
     Raises:
-        SourceError: a file that cannot be read, names the file.
+        SourceError: a file cannot be read; names it.
     """
     return CameraFrame(stamp_ns, frame_id, load_image(image), depth=None if depth is None else load_image(depth))

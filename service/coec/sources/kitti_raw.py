@@ -2,7 +2,7 @@
 
 As in KITTI-360 the sweep carries the stamp of the camera, because the Velodyne triggers the cameras when it looks
 forward (Geiger et al. 2013, section III: "the cameras are triggered at 10 frames per second by the laser scanner, when
-facing forward"). Without `timestamps.txt` frames are 0.1 s apart by their number.
+facing forward"). Without `timestamps.txt`, consecutive frame numbers count as 0.1 s apart.
 
 Extrinsics: T_camera_lidar = [I | K⁻¹ p] · R_rect_00 · Tr_velo_to_cam, with P_rect_k = [K | p] (development kit).
 """
@@ -47,8 +47,8 @@ OXTS_FIELDS = 30
 """Numbers in a line of oxts/data (dataformat.txt of the development kit)."""
 
 _LINEAR = (8, 9, 10)
-"""vf, vl, vu: forward, leftward, upward velocity, m/s. (vf and vl are parallel to the ground, vu perpendicular to it:
-on a road they are those of the vehicle's own axes within its slope and roll, some degrees.)"""
+"""vf, vl, vu: forward, leftward, upward velocity, m/s. vf and vl are parallel to the ground and vu is perpendicular to
+it. On a road these axes agree with the vehicle's own within slope and roll, some degrees."""
 
 _ANGULAR = (20, 21, 22)
 """wf, wl, wu: angular rates about the forward, leftward, upward axis, rad/s."""
@@ -58,11 +58,11 @@ def open_kitti_raw(spec: SourceSpec) -> FramewiseRecording:
     """`kitti-raw:ROOT?drive=2011_09_26_drive_0005_sync&camera=image_02`.
 
     ROOT is the folder of the date folders, a date folder, or a single drive that holds the `calib_*.txt` itself (then
-    there is no drive to choose). The drive defaults to the only one there.
+    there is no drive to choose). The drive defaults to the only one there is.
 
     Raises:
         UsageError: unknown query key.
-        SourceError: anything missing or malformed, by file name.
+        SourceError: something is missing or malformed; names the file.
     """
     query = spec.only("drive", "camera")
     drive, calibration = _locate(spec.path, query.get("drive"))
@@ -114,7 +114,7 @@ def _locate(root: Path, asked: str | None) -> tuple[Path, Path]:
 
 
 def _stamps(path: Path, last: int) -> list[int]:
-    """Stamps of the frames 0 ... last at least, nanoseconds."""
+    """Stamps of at least the frames 0 ... last, nanoseconds."""
     if not path.is_file():
         return [index * FRAME_PERIOD_NS for index in range(last + 1)]
     stamps_ns = read_stamps(path)
@@ -136,7 +136,7 @@ def _calibration(folder: Path, number: str, width: int, height: int) -> tuple[Ma
 
 
 def _imu_to_velo(path: Path) -> Matrix4:
-    """T_lidar_ego, the identity where the file is absent (the sensors then differ by less than a metre)."""
+    """T_lidar_ego; the identity if the file is absent (the sensors are less than a metre apart)."""
     if not path.is_file():
         return np.eye(4)
     numbers = read_numbers(path)
@@ -160,7 +160,7 @@ def _motions(folder: Path, camera_stamps_ns: list[int]) -> tuple[EgoMotion, ...]
         if values.size != OXTS_FIELDS or not np.isfinite(values).all():
             raise SourceError(f"{path}: expected {OXTS_FIELDS} finite numbers, found {values.size}")
         if stamps_ns is camera_stamps_ns and index >= len(stamps_ns):
-            continue  # beyond the last frame, and nothing says when
+            continue  # beyond the last frame, so nothing gives its time
         motions.append(
             EgoMotion(
                 stamp_of(stamps_ns, index, stamps_path),

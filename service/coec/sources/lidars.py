@@ -14,13 +14,12 @@ from coec.sources.recording import MOTION_REACH_NS
 from coec.sources.spec import SourceSpec, is_bag, is_rig, parse_spec
 
 APART_NS = 60_000_000
-"""Two sweeps are a pair if their stamps differ by less: half a turn at 10 Hz, and a little."""
+"""Two sweeps are a pair if their stamps differ by at most this, ns: a little more than half a turn at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """The frames of one stream, loaded when it is their turn: ascending stamps, and how to load the frame of a
-    place."""
+    """The frames of one stream: ascending stamps, and a function that loads the frame at an index when it is needed."""
 
     stamps_ns: tuple[int, ...]
     load: Callable[[int], LidarFrame | EgoMotion]
@@ -31,8 +30,8 @@ class LidarRecording:
     """Sweeps of two LiDARs, and ego-motion.
 
     Attributes:
-        name: for people.
-        truth: true T_a_b (4, 4) at a time, where that is known.
+        name: name for people to read.
+        truth: true T_a_b (4, 4) at a time; None if it is unknown.
     """
 
     name: str
@@ -43,10 +42,10 @@ class LidarRecording:
     truth: Callable[[int], Matrix4] | None = None
 
     def pairs(self, count: int) -> list[SweepPair]:
-        """At most so many pairs, evenly over the recording.
+        """At most `count` pairs, evenly spread over the recording.
 
         Raises:
-            SourceError: a frame that cannot be read, or no sweep of the one near a sweep of the other.
+            SourceError: a frame cannot be read, or no sweep of one LiDAR is near a sweep of the other.
         """
         near = [
             (i, j) for i, stamp in enumerate(self.a.stamps_ns) if (j := _nearest(self.b, stamp, APART_NS)) is not None
@@ -69,11 +68,11 @@ class LidarRecording:
 
 
 def open_lidars(source: str, a: str, b: str) -> LidarRecording:
-    """LiDARs `a` and `b` of `sim:rig=...` (names of sensors) or of a bag (topics).
+    """Opens the LiDARs `a` and `b` of `sim:rig=...` (names of sensors) or of a bag (topics).
 
     Raises:
         UsageError: another kind of source, or no such sensor.
-        SourceError: the bag is absent or damaged, has no such topic, or does not tell where the LiDARs are.
+        SourceError: the bag is absent or damaged, has no such topic, or does not give the poses of the LiDARs.
     """
     if a == b:
         raise UsageError(f"{a} twice: name two LiDARs")
@@ -114,7 +113,7 @@ def _of_rig(spec: SourceSpec, a: str, b: str) -> LidarRecording:
 
 
 def _nearest(frames: Frames, stamp_ns: int, within_ns: int) -> int | None:
-    """The place of the frame nearest to a stamp; None if none is near."""
+    """Index of the frame nearest to a stamp; None if none is near enough."""
     if not frames.stamps_ns:
         return None
     apart = np.abs(np.array(frames.stamps_ns, np.int64) - stamp_ns)

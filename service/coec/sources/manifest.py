@@ -1,6 +1,7 @@
 """`dataset.yaml`: images and clouds listed one by one (CONTRACT, "Command line").
 
-Frames are `camera` and `lidar`; a `twist` is the velocity of the LiDAR in its own frame at the stamp of the image.
+The coordinate frames are called `camera` and `lidar`. A `twist` is the velocity of the LiDAR in its own frame at the
+stamp of the image.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ CAMERA_FRAME = "camera"
 LIDAR_FRAME = "lidar"
 
 _MAX_STAMP_NS = 2**31 * 1_000_000_000
-"""ROS 2 time, in which frames are recorded, has signed 32-bit seconds."""
+"""Bound for stamps: ROS 2 time, in which frames are recorded, has signed 32-bit seconds."""
 
 _DEPTH_CODES = 65_534
-"""Codes of a 16-bit PNG that mean a value, less one: 1 ... 65535; 0 is "no value"."""
+"""Span of the codes 1 ... 65535 that mean a value in a 16-bit PNG; 0 means "no value"."""
 
 
 class _Strict(BaseModel):
@@ -75,11 +76,12 @@ class ManifestDocument(_Strict):
 
 
 def open_manifest(spec: SourceSpec) -> FramewiseRecording:
-    """A folder with a `dataset.yaml`, or such a file.
+    """Opens a folder with a `dataset.yaml`, or such a file.
 
     Raises:
         UsageError: a query was given.
-        SourceError: absent, not YAML, an unknown or missing key, a file that is not there; names each place.
+        SourceError: the manifest is absent or not YAML, has an unknown or missing key, or names an absent file; names
+            each place.
     """
     spec.only()
     path = spec.path / FILE_NAME if spec.path.is_dir() else spec.path
@@ -171,7 +173,7 @@ def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> Came
 
 
 def _load_any_image(path: Path) -> EncodedImage:
-    """JPEG and PNG as they are, anything else that OpenCV reads as raw 8-bit pixels."""
+    """JPEG and PNG files as they are; any other image that OpenCV can read as raw 8-bit pixels."""
     data = read_bytes(path)
     try:
         return probe(data, LimitsConfig())
@@ -190,8 +192,8 @@ def _load_any_image(path: Path) -> EncodedImage:
 
 class _DepthScale:
     """One linear scale from the float maps of a recording to 16-bit codes 1 ... 65535, so that a code means the same in
-    every frame. Values that are not finite or not above zero are "no value", as 0 is in a PNG. The scale keeps the
-    order of the values, which is all that mutual information looks at, up to 1/65534 of their span."""
+    every frame. Values that are not finite or not above zero get 0, which means "no value". The scale keeps the order
+    of the values up to 1/65534 of their span, and mutual information depends only on their order."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._least, self._span = 0.0, 0.0
@@ -209,7 +211,7 @@ class _DepthScale:
         """The map as a 16-bit grey PNG.
 
         Raises:
-            SourceError: unreadable or not a (h, w) array of floats.
+            SourceError: the file is unreadable or not a (h, w) array of floats.
         """
         values = _load_float_map(path)
         share = (np.where(_has_value(values), values, self._least) - self._least) / (self._span or 1.0)

@@ -11,33 +11,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 Columns = dict[str, NDArray[np.generic]]
-"""`xyz` (N, 3), and where there are: `intensity`, `ring`, `time_offset_s`, each (N,). Not filtered."""
+"""`xyz` (N, 3), and if the file has them `intensity`, `ring` and `time_offset_s`, each (N,). Not filtered."""
 
 MAX_POINTS = 4_000_000
-"""No sweep is larger (a 128-beam LiDAR gives 0.3 million)."""
+"""Most points of a sweep (a 128-beam LiDAR gives 0.3 million)."""
 
 MAX_TABLE_BYTES = 128 * 2**20
-"""Of all rows as they are packed: 32 bytes for each of `MAX_POINTS`. With the columns made of it, and the file, it is
-what a hostile header can make us allocate, some 400 MB."""
+"""Most bytes of all rows as they are packed: 32 for each of `MAX_POINTS`. Together with the file and the columns made
+of the rows, a hostile header can so make coec allocate some 400 MB."""
 
 MAX_UNPACKED_BYTES = 20 * 2**20
-"""The same for compressed points. They are unpacked in plain Python, and nobody waits for more; a sweep of 0.3 million
-points with 10 columns has 12 MB."""
+"""The same for compressed points. Unpacking more in plain Python would take too long; a sweep of 0.3 million points
+with 10 columns has 12 MB."""
 
 MAX_FIELDS = 256
-"""Drivers give about ten."""
+"""Most fields of a point; drivers give about ten."""
 
 MAX_LINE_BYTES = 65_536
-"""Of a row in ascii."""
+"""Longest row in ascii, bytes."""
 
 ASCII_BLOCK_BYTES = 2**20
-"""Rows in ascii are parsed in blocks of this size: as Python objects they take thirty times as much."""
+"""Rows in ascii are parsed in blocks of this size, because as Python objects they take thirty times as much memory."""
 
 MAX_HEADER_BYTES = 65_536
-"""PCL's headers have some 300 bytes."""
+"""Longest header; PCL's headers have some 300 bytes."""
 
 _TIME_FIELDS = ("t", "time", "time_offset_s")
-"""Integer `t` is nanoseconds after the stamp (Ouster), the float ones are seconds after it (Velodyne driver)."""
+"""Names of the time field. Integers are nanoseconds after the stamp (`t` of Ouster), floats are seconds after it
+(Velodyne driver)."""
 
 _NS = 1e-9
 
@@ -59,7 +60,7 @@ def parse_pcd(data: bytes) -> Columns:
     """The columns of a PCD file.
 
     Raises:
-        PcdError: not PCD, truncated or contradicting itself; the message begins with the line or byte.
+        PcdError: the file is not PCD, is truncated or contradicts itself; the message begins with the line or byte.
     """
     header = _parse_header(data)
     match header.encoding:
@@ -143,8 +144,8 @@ def _point_type(
 
 
 def _ascii_table(data: bytes, header: _Header) -> NDArray[np.void]:
-    """Rows of numbers, block by block. NumPy reads one in one go; only when it fails are its lines looked at one by
-    one."""
+    """The table from rows of numbers, block by block. NumPy reads a block at once; only if that fails are its lines
+    checked one by one."""
     table = np.zeros(header.points, header.point)
     begin = 0
     for lines in _blocks(data, header):
@@ -157,7 +158,7 @@ def _ascii_table(data: bytes, header: _Header) -> NDArray[np.void]:
 
 
 def _blocks(data: bytes, header: _Header) -> Iterator[list[str]]:
-    """The lines of the points, those of one block after the other; empty ones at the end of the file are none."""
+    """The lines of the points, block by block; empty lines at the end of the file are left out."""
     stream = BytesIO(data)
     stream.seek(header.body)
     lines: list[str] = []
@@ -212,9 +213,9 @@ def _check_row(words: list[str], width: int, number: int) -> None:
 
 
 def _bounded(values: NDArray[np.float64], dtype: np.dtype[np.generic], first_line: int) -> NDArray[np.float64]:
-    """Integer columns written as text may be out of their type's range; a cast would be undefined."""
+    """The values, checked to be in the range of their integer type, because a cast of others would be undefined."""
     limits = np.iinfo(dtype.type)  # type: ignore[type-var]
-    # The largest integer of 64 bits is no double, and rounds to one that is out of range.
+    # The largest 64-bit integer is not a double, and rounds to one that is out of range.
     fits = (values >= limits.min) & (values <= limits.max) & (values < float(limits.max) + 1.0)
     bad = ~fits
     if bad.any():
@@ -223,7 +224,7 @@ def _bounded(values: NDArray[np.float64], dtype: np.dtype[np.generic], first_lin
 
 
 def _decompressed_table(data: bytes, header: _Header) -> NDArray[np.void]:
-    """LZF over the concatenated columns (PCL stores them one after another, not by row)."""
+    """The table from LZF-compressed columns, which PCL stores one after another, not by row."""
     start = header.body + 8
     if len(data) < start:
         raise PcdError(f"byte {len(data)}: the file ends before the size of its compressed points")

@@ -1,5 +1,5 @@
-"""Files of which nothing is known yet: none is read that is larger than what it may be, and NumPy's are checked before
-anything is allocated for them."""
+"""Reads untrusted files. No file is read that is larger than its limit, and NumPy files are checked before memory is
+allocated for them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from coec.errors import SourceError
 
 MAX_FILE_BYTES = 256 * 2**20
-"""Of one image, cloud or table. An 8K image has 100 MB as raw pixels, a million points with eight columns 32 MB."""
+"""Largest image, cloud or table, bytes. An 8K image has 100 MB as raw pixels, a million points with eight columns have
+32 MB."""
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     """A whole file.
 
     Raises:
-        SourceError: absent, not readable or too large.
+        SourceError: the file is absent, not readable or too large.
     """
     try:
         with path.open("rb") as stream:
@@ -38,16 +39,17 @@ def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_npy(path: Path) -> NDArray[np.generic]:
-    """The array of a `.npy` file, a map of it: what its header promises is held against the length of the file.
+    """The array of a `.npy` file, memory-mapped, so that the size in its header is checked against the length of the
+    file.
 
     Raises:
-        SourceError: absent, not such a file, truncated or too large.
+        SourceError: the file is absent, not a `.npy` file, truncated or too large.
     """
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except FileNotFoundError as error:
         raise SourceError(f"{path} does not exist") from error
-    except Exception as error:  # the header is Python source to NumPy, which raises whatever a parser of that may
+    except Exception as error:  # NumPy parses the header as Python source, and raises whatever such a parser may
         raise SourceError(f"{path} is not a NumPy array, or is truncated: {_told(error)}") from error
     if array.nbytes > MAX_FILE_BYTES:
         raise SourceError(f"{path} has more than {MAX_FILE_BYTES} bytes: too large for a single file of a recording")
@@ -55,10 +57,10 @@ def read_npy(path: Path) -> NDArray[np.generic]:
 
 
 def read_npz(path: Path, names: Collection[str]) -> dict[str, NDArray[np.generic]]:
-    """Those of these arrays that a `.npz` file has.
+    """The arrays of these names that a `.npz` file has.
 
     Raises:
-        SourceError: absent, not such a file, damaged, or larger when it is unpacked than a file may be.
+        SourceError: the file is absent, not a `.npz` file or damaged, or the arrays are too large unpacked.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -70,7 +72,7 @@ def read_npz(path: Path, names: Collection[str]) -> dict[str, NDArray[np.generic
             return {name: _member(archive, item) for name, item in wanted.items()}
     except (FileNotFoundError, SourceError) as error:
         raise SourceError(f"{path} does not exist" if isinstance(error, OSError) else str(error)) from error
-    except Exception as error:  # zip, zlib and NumPy's header: each raises more than it says
+    except Exception as error:  # zip, zlib and NumPy's header parser each raise more than they document
         raise SourceError(f"{path} is not an .npz file, or is damaged: {_told(error)}") from error
 
 
@@ -94,5 +96,5 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[np.gener
 
 
 def _told(error: Exception) -> str:
-    """What an error says, in a line that fits on a screen: some quote the file that they complain about."""
+    """The text of an error in one short line, because some errors quote the whole file."""
     return f"{type(error).__name__}: {str(error).splitlines()[0][:120]}" if str(error) else type(error).__name__

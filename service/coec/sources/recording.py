@@ -1,4 +1,4 @@
-"""What a recording offers, whatever its layout on disk: its rig, and its frames in the order of sensor time."""
+"""The interface of a recording, whatever its layout on disk: its rig, and its frames in the order of sensor time."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from coec.errors import UsageError
 Message = CameraFrame | LidarFrame | EgoMotion
 
 MOTION_REACH_NS = 1_000_000_000
-"""Ego-motion this near to a chosen camera frame is handed out with it: five times the default motion tolerance."""
+"""Ego-motion within this time of a chosen camera frame is handed out with it, ns: five times the default motion
+tolerance."""
 
 _EGO, _LIDAR, _CAMERA = 0, 1, 2
-"""Order of messages with equal stamps: by the time a camera frame is seen, its partners are there."""
+"""Order of messages with equal stamps, so that the partners of a camera frame come before it."""
 
 
 class Recording(Protocol):
@@ -24,7 +25,7 @@ class Recording(Protocol):
 
     @property
     def name(self) -> str:
-        """For people: layout, drive, camera."""
+        """Layout, drive and camera, for people to read."""
         ...
 
     @property
@@ -34,7 +35,7 @@ class Recording(Protocol):
 
     @property
     def T_camera_lidar_start(self) -> Matrix4:
-        """(4, 4) extrinsic that was current when the recording was made; the nominal one unless recorded."""
+        """(4, 4) extrinsic that was current when the recording was made; the nominal one if that was not recorded."""
         ...
 
     @property
@@ -54,26 +55,26 @@ class Recording(Protocol):
 
     @property
     def motion_stamps_ns(self) -> tuple[int, ...]:
-        """Stamps of the ego-motion, ascending, nanoseconds; empty where there is none."""
+        """Stamps of the ego-motion, ascending, nanoseconds; empty if there is none."""
         ...
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
         """Messages in ascending order of their stamps, each loaded when it is its turn.
 
         Args:
-            cameras: indices into `camera_stamps_ns`: only these camera frames, and the sweeps and the ego-motion
-                needed to pair them. None = everything.
+            cameras: indices into `camera_stamps_ns`: only these camera frames, and the sweeps and ego-motion that are
+                needed to pair them. None: everything.
 
         Raises:
-            UsageError: an index out of range.
-            SourceError: a file that cannot be read, names the file.
+            UsageError: an index is out of range.
+            SourceError: a file cannot be read; names it.
         """
         ...
 
 
 @runtime_checkable
 class KnowsTruth(Protocol):
-    """A recording of which the extrinsic is known beyond doubt: it was simulated."""
+    """A recording whose true extrinsic is known, because it was simulated."""
 
     def truth(self, stamp_ns: int) -> Matrix4:
         """True T_camera_lidar (4, 4) at a time."""
@@ -95,8 +96,8 @@ class FramewiseRecording:
     """A `Recording` of layouts that number camera frames and sweeps together (KITTI, manifests, windows).
 
     Attributes:
-        frames: ascending by `camera_stamp_ns`.
-        motions: ascending by `stamp_ns`.
+        frames: the frames, ascending by `camera_stamp_ns`.
+        motions: the ego-motion, ascending by `stamp_ns`.
     """
 
     name: str
@@ -137,10 +138,10 @@ class FramewiseRecording:
 
 
 def chosen_indices(cameras: Collection[int] | None, count: int) -> list[int]:
-    """The indices asked for, ascending and once each; all of them for None.
+    """The indices asked for, ascending and once each; None asks for all.
 
     Raises:
-        UsageError: an index outside 0 ... count - 1.
+        UsageError: an index is outside 0 ... count - 1.
     """
     if cameras is None:
         return list(range(count))

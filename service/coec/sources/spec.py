@@ -34,7 +34,7 @@ class SourceSpec:
     query: dict[str, str] = field(default_factory=dict)
 
     def only(self, *keys: str) -> dict[str, str]:
-        """The query, once it is certain that it holds no other keys.
+        """The query, checked to hold no other keys than these.
 
         Raises:
             UsageError: names the unknown keys and the known ones.
@@ -56,7 +56,7 @@ def parse_spec(text: str) -> SourceSpec:
     layout = prefix if colon and prefix in LAYOUTS else None
     if layout is None and colon and "/" not in prefix and "." not in prefix:
         raise UsageError(f"unknown source layout {prefix!r} in {text}\n{FORMS}")
-    # A simulated drive has no path: the question mark may be left out.
+    # A simulated drive has no path, so the question mark may be left out.
     place = f"?{rest.removeprefix('?')}" if layout == "sim" else rest if layout else text
     location, _, query = place.partition("?")
     if not location and layout != "sim":
@@ -65,13 +65,13 @@ def parse_spec(text: str) -> SourceSpec:
 
 
 def is_bag(spec: SourceSpec) -> bool:
-    """Whether it is a bag of ROS 2, a recorded window among them: by the name of the file, or what the folder holds."""
+    """Whether the source is a ROS 2 bag or a recorded window, by the name of the file or the content of the folder."""
     by_name = spec.path.suffix in (".mcap", ".db3") or (spec.path / "metadata.yaml").is_file()
     return spec.layout is None and by_name
 
 
 def is_rig(spec: SourceSpec) -> bool:
-    """Whether it is a whole simulated rig, and not one pair of it."""
+    """Whether the source is a whole simulated rig, not one pair of it."""
     return spec.layout == "sim" and "rig" in spec.query and "pair" not in spec.query
 
 

@@ -1,4 +1,4 @@
-"""From a SOURCE to a window, the way the daemon would have cut it."""
+"""Makes a window of a SOURCE, as the daemon would have cut it."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from coec.sources import Recording, open_source
 from coec.sources.spec import parse_spec
 
 WHOLE = (0.0, math.inf)
-"""Seconds after the first camera frame that hold all of a recording."""
+"""Begin and end of the whole recording, in seconds after the first camera frame."""
 
 HALF_TURN_DEG = 180.0
 FARTHEST_M = 50.0
-"""No sensor sits farther from another on a vehicle, of road or rail: a larger number was given in other units."""
+"""Largest distance of two sensors on a road or rail vehicle. A larger number was given in other units."""
 
 RECORDED_GAP_S = 1e9
-"""Frames that were chosen from a recording may be any time apart; its order is already certain."""
+"""Largest gap between frames that are chosen from a recording, s: practically any, because their order is certain."""
 
 
 class NoPairsError(SourceError):
-    """Camera frames were taken, or none, but no pair can be made of them."""
+    """No pair can be made of the chosen camera frames, or there are none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,9 +39,9 @@ class Loaded:
     """A window and what came with it.
 
     Attributes:
-        configuration: that of a recorded window, else None.
-        vehicle: that of a recorded window that holds its result, else the default name.
-        unpaired: frames that found no partner, by cause.
+        configuration: configuration of a recorded window; None for other recordings.
+        vehicle: vehicle of a recorded window that holds its result; else the default name.
+        unpaired: number of frames that found no partner, by cause.
     """
 
     window: Window
@@ -57,12 +57,12 @@ def load(
     heard: Callable[[int, int], None],
     between_s: tuple[float, float] = WHOLE,
 ) -> Loaded:
-    """The window of a recorded window's file as it is, of any other recording by choosing `frames` (at most
-    `default_frames` if None) camera frames evenly and pairing them. `heard(done, total)` counts camera frames. Only
-    camera frames that were taken `between_s` seconds after the first one are looked at.
+    """The window of a SOURCE. A recorded window's file gives its own window. From any other recording, at most `frames`
+    (`default_frames` if None) camera frames are chosen evenly and paired. `heard(done, total)` counts camera frames.
+    Only camera frames from `between_s` (begin, end) seconds after the first one are used.
 
     Raises:
-        UsageError, SourceError, WindowError: see `open_source`; no camera frame found a sweep.
+        UsageError, SourceError, WindowError: see `open_source`. SourceError also if no camera frame has a sweep.
     """
     spec = parse_spec(source)
     if (
@@ -79,10 +79,11 @@ def load(
 def chosen_from(
     recording: Recording, frames: int, heard: Callable[[int, int], None], between_s: tuple[float, float] = WHOLE
 ) -> Loaded:
-    """Likewise of a recording that is open: at most so many of its camera frames, evenly chosen, and paired.
+    """The window of an open recording: at most `frames` of its camera frames, evenly chosen and paired. `heard` and
+    `between_s` as in `load`.
 
     Raises:
-        SourceError: a file cannot be read; no camera frame found a sweep.
+        SourceError: a file cannot be read, or no camera frame has a sweep.
     """
     within = _within(recording.camera_stamps_ns, between_s)
     chosen = [within[index] for index in evenly(len(within), frames)]
@@ -106,17 +107,18 @@ def chosen_from(
 
 
 def evenly(count: int, wanted: int) -> list[int]:
-    """At most `wanted` of `count` indices, evenly spread, the first and the last among them (the first if one)."""
+    """At most `wanted` of `count` indices, evenly spread. They include the first and the last; a single one is the
+    first."""
     if wanted >= count:
         return list(range(count))
     return sorted({round(index) for index in np.linspace(0, count - 1, wanted)})
 
 
 def vector_of(option: str, text: str) -> NDArray[np.float64]:
-    """ξ (6,) in radians and metres from `rx,ry,rz[,tx,ty,tz]` in degrees and metres, the value of an option.
+    """ξ (6,) in radians and metres from the value of an option, `rx,ry,rz[,tx,ty,tz]` in degrees and metres.
 
     Raises:
-        UsageError: it is not three or six finite numbers, or they are beyond any mount; names the option.
+        UsageError: these are not three or six finite numbers, or larger than any mount has; names the option.
     """
     try:
         values = [float(part) for part in text.split(",")]
@@ -129,7 +131,7 @@ def xi_of(what: str, values: Sequence[float]) -> NDArray[np.float64]:
     """ξ (6,) in radians and metres from `rx, ry, rz[, tx, ty, tz]` in degrees and metres.
 
     Raises:
-        UsageError: it is not three or six finite numbers, or they are beyond any mount; begins with `what`.
+        UsageError: these are not three or six finite numbers, or larger than any mount has; begins with `what`.
     """
     if len(values) not in (3, 6) or not np.isfinite(values).all():
         raise UsageError(f"{what}: give three numbers (degrees), or six (degrees, then metres)")
@@ -144,7 +146,7 @@ def xi_of(what: str, values: Sequence[float]) -> NDArray[np.float64]:
 
 
 def started_at(window: Window, xi: NDArray[np.float64]) -> Window:
-    """The window with its start moved by ξ (6,), on the left: a guess, then."""
+    """The window with its start moved by ξ (6,), applied on the left. The start then counts as a mere guess."""
     start = se3.perturb(window.T_camera_lidar_start, xi)
     return replace(window, T_camera_lidar_start=start, start_known_to_rad=math.pi)
 
@@ -155,7 +157,7 @@ def rotation_error_deg(T_a: Matrix4, T_b: Matrix4) -> float:
 
 
 def _within(stamps_ns: Sequence[int], between_s: tuple[float, float]) -> list[int]:
-    """Indices of the stamps, ascending nanoseconds, so many seconds after the first of them."""
+    """Indices of the stamps (ascending, nanoseconds) that lie `between_s` (begin, end) seconds after the first one."""
     first_s, last_s = between_s
     return [index for index, stamp in enumerate(stamps_ns) if first_s <= (stamp - stamps_ns[0]) * 1e-9 <= last_s]
 

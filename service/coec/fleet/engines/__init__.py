@@ -1,1 +1,1 @@
-"""What judges windows beside each other: a pool of processes here, or an engine that is there."""
+"""Engines that judge windows in parallel: a pool of processes on this machine, or an existing cluster."""

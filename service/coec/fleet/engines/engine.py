@@ -1,4 +1,4 @@
-"""What an engine is."""
+"""The interface of an engine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coec.fleet.terms import Terms
 from coec.schemas.fleet import WindowRow
 
 PROCESS_DIED, DEADLINE, TOO_LARGE = "process_died", "deadline", "memory_exceeded"
-"""Codes of windows with which their process ended."""
+"""Error codes of windows whose process ended or was ended."""
 
 
 class FleetError(CoecError):
@@ -23,11 +23,11 @@ class FleetError(CoecError):
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Of the work on one window.
+    """Limits for the work on one window.
 
     Attributes:
-        seconds: on the wall, without a word of the process that has it.
-        bytes: that its process may hold.
+        seconds: longest wall time without a word of the process that has the window.
+        bytes: largest memory of that process.
     """
 
     seconds: float
@@ -35,7 +35,7 @@ class Bounds:
 
     @property
     def late(self) -> str:
-        """What is said of a window that took longer."""
+        """The error text for a window that took longer."""
         return f"it was not judged within {self.seconds:g} s (--deadline)"
 
 
@@ -44,10 +44,10 @@ class Engine(Protocol):
 
     @property
     def cores(self) -> int:
-        """Windows that are solved at a time."""
+        """How many windows are solved at a time."""
 
     def rows(self, jobs: Sequence[Job], terms: Terms) -> Iterator[WindowRow]:
-        """A row for every window, as they are finished. What one of them does to its process is a row as well.
+        """A row for every window, as they are finished. A window that ends its process gets a row, too.
 
         Raises:
             FleetError: the engine itself fails.

@@ -1,4 +1,4 @@
-"""Processes of this machine, each on a core of its own."""
+"""The engine of this machine: a pool of processes, each on a core of its own."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from coec.fleet.terms import Terms
 from coec.schemas.fleet import WindowRow
 
 LOOK_S = 0.5
-"""Between two looks at how long and how large the processes are."""
+"""Time between two checks of the processes' time and memory, s."""
 
 END_S = 5.0
-"""Until a process that was told to end is gone."""
+"""Longest wait for a process that was told to end, s."""
 
 READY = ""
-"""The first word of a process."""
+"""The first message of a process."""
 
 
 class _Seat:
@@ -39,21 +39,21 @@ class _Seat:
         with one_thread_each():
             self.process = context.Process(target=_work, args=(theirs, terms), daemon=True)
             self.process.start()
-        theirs.close()  # so that the end of the process is the end of the pipe
+        theirs.close()  # so that the pipe ends when the process does
         self.has: dict[str, Job] = {}
         self._ready = self._ended = False
         self._told_s = time.monotonic()
 
     def give(self, job: Job) -> None:
-        """A window more."""
+        """Gives the process another window."""
         if not self.has:
             self._told_s = time.monotonic()
         self.has[job.url] = job
-        with suppress(OSError):  # it has ended, which `trouble` will say
+        with suppress(OSError):  # the process has ended, which `trouble` will report
             self.link.send(job)
 
     def hear(self) -> WindowRow | None:
-        """What has come through the pipe."""
+        """The row that has come through the pipe; None if it was something else."""
         try:
             told = self.link.recv()
         except (EOFError, OSError):
@@ -68,10 +68,10 @@ class _Seat:
         return row
 
     def trouble(self, bounds: Bounds) -> tuple[str, str] | None:
-        """Code and words of why the process has to be replaced.
+        """Code and text of why the process has to be replaced; None if it has not.
 
         Raises:
-            FleetError: it has not even begun.
+            FleetError: the process ended during its start.
         """
         if self._ended:
             self.process.join(END_S)
@@ -87,15 +87,15 @@ class _Seat:
         return None
 
     def end(self) -> None:
-        """Whatever it does."""
+        """Kills the process, whatever it is doing."""
         self.link.close()
         self.process.kill()
         self.process.join(END_S)
 
 
 class LocalEngine:
-    """A process a core. A window that ends its process, takes too long or too much memory is a row with that error, and
-    the others go on."""
+    """Runs a process on each core. A window that ends its process, or takes too long or too much memory, gets a row
+    with that error; the others go on."""
 
     def __init__(self, cores: int, bounds: Bounds) -> None:
         self.cores = cores
@@ -121,7 +121,7 @@ class LocalEngine:
                         seat.end()
                         seats[index] = _Seat(told)
                         yield from queue.give_back(seat.has.values(), *trouble)
-        finally:  # also where the caller has gone before the end
+        finally:  # also if the caller stops before the end
             for seat in seats:
                 seat.end()
 
@@ -130,14 +130,14 @@ class LocalEngine:
 
 
 def _work(link: Connection, terms: str) -> None:
-    """Take windows until nobody gives any; each thread has one, and one of them solves at a time."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's: who gives the windows decides when they end
+    """Takes windows until none come any more. Each thread has one window, and one thread at a time solves."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which decides when this process ends
     desk = Desk(Terms.model_validate_json(terms))
     link.send(READY)
     taking, telling = threading.Lock(), threading.Lock()
 
     def take() -> None:
-        with suppress(EOFError, OSError):  # nobody is there any more
+        with suppress(EOFError, OSError):  # the parent has gone
             while True:
                 with taking:
                     job = link.recv()

@@ -1,4 +1,4 @@
-"""Windows that wait for a process, and which of them ended one."""
+"""The queue of windows that wait for a process. It remembers which windows ended a process."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from coec.fleet.trouble import lost
 from coec.schemas.fleet import WindowRow
 
 AHEAD = 2
-"""Windows that a process has at a time: one that it solves, and one that it fetches meanwhile."""
+"""How many windows a process has at a time: one that it solves, and one that it fetches meanwhile."""
 
 
 class Queue:
-    """A window whose process ends is tried once more, in a process to itself: the first end may have been another
-    window's fault, or for want of memory that others had taken. The second is its own."""
+    """The waiting windows. A window whose process ended is tried once more, alone in a process. The first end may have
+    been caused by another window, or by memory that others had taken; the second one is caused by this window."""
 
     def __init__(self, jobs: Iterable[Job]) -> None:
         self._waiting = deque(jobs)
@@ -26,7 +26,7 @@ class Queue:
         return bool(self._waiting)
 
     def next_for(self, has: Collection[Job]) -> Job | None:
-        """The next window for a process that has these; None: it shall have no more now."""
+        """The next window for a process that has these; None: it gets no more now."""
         if not self._waiting or len(has) >= AHEAD:
             return None
         if has and (self._waiting[0] in self._suspected or not self._suspected.isdisjoint(has)):
@@ -34,7 +34,8 @@ class Queue:
         return self._waiting.popleft()
 
     def give_back(self, has: Collection[Job], code: str, text: str) -> Iterator[WindowRow]:
-        """A process that had these has ended, for a reason; the rows of those that are not tried again."""
+        """A process with these windows has ended, for a reason. Queues the windows again, and returns the rows of those
+        that are not tried again."""
         for job in reversed(list(has)):
             if job in self._suspected:
                 yield lost(job, code, text)

@@ -1,7 +1,7 @@
-"""Processes of a Ray cluster: the one that is there (`RAY_ADDRESS`, or started on this machine), else a fresh one.
+"""The engine of a Ray cluster: an existing one (`RAY_ADDRESS`, or started on this machine), else a fresh one.
 
-Each is an actor on one core, with the memory that a window may take declared, so that the cluster places no more of
-them than it can hold.
+Each process is an actor on one core. It declares the memory that a window may take, so that the cluster places no more
+actors than it can hold.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from coec.fleet.terms import Terms
 from coec.schemas.fleet import WindowRow
 
 LOOK_S = 1.0
-"""Between two looks at how long windows take."""
+"""Time between two checks of how long windows take, s."""
 
 
 class _Judge:
     """Runs on a node of the cluster, which has coec installed."""
 
     def __init__(self, terms: str) -> None:
-        from coec.fleet.desk import Desk  # what it takes to calibrate belongs to the nodes
+        from coec.fleet.desk import Desk  # only the nodes need what calibrates
 
         self._desk = Desk(Terms.model_validate_json(terms))
 
     def row(self, job: Job) -> str:
-        """The row of a window, as JSON; on several threads."""
+        """The row of a window, as JSON. For several threads."""
         return self._desk.row(job).model_dump_json()
 
 
 class _Seat:
-    """An actor, and the windows that it has, by the reference of their row."""
+    """An actor and the windows that it has, by the reference of their future row."""
 
     def __init__(self, actor: Any) -> None:
         self.actor = actor
@@ -46,23 +46,23 @@ class _Seat:
         self.told_s = time.monotonic()
 
     def give(self, job: Job) -> None:
-        """A window more."""
+        """Gives the actor another window."""
         if not self.has:
             self.told_s = time.monotonic()
         self.has[self.actor.row.remote(job)] = job
 
 
 class RayEngine:
-    """See the module."""
+    """Judges windows on a Ray cluster."""
 
     def __init__(self, cores: int | None, bounds: Bounds) -> None:
-        """`cores`: that are used at most; None: all of the cluster.
+        """`cores`: how many cores are used at most; None: all of the cluster.
 
         Raises:
             SourceError: Ray is not installed.
             FleetError: there is no cluster, and none can be started.
         """
-        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # its reports go to its vendor
+        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # otherwise Ray reports to its vendor
         try:
             import ray
         except ImportError as error:
@@ -78,7 +78,7 @@ class RayEngine:
                 runtime_env={"env_vars": dict(ONE_THREAD)},
             )
             there = int(ray.cluster_resources().get("CPU", 0.0))
-        except Exception as error:  # Ray's own, the system's, or of a library in between
+        except Exception as error:  # of Ray, of the system, or of a library in between
             raise FleetError(f"no Ray cluster: {type(error).__name__}: {error}") from error
         self.cores = max(min(cores or there, there), 1)
 
@@ -98,12 +98,12 @@ class RayEngine:
                         self._ray.kill(seat.actor)
                         seats[index] = _Seat(self._actor(told))
                         yield from queue.give_back(seat.has.values(), *trouble)
-        finally:  # also where the caller has gone before the end
+        finally:  # also if the caller stops before the end
             for seat in seats:
                 self._ray.kill(seat.actor)
 
     def _heard(self, seat: _Seat, done: Sequence[Any]) -> Generator[WindowRow, None, tuple[str, str] | None]:
-        """The rows of a process that are done; returns code and words of why it has to be replaced, or None."""
+        """Yields the finished rows of a process. Returns code and text of why it has to be replaced, or None."""
         for row in [row for row in done if row in seat.has]:
             try:
                 document = self._ray.get(row)

@@ -1,1 +1,1 @@
-"""ROS 2 bags: files and folders of messages (`storage` and what is in it), and the recording of one pair in them."""
+"""ROS 2 bags: files and folders of messages (`storage`), and the recording of one pair in them."""

@@ -1,4 +1,4 @@
-"""How the messages of a bag are read where they leave it open, as a query says it."""
+"""How the messages of a bag are read: what they leave open, a query can say."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Clouds:
     """How the clouds of a bag are read.
 
     Attributes:
-        point_time: how points are timed, where that was said.
-        source: number of the LiDAR, of clouds of several.
+        point_time: how points are timed; None: the messages tell.
+        source: number of the LiDAR to choose from clouds of several LiDARs; None: all points.
     """
 
     point_time: PointTimeConfig | None = None
@@ -26,10 +26,10 @@ class Clouds:
 
     @classmethod
     def asked(cls, time: str | None, source: str | None) -> Clouds:
-        """As a query asks for it: `FIELD,UNIT[,BASE]`, and a number.
+        """From the values of a query: `time` is `FIELD,UNIT[,BASE]`, `source` a whole number.
 
         Raises:
-            UsageError: it does not.
+            UsageError: a value does not fit this form.
         """
         names = ("field", "unit", "base")
         try:
@@ -46,6 +46,6 @@ class Clouds:
         """The frame in a message of this type.
 
         Raises:
-            DecodeError: there is none.
+            DecodeError: the message holds no frame.
         """
         return incoming.decode(type_name, data, LimitsConfig(), point_time=self.point_time, source=self.source)

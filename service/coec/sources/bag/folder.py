@@ -1,7 +1,7 @@
-"""Folders of rosbag2: `metadata.yaml`, and the files that it names, one after the other as one bag.
+"""Folders of rosbag2: `metadata.yaml`, and the files that it names, read one after the other as one bag.
 
-Files that are packed as a whole (`compression_mode: FILE`) are unpacked beside the system's other temporary files, and
-removed with the recording.
+Files that are packed as a whole (`compression_mode: FILE`) are unpacked into the system's temporary folder, and removed
+when the recording is no longer used.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from coec.sources.bag.storage import Entry, Reader, Storage
 METADATA = "metadata.yaml"
 
 MAX_FILES = 10_000
-"""Of one bag; a day in files of ten seconds."""
+"""Most files of one bag: a day in files of ten seconds."""
 
 MAX_MESSAGE_BYTES = 256 * 2**20
-"""Unpacked size of one packed message, as of MCAP's chunks."""
+"""Largest unpacked size of one packed message, bytes; the same as for MCAP's chunks."""
 
 KEPT_FREE_BYTES = 2**30
-"""Of the disk for temporary files: a packed file that would take more of it is refused."""
+"""Bytes that stay free on the disk of temporary files. A packed file that would leave less is refused."""
 
 _COPY_BYTES = 2**20
 
 
 class BagInformation(BaseModel):
-    """What is used of `rosbag2_bagfile_information`, versions 1 to 9; the rest is passed over."""
+    """The used fields of `rosbag2_bagfile_information`, versions 1 to 9; others are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -52,7 +52,7 @@ class BagInformation(BaseModel):
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)
 class FolderStorage:
-    """A `Storage`. A place is: number of the file, place in it.
+    """The `Storage` of a folder. A place is: number of the file, place in that file.
 
     Attributes:
         packed_messages: whether each message is a zstd frame (`compression_mode: MESSAGE`).
@@ -96,7 +96,7 @@ class FolderStorage:
 
 @dataclass(frozen=True, slots=True)
 class _FolderReader:
-    """Keeps one file open, the one read from last: a bag may have more of them than a process may open."""
+    """Keeps only the file open that was read last, because a bag may have more files than a process may open."""
 
     folder: FolderStorage
     opened: ExitStack
@@ -113,11 +113,10 @@ class _FolderReader:
 
 
 def open_folder(path: Path) -> FolderStorage:
-    """The bag in a folder.
+    """Opens the bag in a folder.
 
     Raises:
-        SourceError: no `metadata.yaml`, one that cannot be used, a storage that is not known, or a file that is absent;
-            names it.
+        SourceError: `metadata.yaml` is absent or cannot be used, the storage is unknown, or a file is absent; names it.
     """
     information = _information(path)
     if information.storage_identifier not in ("mcap", "sqlite3"):
@@ -125,7 +124,7 @@ def open_folder(path: Path) -> FolderStorage:
     mode = information.compression_mode.upper() if information.compression_format else ""
     if mode and information.compression_format != "zstd":
         raise SourceError(f"{path / METADATA}: compression {information.compression_format!a} is not zstd")
-    # Folders above are no business of a bag's; old versions wrote the folder's own name in front.
+    # Only the file's name counts: a bag must not reach outside its folder, and old versions wrote the folder in front.
     names = [path / Path(name).name for name in information.relative_file_paths]
     if len(set(names)) < len(names):
         raise SourceError(f"{path / METADATA} names a file twice")

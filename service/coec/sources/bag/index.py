@@ -1,6 +1,7 @@
-"""What is in a bag: one pass that verifies it, and notes where each frame lies and what its header's stamp is.
+"""The index of a bag: one pass verifies the bag, and notes the place of each frame and the stamp of its header.
 
-The header stamp is the sensor's time, of a cloud without one its first point's; the recorder's is not looked at.
+The stamp of the header is the sensor's time. A cloud without a stamp gets the time of its first point. The recorder's
+time is not used.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ ROTATION_TYPES = (messages.IMU,)
 T = TypeVar("T")
 
 _HEADER = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
-"""`std_msgs/Header.stamp` (sec, nanosec), with which every type above begins, by the byte order of the message."""
+"""`std_msgs/Header.stamp` (sec, nanosec) by the byte order of the message. Every type above begins with it."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Place:
-    """Where a message lies, ordered by the stamp of its header, and where that is the same as they lie in the bag."""
+    """Where a message lies. Places are ordered by the stamp of the header; equal stamps by the order in the bag."""
 
     stamp_ns: int
     at: tuple[int, ...]
@@ -48,7 +49,7 @@ class Stream:
     places: list[Place] = field(default_factory=list)
 
     def ordered(self) -> list[Place]:
-        """By their stamps."""
+        """The places in the order of their stamps."""
         return sorted(self.places)
 
 
@@ -61,7 +62,7 @@ class Index:
         streams: frames by topic.
         infos: the first camera info of each topic.
         transforms: all static transforms.
-        transforms_at: places of the messages of all other transforms, by topic, as they lie in the bag.
+        transforms_at: places of the messages of all other transforms, by topic, in the order in the bag.
     """
 
     path: Path
@@ -72,14 +73,18 @@ class Index:
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
 
     def topic(self, types: tuple[str, ...], asked: str | None, key: str) -> str:
-        """The topic of these types that was asked for, or the only one."""
+        """The topic of these types that was asked for, else the only one.
+
+        Raises:
+            SourceError: there is no such topic, or there are several and none was asked for.
+        """
         found = self.optional_topic(types, asked, key)
         if found is None:
             raise SourceError(f"{self.path} has no message of type {' or '.join(types)}")
         return found
 
     def optional_topic(self, types: tuple[str, ...], asked: str | None, key: str) -> str | None:
-        """As `topic`, but None where there is none at all and none was asked for."""
+        """As `topic`, but None if the bag has none and none was asked for."""
         there = [topic for topic, stream in self.streams.items() if stream.type_name in types]
         if asked is not None:
             if asked not in there:
@@ -94,10 +99,10 @@ class Index:
         return there[0] if there else None
 
     def transform(self, target: str, source: str) -> Matrix4 | None:
-        """T_target_source (4, 4) along the static transforms, or None where they do not connect the two.
+        """T_target_source (4, 4) along the static transforms; None if they do not connect the two frames.
 
         Raises:
-            SourceError: they connect them in ways that contradict each other.
+            SourceError: they connect the frames in ways that contradict each other.
         """
         doubts = self.transforms.doubts(target, source)
         if doubts:
@@ -108,7 +113,7 @@ class Index:
         """Notes a message.
 
         Raises:
-            SourceError: it is not what its topic says.
+            SourceError: the message is not what its topic says.
         """
         name = entry.type_name
         if name in (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES):
@@ -127,7 +132,8 @@ class Index:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
 
     def _stamp_of_points(self, entry: Entry) -> int:
-        """Of a cloud without a stamp; 0 where its points tell none. One that is refused is told of where it is used."""
+        """Stamp of a cloud without one, from its points; 0 if they give none. If the cloud cannot be decoded, that is
+        reported when it is used."""
         try:
             return self.clouds.decoded(entry.type_name, entry.data).stamp_ns
         except DecodeError:
@@ -141,7 +147,7 @@ class Index:
 
 
 def index_of(storage: Storage, clouds: Clouds) -> Index:
-    """The index of a bag whose clouds are read like this.
+    """Makes the index of a bag whose clouds are read by `clouds`.
 
     Raises:
         SourceError: a file is absent, cut off or damaged, or a message is not what its topic says.

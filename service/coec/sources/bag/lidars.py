@@ -18,11 +18,11 @@ AS_THEY_ARE = Clouds()
 
 
 def lidars_of_bag(spec: SourceSpec, a: str, b: str) -> LidarRecording:
-    """`BAG[?odometry=/TOPIC]`, topics of clouds `a` and `b`; their poses along `/tf_static`.
+    """Opens `BAG[?odometry=/TOPIC]`. `a` and `b` are topics of clouds; the poses come from `/tf_static`.
 
     Raises:
         UsageError: an unknown query key.
-        SourceError: no bag, no such topic, a damaged message, or no transform between the two.
+        SourceError: no bag, no such topic, a damaged message, or no transform between the two LiDARs.
     """
     query = spec.only("odometry")
     storage = open_storage(spec.path)
@@ -37,7 +37,7 @@ def lidars_of_bag(spec: SourceSpec, a: str, b: str) -> LidarRecording:
         raise SourceError(f"{spec.path}: /tf_static does not connect {frame_a!r} and {frame_b!r}")
     T_a_ego = index.transform(frame_a, _load(storage, motions[0]).frame_id) if motions else None
     if T_a_ego is None:
-        T_a_ego, motions = np.eye(4), []  # motion that cannot be carried to the LiDARs is none
+        T_a_ego, motions = np.eye(4), []  # motion is of no use without its pose against the LiDARs
 
     def frames(of: list[Place]) -> Frames:
         return Frames(tuple(place.stamp_ns for place in of), lambda number: _load(storage, of[number]))

@@ -25,7 +25,8 @@ _OUTSIDE_CHUNKS = -1
 
 @dataclass(frozen=True, slots=True)
 class McapStorage:
-    """A `Storage`. A place is: file offset of the chunk (-1 outside chunks), offset in it, length."""
+    """The `Storage` of an MCAP file. A place is: file offset of the chunk (-1 outside chunks), offset in the chunk,
+    length."""
 
     path: Path
 

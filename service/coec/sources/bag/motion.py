@@ -1,4 +1,4 @@
-"""Which topic of a bag tells how the vehicle moves, and the motion in the transforms of `/tf`."""
+"""Finds the topic of a bag that gives the motion of the vehicle, and takes motion from the transforms of `/tf`."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from coec.sources.bag.index import ROTATION_TYPES, VELOCITY_TYPES, Index
 from coec.sources.bag.storage import Reader
 
 VEHICLE: Final = ("odom", "base_link")
-"""The frame in which a vehicle moves, and its own, as REP 105 names them."""
+"""The frame in which a vehicle moves and the vehicle's own frame, as REP 105 names them."""
 
 _LISTED: Final = 12
-"""Joints that an error names."""
+"""How many joints an error lists."""
 
 
 def motion_topic(index: Index, reader: Reader, frames: tuple[str, str], asked: str | None) -> str | None:
-    """The topic that was asked for; else the only one of velocities, else of transforms of the vehicle (`frames`:
-    parent, child), else the only one of turn rates; None where there is none.
+    """The topic that was asked for; else the only one of velocities, else one of transforms of the vehicle (`frames`:
+    parent, child), else the only one of turn rates; None if there is none.
 
     Raises:
-        SourceError: there is no such topic, or several of the best kind.
+        SourceError: there is no topic as asked for, or there are several of the best kind.
     """
     if asked in index.transforms_at:
         return asked
@@ -31,7 +31,7 @@ def motion_topic(index: Index, reader: Reader, frames: tuple[str, str], asked: s
         return index.optional_topic((*VELOCITY_TYPES, *ROTATION_TYPES), asked, "odometry")
     found = index.optional_topic(VELOCITY_TYPES, None, "odometry")
     if found is None:
-        # Most bags have /tf, and in most of those it is the joints of a robot that move.
+        # Most bags have /tf, and in most of them the moving transforms are joints of a robot.
         found = next((topic for topic in sorted(index.transforms_at) if _moved(index, reader, topic, frames)), None)
     return found or index.optional_topic(ROTATION_TYPES, None, "odometry")
 
@@ -40,7 +40,7 @@ def moved_on(index: Index, reader: Reader, topic: str, frames: tuple[str, str]) 
     """The motion of the vehicle in the transforms of a topic, in the order of their stamps.
 
     Raises:
-        SourceError: they do not have its frames; names those that they have.
+        SourceError: the transforms do not have the vehicle's frames; lists those that they have.
     """
     motions = _moved(index, reader, topic, frames)
     if not motions:

@@ -1,6 +1,6 @@
 """The recording of one pair in a ROS 2 bag, or a window that coec recorded.
 
-A bag is gone through once (`index`); messages are read again when it is their turn.
+A bag is read through once for its index (`index`); each message is read again when it is its turn.
 """
 
 from __future__ import annotations
@@ -46,20 +46,23 @@ def open_bag(spec: SourceSpec) -> Recording:
     """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]
     [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N]`.
 
-    Without a query, a recorded window is opened as such. In any other bag topics are found by their type where there is
-    only one of it. Intrinsics come from the `CameraInfo` of the camera's frame (or of the topic named), or from a YAML
-    file; the extrinsic from that file, else from `/tf_static`, over any number of joints. Where `/tf_static` does not
-    lead to the frame of the odometry, its twist is taken as the LiDAR's own. Points that a driver gives in another
-    frame than the LiDAR's (`base_link`) are taken back to it where `lidar_frame` names it and `/tf_static` leads there.
-    Where no topic tells a velocity, the transforms of `/tf` do, from frame to frame as `moving` names them (`odom` and
-    `base_link` unless it does), else an IMU tells the rotation. `time` says how points are timed, where their values
-    leave it open (see `config.PointTimeConfig`). Of a cloud of several LiDARs `lidar_source` chooses one (see
-    `adapters.ros.source_field`).
+    Without a query, a recorded window is opened as such. In any other bag:
+
+    - Topics are found by their type if there is only one of that type.
+    - Intrinsics come from the `CameraInfo` of the camera's frame (or of the topic `intrinsics`), or from a YAML file.
+    - The extrinsic comes from that file, else from `/tf_static`, over any number of joints.
+    - If a driver gives points in another frame than the LiDAR's (`base_link`), `lidar_frame` names the LiDAR's frame,
+      and the points are moved back to it along `/tf_static`.
+    - If no topic gives a velocity, the motion comes from the transforms of `/tf` between the frames that `moving` names
+      (default: `odom` and `base_link`), else the rotation from an IMU. If `/tf_static` does not lead to the frame of
+      the odometry, its twist is taken as the LiDAR's own.
+    - `time` says how points are timed, if their values leave it open (see `config.PointTimeConfig`).
+    - `lidar_source` chooses one LiDAR of a cloud of several (see `adapters.ros.source_field`).
 
     Raises:
-        UsageError: unknown query key, or a value that is none.
+        UsageError: unknown query key, or an invalid value.
         SourceError: no bag, cut off or damaged; no topic, or several, of a type; no intrinsics, no extrinsic.
-        WindowError: a recorded window that is damaged.
+        WindowError: a recorded window is damaged.
     """
     query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame", "moving", "time", "lidar_source")
     if not query and spec.path.suffix == ".mcap" and is_window(spec.path):
@@ -107,7 +110,7 @@ class Streams:
     """Places of a pair's messages, each ascending by stamp; `motion` may be empty.
 
     Attributes:
-        moved: the motion itself, instead of `motion`, where it was taken from transforms; ascending by stamp.
+        moved: the motion itself, instead of `motion`, if it was taken from transforms; ascending by stamp.
     """
 
     camera: list[Place]
@@ -117,7 +120,7 @@ class Streams:
 
     @property
     def motions(self) -> list[Place | EgoMotion]:
-        """One of the two."""
+        """`motion` or `moved`, whichever is not empty."""
         return [*self.motion, *self.moved]
 
 
@@ -126,7 +129,7 @@ class BagRecording:
     """A `Recording` whose streams have their own cadence.
 
     Attributes:
-        storage: of the bag.
+        storage: storage of the bag.
         streams: places of the messages.
         T_cloud_lidar: (4, 4) pose of the LiDAR in the frame in which the points are given.
         clouds: how the clouds are read.
@@ -157,7 +160,7 @@ class BagRecording:
         return tuple(motion.stamp_ns for motion in self.streams.motions)
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
-        """See `Recording.messages`. Of the sweeps, the nearest to each chosen camera frame is handed out."""
+        """See `Recording.messages`. With chosen camera frames, only the sweep nearest to each of them comes."""
         chosen = [self.streams.camera[index] for index in chosen_indices(cameras, len(self.streams.camera))]
         sweeps = self.streams.lidar
         motions = self.streams.motions
@@ -184,7 +187,7 @@ class BagRecording:
 def _streams(
     index: Index, reader: Reader, camera: str, lidar: str, motion: tuple[tuple[str, str], str | None]
 ) -> Streams:
-    """`motion`: the vehicle's frames, and the topic that was asked for."""
+    """The streams of the pair. `motion`: the vehicle's frames, and the topic that was asked for."""
     frames, asked = motion
     found = motion_topic(index, reader, frames, asked)
     places = index.streams[found].ordered() if found in index.streams else []

@@ -35,11 +35,12 @@ def rig_of_bag(
     lidar_frame_id: str,
     motion: EgoMotion | None,
 ) -> Rig:
-    """The rig of a pair: intrinsics from the `CameraInfo` beside the images or of the camera's frame (or of the topic
-    `intrinsics`), or from the YAML file `intrinsics`; the extrinsic from that file, else along `/tf_static`.
+    """The rig of a pair. Intrinsics come from the `CameraInfo` of the topic `intrinsics`, else beside the images, else
+    of the camera's frame; or from the YAML file `intrinsics`. The extrinsic comes from that file, else from
+    `/tf_static`.
 
     Raises:
-        SourceError: no intrinsics, or more than one, or of another image; no extrinsic.
+        SourceError: there are no intrinsics, several, or those of another image size; or there is no extrinsic.
     """
     camera_frame, lidar_frame = bare(image.frame_id), bare(lidar_frame_id)
     mask = None
@@ -90,7 +91,7 @@ def _lens(index: Index, info: Info, image_topic: str) -> Lens:
 
 
 def _info(index: Index, asked: str | None, camera_frame: str, image_topic: str) -> Info:
-    """The camera info that was asked for, the one beside the images, the one of the camera's frame, or the only one."""
+    """The camera info that was asked for, else the one beside the images, of the camera's frame, or the only one."""
     if asked is not None:
         return index.infos[asked]
     beside = index.infos.get(info_topic(image_topic))

@@ -1,7 +1,7 @@
 """Bags that are SQLite files, as `ros2 bag` wrote them by default up to Humble.
 
-Nobody vouches for a file: its schema is not trusted, nothing in it may be longer than a message, and what is called a
-table must be one.
+Files are not trusted: their schema is not, nothing in them may be longer than a message, and the tables must be real
+tables.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from coec.errors import SourceError
 from coec.sources.bag.storage import Entry, Reader
 
 MAX_MESSAGE_BYTES = 256 * 2**20
-"""Of one message, as in MCAP's chunks."""
+"""Largest message, bytes; the same as for MCAP's chunks."""
 
 MAX_TOPICS = 10_000
-"""Of a bag; a large vehicle has some 2,000."""
+"""Most topics of a bag; a large vehicle has some 2,000."""
 
 MAX_NAME = 1024
-"""Characters of a topic's name, or a type's."""
+"""Most characters of the name of a topic or a type."""
 
 MIN_ROW_BYTES = 4
-"""Of a message in the file beside its data: size of the cell, row, header and time take more."""
+"""Least bytes that a message takes in the file beside its data. Size of the cell, row, header and time take more."""
 
 _TABLES = {"topics", "messages"}
 
 
 @dataclass(frozen=True, slots=True)
 class SqliteStorage:
-    """A `Storage`. A place is: the row of a message."""
+    """The `Storage` of a SQLite file. A place is the row of a message."""
 
     path: Path
 
@@ -42,14 +42,14 @@ class SqliteStorage:
         with self._connected() as connection:
             topics = self._topics(connection)
             left = self.path.stat().st_size
-            # As they lie, without a join or an order of their own: nothing is sorted, whatever the schema says.
+            # In the order of the file, without join or ORDER BY, so that nothing is sorted, whatever the schema says.
             for row, topic_id, logged_ns, data in connection.execute(
                 "SELECT rowid, topic_id, timestamp, data FROM messages"
             ):
                 if not (isinstance(row, int) and isinstance(logged_ns, int)) or topic_id not in topics:
                     raise SourceError(f"{self.path} is damaged: a message has no number, no time or no topic")
                 message = self._bytes(row, data)
-                # Pages that are used twice, and columns that are made up, would give more than there is.
+                # A file whose pages are used twice, or whose columns are computed, would give more bytes than it has.
                 left -= len(message) + MIN_ROW_BYTES
                 if left < 0:
                     raise SourceError(f"{self.path} is damaged: its messages are longer than the file")
@@ -64,7 +64,7 @@ class SqliteStorage:
             yield _SqliteReader(self, connection)
 
     def _topics(self, connection: sqlite3.Connection) -> dict[int, tuple[str, str, str]]:
-        """Name, type and serialization by id."""
+        """Name, type and serialization of each topic, by id."""
         topics = {}
         rows = connection.execute("SELECT id, name, type, serialization_format FROM topics LIMIT ?", (MAX_TOPICS + 1,))
         for number, *texts in rows:
@@ -76,7 +76,7 @@ class SqliteStorage:
         return topics
 
     def read_from(self, connection: sqlite3.Connection, row: int) -> bytes:
-        """The data of a message by its row."""
+        """The data of the message in a row."""
         found = connection.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
         if found is None:
             raise SourceError(f"{self.path}: there is no message {row} any more: the file has changed")
@@ -89,7 +89,8 @@ class SqliteStorage:
 
     @contextmanager
     def _connected(self) -> Iterator[sqlite3.Connection]:
-        """A file that nobody is writing is opened as one that cannot change, which needs no second file beside it."""
+        """Connects to the file. If nobody is writing it, it is opened as immutable, so that SQLite needs no second file
+        beside it."""
         if not self.path.is_file():
             raise SourceError(f"{self.path} does not exist")
         beside = self.path.with_name(f"{self.path.name}-wal")

@@ -1,4 +1,4 @@
-"""Where the messages of a bag lie: one door for MCAP files, SQLite files, and the folders of rosbag2 that hold them."""
+"""One interface to the messages of a bag, for MCAP files, SQLite files, and the folders of rosbag2 that hold them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class Entry:
     """A message, and the place at which it can be read again.
 
     Attributes:
-        type_name: of ROS, for example `sensor_msgs/msg/Image`.
-        data: CDR.
-        logged_ns: when the recorder got it, by its own clock.
-        place: means something to the storage that gave it.
+        type_name: ROS type, for example `sensor_msgs/msg/Image`.
+        data: the message in CDR.
+        logged_ns: when the recorder got the message, by its own clock.
+        place: where the message lies; only the storage that gave it can use it.
     """
 
     topic: str
@@ -45,7 +45,7 @@ class Storage(Protocol):
     """The messages of a bag.
 
     Attributes:
-        path: what a person calls the bag.
+        path: path of the bag, as a person gives it.
     """
 
     @property
@@ -54,7 +54,7 @@ class Storage(Protocol):
         ...
 
     def entries(self) -> Iterator[Entry]:
-        """All CDR messages, in the order in which they lie.
+        """All CDR messages, in the order in which they lie in the bag.
 
         Raises:
             SourceError: a file is absent, cut off or damaged; names it.
@@ -62,7 +62,7 @@ class Storage(Protocol):
         ...
 
     def open(self) -> AbstractContextManager[Reader]:
-        """A reader; the files are closed when it is left."""
+        """A context manager that gives a reader; the files are closed at its end."""
         ...
 
 
@@ -70,7 +70,7 @@ def open_storage(path: Path) -> Storage:
     """The storage of an `.mcap` or `.db3` file, or of a folder with rosbag2's `metadata.yaml`.
 
     Raises:
-        SourceError: it is none of them; says what would be.
+        SourceError: the path is none of them; the message lists what would be.
     """
     if path.is_dir():
         from coec.sources.bag.folder import open_folder

@@ -1,4 +1,4 @@
-"""All topics of a bag, with the messages as they were recorded."""
+"""All topics of a bag, with their messages as they were recorded."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class _Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BagTopics:
-    """A bag that was gone through once.
+    """The topics of a bag that was read through once.
 
     Attributes:
-        infos: its topics of CDR messages, in the order of their names.
+        infos: the topics of CDR messages, in the order of their names.
     """
 
     name: str
@@ -33,7 +33,7 @@ class BagTopics:
     _places: tuple[_Place, ...]
 
     def messages(self, topics: Collection[str]) -> Iterator[TopicMessage]:
-        """Those of these topics, in the order in which they were recorded, each loaded when it is its turn.
+        """The messages of these topics, in the order in which they were recorded, each loaded when it is its turn.
 
         Raises:
             SourceError: the file is no longer what it was.
@@ -46,11 +46,11 @@ class BagTopics:
 
 
 def open_topics(spec: SourceSpec) -> BagTopics:
-    """The topics of a bag, or of a recorded window.
+    """Opens the topics of a bag or of a recorded window.
 
     Raises:
-        UsageError: it is none, or has a query: topics are not chosen by it.
-        SourceError: cut off or damaged; a topic with messages of two types.
+        UsageError: the source is no bag, or has a query, which cannot choose topics.
+        SourceError: the bag is cut off or damaged, or a topic has messages of two types.
     """
     if not is_bag(spec):
         raise UsageError(f"{spec.text} is no bag")
@@ -71,6 +71,6 @@ def open_topics(spec: SourceSpec) -> BagTopics:
 
 
 def _info(type_name: str, logged_ns: Sequence[int]) -> TopicInfo:
-    """Of ascending times."""
+    """What is known of a topic, from the ascending times of its messages."""
     span_s = (logged_ns[-1] - logged_ns[0]) * 1e-9
     return TopicInfo(type_name, len(logged_ns), (len(logged_ns) - 1) / span_s if span_s > 0 else 0.0)
