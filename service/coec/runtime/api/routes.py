@@ -92,7 +92,7 @@ class VehicleAnswers:
         bus.serve(f"{self._keys.rig}/**", self._find_of_rig)
         for name in self._pairs:
             # Each by its own key: a router finds a declared key at once when something is put there, however many
-            # vehicles there are. A key that is not declared it would look for among all of them (docs/fleet.md).
+            # vehicles there are. An undeclared key would make it search among all of them each time (docs/fleet.md).
             bus.serve(self._keys.last(name), self._find_last(name))
         bus.serve(f"{self._keys.root}/**", self._find_unknown, complete=False)
 

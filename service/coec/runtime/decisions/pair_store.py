@@ -223,8 +223,8 @@ class PairStore:
     def note_command(
         self, name: str, code: str, text: str, sender: str, *, accepted: bool, reason: str | None = None
     ) -> None:
-        """Writes down that a command was carried out or refused, with the `reason` that its sender gave, if any. Of
-        equal refusals in a row only the first is written down."""
+        """Writes down that a command was carried out or refused, with the `reason` that its sender gave, if any. If
+        equal refusals follow each other, only the first is written down."""
         last = next(reversed(self.history.entries()), None)
         told = f"{name}: {text}"
         if not accepted and last is not None:

@@ -36,8 +36,8 @@ LOOKS_WAITING = 2
 """How many looks may wait for their turn, or for the answer to an earlier one."""
 
 RESTS = 7
-"""How many looks are left out after one that found next to nothing in common. Two LiDARs that do not overlap so cost an
-eighth. If they overlap after all, in a narrow street, that is noticed within two minutes."""
+"""How many looks are left out after one that found next to nothing in common. Two LiDARs that do not overlap then cost
+only an eighth. If they overlap after all, in a narrow street, that is noticed within two minutes."""
 
 WEAK = Reason(
     "surroundings_tell_nothing",

@@ -1,5 +1,5 @@
 """The thread that takes the samples of a vehicle, on one page. It decodes each sample once to a frame and hands the
-frame to every camera-LiDAR pair that uses it. Of each of these it gives the next pair of frames to the chooser.
+frame to every camera-LiDAR pair that uses it. For each of these it gives the next pair of frames to the chooser.
 
 There is one thread for all, for three reasons. Its work holds the interpreter nearly all the time, so that more threads
 would only share the same second. Frames are handed on without a lock. And every pair sees the samples in the order in

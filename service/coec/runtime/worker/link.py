@@ -100,8 +100,8 @@ class Link:
 
 
 def _parts(message: dict[str, Any]) -> Iterator[bytes]:
-    """The message in msgpack, piece by piece. A large byte string is a piece by itself and is not copied. Of a lazy
-    sequence only one packed entry is in memory at a time."""
+    """The message in msgpack, piece by piece. A large byte string is a piece by itself and is not copied. Only one
+    packed entry of a lazy sequence is in memory at a time."""
     packer = msgpack.Packer(autoreset=False)
 
     def taken() -> bytes:
