@@ -1,1 +1,1 @@
-"""Experiments on the estimator: starts, statistics, split halves, detection, profiles, those of the paper."""
+"""Experiments on the estimator: starts, statistics, split halves, detection, profiles, and the paper's own."""

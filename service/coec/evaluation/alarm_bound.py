@@ -1,11 +1,10 @@
-"""How often the monitor would accuse a right mount, from fewer hours than it takes to see one accused.
+"""How often the monitor would accuse a right mount, estimated from fewer hours of driving than one false alarm takes.
 
-A single check accuses nobody: what does is a place where all checks are off alike, far enough and for long enough. So
-the question is split in two. How far off are places? As checks of rendered drives say: the largest displacement of each
-drive, in standard deviations of `place`, and a tail beyond those that were seen (peaks over threshold: Pickands 1975;
-Smith 1987), over all tails that they leave likely. And what does the detector do at a place that is so far off? It is
-asked: drawn places of one displacement, with the scatter of checks about their place as it was rendered, one drive's at
-a time.
+No single check accuses a mount. What accuses it is a place where all checks are off alike, far enough and for long
+enough. So there are two questions. First, how far off are places? Rendered drives give the displacement of each drive
+on its farthest axis, in standard deviations of `place`; beyond what was seen a tail is fitted (peaks over threshold:
+Pickands 1975; Smith 1987), and all tails count by their likelihood. Second, what does the detector do at a place that
+far off? It is run on drawn places of one displacement, where checks scatter as they did on one of the rendered drives.
 """
 
 from __future__ import annotations
@@ -21,26 +20,27 @@ from coec.calibration.monitor.change_detector import doubtful_after
 from coec.schemas.checks import Judged
 
 SETTLED_CHECKS = 24
-"""Of a right mount before a place: two minutes at one every five seconds."""
+"""Checks of a right mount before a place: two minutes at one every five seconds."""
 
 DISPLACEMENTS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0)
-"""Of drawn places, in standard deviations of `place`: from what every other place has to what every check sees."""
+"""Displacements of drawn places, in standard deviations of `place`: from one that every second place has to one that
+every check sees."""
 
 DRAWS = 12
 """Places of each displacement."""
 
 MIN_PLACES = 20
-"""With fewer no tail is fitted: half of them are beyond the threshold."""
+"""With fewer places no tail is fitted, because only half of them lie beyond the threshold."""
 
 SHAPES = np.linspace(-0.5, 0.5, 41)
-"""Of tails that are thought of, all alike likely: from one that ends soon after what was seen to one without a
-variance."""
+"""Shapes of the tails considered, all equally likely beforehand: from a tail that ends soon after what was seen to one
+without a variance."""
 
 SCALES = np.geomspace(0.05, 20.0, 121)
-"""Likewise, over the mean excess; every factor alike likely."""
+"""Scales of the tails considered, over the mean excess; every factor is equally likely beforehand."""
 
 CONFIDENCE = 0.95
-"""Of the bound."""
+"""Confidence of the bound."""
 
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
@@ -51,12 +51,12 @@ Alarms = Callable[[Sequence[Judged]], bool]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """What clear checks of a right mount say of the places they were made at.
+    """What clear checks of a right mount say about the places where they were made.
 
     Attributes:
-        checks: of every place, those that can tell.
+        checks: of every place, the checks that can tell.
         displacement: (n,) of every place: the median of its checks on the axis that is farthest off, in standard
-            deviations of `place` in such a scene. What one of them says alone, the place does not.
+            deviations of `place` in such a scene. By the median, one outlying check displaces no place.
     """
 
     checks: tuple[tuple[Judged, ...], ...]
@@ -64,7 +64,7 @@ class Places:
 
     @classmethod
     def of(cls, drives: Sequence[Sequence[Judged]]) -> Places:
-        """A place a drive; drives without a clear check are none."""
+        """Every drive is one place; drives without a clear check are left out."""
         kept = tuple(checks for checks in map(_clear, drives) if checks)
         far = [float(np.max(np.abs(_centre(checks)) / _place(checks))) for checks in kept]
         return cls(kept, np.array(far))
@@ -72,9 +72,8 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Of false alarms in 100 hours, as a tail of displacements says: its mean over all likely tails, and what it is
-    below at `CONFIDENCE`. `half` is the displacement at which half of the places accuse; None if those farthest off
-    do not."""
+    """False alarms in 100 hours: the mean over all likely tails of displacements, and the upper bound at `CONFIDENCE`.
+    `half` is the displacement from which half of the places accuse; None if not even the largest does."""
 
     mean: float
     at_most: float
@@ -93,12 +92,12 @@ def _clear(drive: Sequence[Judged]) -> tuple[Judged, ...]:
 
 
 def bound(places: Places, stay_checks: int, places_per_h: float, alarms: Alarms) -> Bound | None:
-    """Of a vehicle that stays at a place for so many checks, and comes to so many of them an hour; None of fewer than
-    `MIN_PLACES`."""
+    """The bound for a vehicle that stays `stay_checks` checks at each place and meets `places_per_h` places an hour;
+    None with fewer than `MIN_PLACES` places."""
     if len(places.checks) < MIN_PLACES:
         return None
     accused = [_accused(places, far, stay_checks, alarms) for far in DISPLACEMENTS]
-    # The farther, the likelier: fewer by chance are no fewer.
+    # A farther place is never less likely to accuse: a smaller share is chance.
     share = np.maximum.accumulate(np.array(accused))
     weight, beyond = tail(places.displacement, np.array(DISPLACEMENTS))
     rates = 100.0 * places_per_h * np.sum(np.diff(share, prepend=0.0) * beyond, axis=1)
@@ -109,8 +108,8 @@ def bound(places: Places, stay_checks: int, places_per_h: float, alarms: Alarms)
 
 
 def tail(seen: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of displacements (n,) that were seen, tails (k,) by how likely they are, and the share of places (k, m) that each
-    has beyond some displacements (m,): generalised Pareto beyond the median."""
+    """Tails fitted to the displacements `seen` (n,), generalised Pareto beyond their median: the weight of each tail
+    (k,), its likelihood scaled to a sum of 1, and the share of places (k, m) that it has beyond `at` (m,)."""
     threshold = float(np.median(seen))
     excess = seen[seen > threshold] - threshold
     mean = float(excess.mean())
@@ -145,11 +144,11 @@ def _accused(places: Places, displacement: float, stay_checks: int, alarms: Alar
 
 
 def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.Generator) -> list[Judged]:
-    """Checks of a right mount, and then those of a place that is off about or along one axis."""
+    """Checks of a right mount, followed by checks of a place that is off about or along one axis."""
     scattered = [checks for checks in places.checks if len(checks) > 1]
     checks = scattered[int(rng.integers(len(scattered)))]
     offsets = _offsets(checks)
-    # What so few scatter about their middle is less than what they scatter about their place.
+    # A few checks scatter less about their own centre than about the true displacement of their place.
     about = (offsets - _centre(checks)) * np.sqrt(len(checks) / (len(checks) - 1.0))
     off = np.zeros(6)
     axis = int(rng.integers(6))
@@ -162,12 +161,12 @@ def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.
 
 
 def _place(checks: Sequence[Judged]) -> NDArray[np.float64]:
-    """(6,) the standard deviation of a place where checks are of such dispersions."""
+    """(6,) the standard deviation of a place, given the dispersions of its checks."""
     return np.asarray(np.mean([np.array(check.place) * check.dispersion for check in checks], axis=0))
 
 
 def _centre(checks: Sequence[Judged]) -> NDArray[np.float64]:
-    """(6,) where the checks of a place put the mount, one that is far from the others or not."""
+    """(6,) median offset of the checks of a place, so that an outlier does not count."""
     return np.asarray(np.median(_offsets(checks), axis=0))
 
 

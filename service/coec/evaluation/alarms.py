@@ -1,7 +1,7 @@
-"""What the change detector does with streams of checks whose truth is known: how often it accuses a right mount, how
-soon it notices a step of any size, a creep, and a mount that was wrong before the first check.
+"""What the change detector does with streams of checks whose truth is known: how often it accuses a right mount, and
+how soon it notices a step, a creep, and a mount that was wrong before the first check.
 
-The streams are drawn, not rendered: 100 hours of driving are 72 000 checks. They are worse than what the detector
+The streams are drawn, not rendered, because 100 hours of driving are 72 000 checks. They are worse than the detector
 assumes: bad checks come in bursts.
 """
 
@@ -36,29 +36,29 @@ STREET_CHECKS = 24
 """Checks in one street, on average: two minutes at one every five seconds."""
 
 BURST_EVERY, BURST_CHECKS = 100, 3
-"""Checks between two poor stretches, and in one, on average."""
+"""Checks between two poor stretches, and checks in one, on average."""
 
 BAD = np.array([radians(2.5)] * 3 + [0.1] * 3)
-"""Standard deviations of what checks of poor stretches say (rad, m)."""
+"""Standard deviations of the offsets that checks report in poor stretches (rad, m)."""
 
 SETTLED_CHECKS = 60
 """Checks of a right mount before a step."""
 
 PATIENCE_CHECKS = 240
-"""Checks after a step in which it has to be noticed: twenty minutes at one every five seconds."""
+"""Checks after a step within which it must be noticed: twenty minutes at one every five seconds."""
 
 STATED_H = (1.0, 3.0, 10.0, 30.0, 100.0)
-"""Hours between false alarms for which it is counted how many there were."""
+"""Stated hours between false alarms; for each of them the alarms are counted."""
 
 STEPS_DEG = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 2.0, 3.0, 4.5, 7.0)
 """Sizes of the steps."""
 
 CREEP_DEG_PER_H, CREEP_H, CREEPS = 0.1, 12.0, 3
-"""How fast a mount creeps, for how long at most, and how many of them."""
+"""How fast a mount creeps, for how long at most, and how many creeps are drawn."""
 
 WRONG_DEG, WRONG_CHECKS = (0.0, 0.3, 0.5, 0.7, 1.0, 2.0, 3.0), 12
-"""How far from what is served a mount is from the first check on, and the checks in which that has to be noticed: a
-minute at one every five seconds."""
+"""How far a mount is from what is served from the first check on, and the number of checks within which this must be
+noticed: a minute at one every five seconds."""
 
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
@@ -68,7 +68,8 @@ Heard = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class FalseAlarms:
-    """Of a right mount in so many hours: how often its evidence came to the level of a stated time between them."""
+    """How often the evidence of a right mount reached the alarm level that belongs to a stated time between false
+    alarms (h), in so many hours of driving."""
 
     stated_h: float
     driven_h: float
@@ -77,8 +78,8 @@ class FalseAlarms:
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """From a step to the first check that makes it suspect, and confirms it, per drawn step, s; infinite where it was
-    not within `PATIENCE_CHECKS`."""
+    """Time from a step to the first check that suspects it and to the one that confirms it, per drawn step, s; infinite
+    where this did not happen within `PATIENCE_CHECKS`."""
 
     step_deg: float
     suspect_s: tuple[float, ...]
@@ -87,7 +88,8 @@ class Delay:
 
 @dataclass(frozen=True, slots=True)
 class Creep:
-    """Until a steady creep was suspected and confirmed, per drawn creep, h; infinite where it was not in time."""
+    """Time until a steady creep was suspected and confirmed, per drawn creep, h; infinite where it was not within
+    `CREEP_H`."""
 
     deg_per_h: float
     suspect_h: tuple[float, ...]
@@ -96,9 +98,9 @@ class Creep:
 
 @dataclass(frozen=True, slots=True)
 class FromStart:
-    """From the first check of a mount that is wrong by so much from then on to the check that wants a window soon, per
-    drawn rig, s; infinite where none of `WRONG_CHECKS` did. Nothing was learned of the rig: that it may be right, and
-    the estimator off by as much, is weighed by what estimators are off on other rigs."""
+    """A mount is wrong by `off_deg` from the first check on: the time until a check wants a window soon, per drawn rig,
+    s; infinite where none of `WRONG_CHECKS` did. Nothing was learned about the rig. So the mount may be right and
+    the estimator off instead; the detector weighs that by the bias of estimators on other rigs."""
 
     off_deg: float
     wanted_s: tuple[float, ...]
@@ -116,7 +118,7 @@ class Alarms:
 
 
 def measured(config: MonitorConfig, hours: float, steps: int, heard: Heard) -> Alarms:
-    """The experiments: so many hours of a right mount, so many steps of every size (seeded)."""
+    """Runs all experiments: `hours` of a right mount, and `steps` steps of every size (seeded)."""
     total = 2 + len(STEPS_DEG) + len(WRONG_DEG)
     false = false_alarms(config, hours)
     heard(1, total)
@@ -133,8 +135,8 @@ def measured(config: MonitorConfig, hours: float, steps: int, heard: Heard) -> A
 
 
 def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarms, ...]:
-    """Counts rises of the evidence of a right mount to the level of every stated time. A rise is counted once, until
-    the suspicion is over."""
+    """Counts how often the evidence of a right mount rises to the level of each stated time. A rise counts once; the
+    next can count only after the suspicion is over."""
     levels = alarm_levels(config)
     at = [alarm_level(config, stated) for stated in STATED_H]
     above, alarms = [False] * len(at), [0] * len(at)
@@ -149,7 +151,7 @@ def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarms, ...]
 
 
 def delay(config: MonitorConfig, step_deg: float, steps: int) -> Delay:
-    """Steps about drawn axes, each after `SETTLED_CHECKS` of a right mount."""
+    """Steps about drawn axes, each after `SETTLED_CHECKS` checks of a right mount."""
     suspect, confirmed = [], []
     for number in range(steps):
         rng = np.random.default_rng([SEED, round(step_deg * 1000), number])
@@ -189,7 +191,7 @@ def from_start(config: MonitorConfig, off_deg: float, rigs: int) -> FromStart:
 
 
 def _first(config: MonitorConfig, stream: Iterator[Observation], after: int) -> tuple[float, float]:
-    """Checks after so many until the evidence came to both levels."""
+    """Checks from number `after` on until the evidence reached the suspect level and the confirmed level."""
     levels = alarm_levels(config)
     suspect = float("inf")
     for number, state in enumerate(_states(stream, levels)):
@@ -210,7 +212,7 @@ def _states(stream: Iterator[Observation], levels: AlarmLevels) -> Iterator[Moni
 
 
 def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: MonitorConfig) -> Iterator[Observation]:
-    """Checks of a mount that is at `truth` (n, 6), rad and m from what is served."""
+    """Checks of a mount that is off what is served by `truth` (n, 6), rad and m."""
     turns = Accuracy(np.zeros(6), UNCOMMISSIONED_BIAS, SPREAD_ROTATION)
     shifts = Accuracy(np.zeros(6), UNCOMMISSIONED_BIAS, SPREAD_POSE)
     noise, sigma = (
@@ -252,7 +254,7 @@ def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: Monito
 
 
 def _bad(rng: np.random.Generator, checks: int) -> list[bool]:
-    """(n,) which checks are those of poor stretches."""
+    """(n,) which checks lie in poor stretches."""
     bad, within = [], False
     for draw in rng.random(checks):
         within = draw >= 1.0 / BURST_CHECKS if within else draw < 1.0 / BURST_EVERY

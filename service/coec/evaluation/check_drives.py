@@ -1,4 +1,4 @@
-"""Drives on which checks are tried, as data: rigs and places, each with seeds that nothing was learned on."""
+"""Drives on which checks are tried, as data: rigs and places, with seeds from which nothing was learned."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ RIGS = {
     "32-100deg": "lidar=32&camera=pinhole600x300@100",
     "32-70deg": "lidar=32&camera=pinhole420x260@70",
 }
-"""By name, the words of a `sim:` SOURCE. None of these lenses is in the matrix, or was learned on. Those that share a
-LiDAR look at the same drives, so a sweep is drawn once for them."""
+"""By name, the words of a `sim:` SOURCE. None of these lenses is in the matrix, and nothing was learned from them. Rigs
+with the same LiDAR see the same drives, so a sweep is drawn once for all of them."""
 
 PLACES = {
     "highway": "scene=highway",
@@ -35,13 +35,13 @@ PLACES = {
 """Likewise."""
 
 FIRST_SEED = 950_001
-"""Beyond all seeds that anything was learned on, or is shown with."""
+"""Beyond all seeds that are used for learning or for showing."""
 
 COMMISSIONED_ON = (("street", 920_001), ("garage", 920_002))
 """Places and seeds of the drives that a rig is commissioned on."""
 
 COMMISSIONED_CHECKS = 3
-"""Length of each of these, in checks: together they have 36 pairs, as many as one or two windows of a rig."""
+"""Length of each of these drives, in checks: together 36 pairs, as many as one or two windows of a rig."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,15 +59,15 @@ class CheckDrive:
 
     def source(self, checks: int) -> str:
         """The SOURCE that draws so many checks of it."""
-        # A moment longer: the last pair is begun.
+        # A moment longer, so that the last pair is begun.
         seconds = checks * PERIOD_S + 0.5 / HERTZ
         words = [f"seed={self.seed}", f"seconds={seconds:g}", f"camera_hz={HERTZ:g}", f"lidar_hz={HERTZ:g}"]
         return "sim:" + "&".join([*words, "ego_hz=20", RIGS[self.rig], *filter(None, [PLACES[self.place]])])
 
 
 def drives(rounds: int) -> Iterator[tuple[CheckDrive, ...]]:
-    """Every place with every rig, `rounds` times, each time with a seed of its own: some of a run have seen all.
-    Together those that differ in their lens alone."""
+    """Every place with every rig, `rounds` times, each time with another seed, so that part of a run covers them all.
+    Drives that differ only in their lens come together."""
     for turn in range(rounds):
         for number, place in enumerate(PLACES):
             for _, rigs in groupby(RIGS, lambda rig: RIGS[rig].partition("&")[0]):

@@ -1,4 +1,4 @@
-"""One drive of the checks: drawn, and checked at the right pose and beside it, as the monitor does."""
+"""One drive on which checks are tried: it is drawn, and checked as the monitor does, at the right pose and off it."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
 
 RIGHT = "right"
-"""Name of no move."""
+"""Name of the case without a move."""
 
 MOVES = (("0.5 deg", 0.5, 0.0), ("1 deg", 1.0, 0.0), ("10 cm", 0.0, 0.10))
-"""By name: by how much the served pose is turned from the truth, about a random axis (degrees), and shifted from it
-along an axis of the camera that checks know (m). A drive is looked at from the truth and with one of them."""
+"""By name: by how much the served pose is turned from the truth about a random axis (degrees), and shifted from it
+along an axis of the camera that checks can observe (m). Each drive is checked at the truth and with one of these."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stage:
-    """A drawn drive: its pairs, the truth (4, 4), and what reads them once for all."""
+    """A drawn drive: its pairs, the truth (4, 4), and readers that decode each pair only once."""
 
     rig: Rig
     truth: Matrix4
@@ -62,20 +62,20 @@ class _Stage:
     images: ImageReader
 
     def window(self, pairs: Sequence[FramePair]) -> Window:
-        """Some pairs, from the truth."""
+        """A window of some pairs that starts at the truth."""
         rig = replace(self.rig, T_camera_lidar_nominal=self.truth)
         return Window(f"{rig.pair}-{pairs[0].stamp_ns}", rig, self.truth, tuple(pairs))
 
 
 def commissioned(rig: str) -> Baseline:
-    """What checks of a rig learn on drives of its own; limits of full calibrations are not asked for.
+    """The baseline of a rig, learned for checks on the drives `COMMISSIONED_ON`, without limits for full calibrations.
 
     Raises:
         CalibrationError: these drives show nothing.
     """
     stages = [_draw([CheckDrive(rig, *where).source(COMMISSIONED_CHECKS)])[0] for where in COMMISSIONED_ON]
     pairs = [
-        # As if one drive had come after the other: they begin at the same time.
+        # All drives begin at the same time: later ones are shifted, as if they had come one after the other.
         _later(pair, number * 3_600_000_000_000)
         for number, stage in enumerate(stages)
         for pair in stage.pairs
@@ -95,8 +95,8 @@ def commissioned(rig: str) -> Baseline:
 
 
 def run(drives: Sequence[CheckDrive], baselines: Mapping[str, Baseline]) -> list[CheckedDrive]:
-    """The rows of drives that differ in their lens alone; whatever goes wrong is their `failure`. `baselines` of the
-    rigs that could be commissioned, by name."""
+    """The rows of drives that differ only in their lens; an error becomes a row's `failure`. `baselines` holds those of
+    the rigs that could be commissioned, by name."""
     rows = [
         CheckedDrive(name=drive.name, rig=drive.rig, place=drive.place, seed=drive.seed, source=source, poses=())
         for drive in drives
@@ -136,7 +136,7 @@ def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tup
         pose = se3.perturb(stage.truth, xi)
         seen = [(evidence, check_at(evidence, pose, expected)) for evidence in gathered]
         of_any = tuple(_judged(*one, pose, None) for one in seen)
-        # The reference moves with what is served: a commissioned rig whose mount has moved.
+        # The baseline's reference moves with the served pose, as for a commissioned rig whose mount has moved.
         of_rig = () if baseline is None else tuple(_judged(*one, pose, baseline) for one in seen)
         rows.append(CheckedPose(moved=name, uncommissioned=of_any, commissioned=of_rig))
     return tuple(rows)
@@ -145,7 +145,7 @@ def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tup
 def _move(
     rng: np.random.Generator, turn_deg: float, shift_m: float, baseline: Baseline | None
 ) -> NDArray[np.float64] | None:
-    """(6,) ξ; None of a shift where checks know no translation to `OBSERVABLE_M`."""
+    """(6,) ξ of a move; None for a shift where checks know no translation to `OBSERVABLE_M`."""
     xi = np.zeros(6)
     xi[:3] = radians(turn_deg) * random_direction(rng)
     if shift_m > 0.0:
@@ -158,14 +158,14 @@ def _move(
 
 
 def _draw(sources: Sequence[str]) -> list[_Stage]:
-    """Drives that differ in their lens alone."""
+    """Draws drives that differ only in their lens."""
     first: SimulatedDrive = open_sim(parse_spec(sources[0]).query)
     configs = [drive_config_of(parse_spec(source).query) for source in sources[1:]]
     drives = [first, *(first.through(config.camera, config.half_view_deg) for config in configs)]
     pairers = [Pairer(PairingConfig(), expects_motion=True) for _ in drives]
     pairs: list[list[FramePair]] = [[] for _ in drives]
     for number, message in enumerate(first.messages()):
-        # What is no picture is the same for all of them.
+        # All messages but pictures are the same for all drives.
         own = isinstance(message, CameraFrame)
         seen = [message, *(drive.part(number, number + 1)[0] if own else message for drive in drives[1:])]
         for pairer, one, paired in zip(pairers, seen, pairs, strict=True):
@@ -192,7 +192,7 @@ def _later(pair: FramePair, by_ns: int) -> FramePair:
 
 def _configuration() -> CalibrationConfig:
     values = CalibrationConfig().model_dump()
-    # One process draws and checks one drive: its thread is its own.
+    # Each process draws and checks one drive, so one thread is enough.
     values["depth"] |= {"threads": 1}
     return CalibrationConfig.model_validate(values)
 

@@ -1,10 +1,10 @@
 """What the change detector makes of checks of rendered drives: shares, delays, and false alarms in hours of driving.
 
-A mount is right or wrong for hours, and so is a place poor for its checks: on a highway what one check is off, the next
-one is off as well. So the hours are resampled by whole drives, and of one place for as long as one is there; checks
-that are shuffled would be independent, and the alarms far too few. What was not met, no resampling meets: a tail is
-fitted to how far off places are (`alarm_bound`), once as if every drive were a place of its own, and once as if a
-vehicle stayed at each for ten minutes.
+Checks at one place are not independent: on a highway, if one check is off, the next is off by as much. So hours are
+resampled from whole drives, all of one place for as long as a vehicle stays there. Shuffled checks would be
+independent, and alarms far too few. Resampling cannot show what was never met, so a tail is fitted to how far off
+places are (`alarm_bound`): once as if every drive were a place of its own, and once as if a vehicle stayed at each
+place for ten minutes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PLACE_CHECKS = 120
 """Checks in one place of resampled driving, on average: ten minutes at one every five seconds."""
 
 SETTLED_CHECKS = 24
-"""Of a right mount before a move: two minutes, of other drives in the same place with the same rig."""
+"""Checks of a right mount before a move: two minutes, from other drives in the same place with the same rig."""
 
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
@@ -93,13 +93,13 @@ def _checks(row: CheckedDrive, moved: str, commissioned: bool) -> tuple[Judged, 
 
 
 def _in_turn(rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]]) -> Iterator[list[Where]]:
-    """What each rig met, one drive after the other, as a vehicle of its own."""
+    """One vehicle per rig: all checks of its drives, one drive after the other."""
     for rig in dict.fromkeys(row.rig for row in rows):
         yield [(f"{rig} {row.place}", check) for row in rows if row.rig == rig for check in right[row.name]]
 
 
 def _resampled(rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]]) -> Iterator[list[Where]]:
-    """Vehicles, one of each rig in turn, each in one place after the other."""
+    """Vehicles without end, one of each rig in turn, each of which visits one place after the other."""
     rng = np.random.default_rng(SEED)
     rigs = list(dict.fromkeys(row.rig for row in rows))
     for rig in cycle(rigs):
@@ -116,7 +116,7 @@ def _resampled(rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]
 
 
 def _at_most(vehicles: Iterable[list[Where]], checks: int) -> Iterator[list[Where]]:
-    """The first so many checks of all vehicles."""
+    """Vehicles until they have `checks` checks together."""
     for driven in vehicles:
         yield driven[:checks]
         checks -= len(driven)
@@ -150,7 +150,7 @@ def _hours(how: str, vehicles: Iterable[list[Where]]) -> HoursStatistics:
 
 @dataclass(frozen=True, slots=True)
 class _Told:
-    """How many of some checks cannot tell, and those that can."""
+    """How many of some checks cannot tell, and why, and the checks that can."""
 
     blind: int
     weak: int
@@ -174,7 +174,7 @@ def _place(place: str, checks: Sequence[Judged]) -> PlaceStatistics:
 
 
 def _tail(places: Places, stay_checks: int) -> TailStatistics | None:
-    """Of a vehicle that is at another place after every `stay_checks`."""
+    """The bound for a vehicle that comes to another place after every `stay_checks` checks."""
     levels = alarm_levels(CONFIG)
 
     def alarms(checks: Sequence[Judged]) -> bool:
@@ -220,7 +220,7 @@ def _moved(
 
 
 def states(checks: Iterable[Judged], levels: AlarmLevels) -> Iterator[MonitorState]:
-    """The change detector after each of some checks, all of pairs of their own."""
+    """The state of the change detector after each check; no two checks share a pair."""
     state = MonitorState()
     for number, check in enumerate(checks):
         state = after_observation(state, _observation(check, number), levels)

@@ -1,8 +1,8 @@
-"""Do two calibrations close? Two cameras, or two LiDARs, each calibrated by itself, against the pose that lies between
-them: a test that needs no reference for either.
+"""Do two calibrations close? Two cameras, or two LiDARs, are each calibrated by themselves and compared through the
+known pose between them. The test needs no reference for either.
 
 Two cameras A and B beside one LiDAR: T_B_A · T_A_lidar should be T_B_lidar. Two LiDARs beside one camera: T_camera_A ·
-T_B_A⁻¹ should be T_camera_B. What is left is the closure error, ξ about the axes of camera B.
+T_B_A⁻¹ should be T_camera_B. The difference is the closure error, ξ about the axes of camera B.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ class Between:
     T_b_a: Matrix4
 
     def predicted(self, T_of_a: Matrix4) -> Matrix4:
-        """(4, 4) what B's calibration should be, from that of A."""
+        """B's calibration (4, 4) as it should be, given that of A."""
         if self.relation is Relation.CAMERAS:
             return np.asarray(self.T_b_a @ T_of_a)
         return np.asarray(T_of_a @ se3.inverse(self.T_b_a))
 
     @property
     def jacobian(self) -> NDArray[np.float64]:
-        """(6, 6) how an error of A's calibration shows in what is predicted for B, about the axes of camera B."""
+        """(6, 6) how an error of A's calibration carries over to the prediction for B, about the axes of camera B."""
         return se3.adjoint(self.T_b_a) if self.relation is Relation.CAMERAS else np.eye(6)
 
     def error(self, a: Outcome, b: Outcome) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """ξ (6,) from what A predicts to what B found, and the covariance (6, 6) that both claim for it; None unless
-        both were accepted."""
+        """ξ (6,) from what A predicts to what B found, and its covariance (6, 6) by both claims; None unless both were
+        accepted and claim something."""
         of_a, of_b = claimed(a), claimed(b)
         if of_a is None or of_b is None:
             return None
@@ -77,9 +77,9 @@ class Closure:
 
     Attributes:
         frames: on which both were calibrated.
-        pairs: camera-LiDAR pairs that each solve of A and of B saw.
-        normalised: the closure errors over what was claimed for them.
-        rotation_rad, translation_m: sizes of the errors; of the translation NaN where it was not searched.
+        pairs: camera-LiDAR pairs in each solve of A and of B.
+        normalised: the closure errors divided by what was claimed for them.
+        rotation_rad, translation_m: sizes of the errors; NaN for a translation that was not searched.
     """
 
     frames: Frames
@@ -122,10 +122,10 @@ def close(
     dof: int,
     heard: Callable[[int, str], None],
 ) -> tuple[Closure, ...]:
-    """A and B calibrated by themselves, `trials` times from starts of their own: on all of their frames (`pairs` of
-    each), on halves, and on halves that have no instant in common.
+    """Calibrates A and B by themselves, `trials` times from different starts: on all their frames (`pairs` of each), on
+    the same half, and on halves that have no instant in common.
 
-    Halves are drawn by index: sources with equal numbers of frames that were taken together share instants.
+    Halves are drawn by index: two sources share instants if they have equal numbers of frames taken together.
     """
     found: dict[Frames, list[tuple[Outcome, Outcome]]] = {frames: [] for frames in Frames}
     halved = min(pairs) >= 2
@@ -153,7 +153,7 @@ def _closure(
     return Closure(
         frames=frames,
         pairs=pairs,
-        # Every trial sees the same recording: they count as one.
+        # All trials see the same recording, so they count as one.
         normalised=normalise(gathered(results), independent=1),
         rotation_rad=statistics.spread(float(np.linalg.norm(error[:3])) for error in errors),
         translation_m=statistics.spread(float(np.linalg.norm(error[3:])) for error in errors if dof == 6),

@@ -1,8 +1,8 @@
-"""How good a depth network is for this purpose: its maps against the sweeps at a known calibration.
+"""How good a depth network is for calibration: its maps are compared with the sweeps at a known calibration.
 
-Rank correlation says how well the network orders what it sees by distance, and needs no search. Mutual information, and
-where it is highest, says what the method of the paper would make of it (METHOD, section 3: plain mutual information is
-as good as its depth).
+Rank correlation shows how well the network orders what it sees by distance, and needs no search. Mutual information and
+the place of its maximum show what the paper's method would make of the network (METHOD, section 3: plain mutual
+information is as good as its depth).
 """
 
 from __future__ import annotations
@@ -38,17 +38,18 @@ SEARCH_DEG = 8.0
 (3 degrees, METHOD section 3)."""
 
 SPAN = Span(radians(15.0), 0.0, 91)
-"""Of the curves along the axes: wide enough for the peak of a weak network to fall to half on either side."""
+"""Span of the curves along the axes: wide enough for the peak of a weak network to fall to half on either side."""
 
 GOOD_RANK, GOOD_BIAS_RAD = 0.85, HIT_RAD
-"""From these on, plain mutual information lands in a hit by itself: stereo depth on KITTI-360 has 0.90 and 0.2 degrees,
-a network trained on such views 0.91 and 0.4."""
+"""With at least this rank correlation and at most this bias, plain mutual information alone reaches a hit: stereo depth
+on KITTI-360 has 0.90 and 0.2 degrees, a network trained on such views 0.91 and 0.4."""
 
 USABLE_RANK, USABLE_BIAS_RAD = 0.4, radians(6.0)
-"""Up to these, the hill of the depth witness still holds the true pose (its half-width is 3 to 9 degrees). Of five
-recordings and three networks, those beyond had 0.2 or less in a garage, or 11 degrees on a lens they do not know.
+"""Within these limits, the peak of the depth witness still holds the true pose (its half-width is 3 to 9 degrees). Of
+five recordings and three networks, those beyond had a rank of 0.2 or less in a garage, or a bias of 11 degrees on a
+lens that they do not know.
 
-The ratio to unrelated maps is told, but does not decide: frames a tenth of a second apart are not unrelated."""
+The ratio to unrelated maps is reported but does not decide, because frames a tenth of a second apart are related."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,11 +70,11 @@ class Pairing:
 
     @property
     def rank_correlation(self) -> float:
-        """Spearman's, of the value with the inverse range: + for inverse depth, - for depth; NaN below two points."""
+        """Spearman's, between value and inverse range: + for inverse depth, - for depth; NaN below two points."""
         return spearman(self.value, 1.0 / self.range_m)
 
     def residuals(self) -> NDArray[np.float64]:
-        """(n,) by how much of all points the map puts a point too near (+) or too far (-): -1 to 1."""
+        """(n,) how far the map ranks each point too near (+) or too far (-), as a share of all points: -1 to 1."""
         sign = -1.0 if self.rank_correlation < 0.0 else 1.0
         count = max(len(self.value) - 1, 1)
         return (ranks(sign * self.value) - ranks(1.0 / self.range_m)) / count
@@ -85,12 +86,12 @@ class DepthQuality:
 
     Attributes:
         pairings: per frame, at the reference.
-        mi, mi_of_unrelated: nats, at the reference: with its own maps and with those of other frames.
+        mi, mi_of_unrelated: nats, at the reference, of each frame with its own map and with maps of other frames.
         bias: (3,) rotation vector from the reference to the optimum of mutual information, rad.
-        half_width: (3,) of the peak about the axes through the optimum, half-way down to the unrelated, rad.
+        half_width: (3,) of the peak about the axes through the optimum, half-way down to `mi_of_unrelated`, rad.
         peakedness: (3,) -f''/f at the optimum, per rad².
         scans: mutual information about the reference along the three axes.
-        joint: (bins, bins) counts of the points by bin of the map (rows) and of the range, equal shares, near first.
+        joint: (bins, bins) counts of the points by bin of the map (rows) and of the range, see `joint_histogram`.
     """
 
     pairings: tuple[Pairing, ...]
@@ -115,7 +116,7 @@ class DepthQuality:
 
     @property
     def mi_over_unrelated(self) -> float:
-        """What the network tells of its own frame over what it tells of others."""
+        """Mutual information with a frame's own map over that with maps of other frames."""
         return self.mi / max(self.mi_of_unrelated, 1e-12)
 
 
@@ -236,8 +237,8 @@ def half_width(along: Scan, floor: float) -> float:
 
 
 def joint_histogram(pairings: Sequence[Pairing], bins: int) -> NDArray[np.int64]:
-    """(bins, bins) counts over all frames by share of the map's values (rows, the furthest first) and of the ranges
-    (columns, the furthest first): a perfect network has all points on the diagonal."""
+    """(bins, bins) counts over all frames, in bins of equal shares of the map's values (rows, furthest first) and of
+    the ranges (columns, furthest first). A perfect network has all points on the diagonal."""
     counts = np.zeros((bins, bins), np.int64)
     for pairing in pairings:
         sign = -1.0 if pairing.rank_correlation < 0.0 else 1.0

@@ -1,9 +1,9 @@
-"""How well a wrong extrinsic is seen: limits learned on one stretch of a recording, tried on the rest, with no pair in
-both.
+"""How well checks detect a wrong extrinsic: limits are learned on one stretch of a recording and tried on the rest,
+with no pair in both.
 
-Both classifiers are tried on the same checks: the distance of the local optimum, which decides, and for comparison the
-paper's, equation (2). On other pairs than those its limits were learned on, that one flagged 27 to 48 % of right poses
-of KITTI-360: mutual information tells the scene as much as the pose.
+Two classifiers are tried on the same checks: the distance of the local optimum, which decides, and for comparison the
+paper's, equation (2). On pairs from which its limits were not learned, the paper's flagged 27 to 48 % of right poses of
+KITTI-360, because mutual information depends on the scene as much as on the pose.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 
 RIGHT = "right"
-"""Name of no move."""
+"""Name of the case without a move."""
 
 MOVES = (
     (RIGHT, 0.0, 0.0),
@@ -39,24 +39,24 @@ MOVES = (
 """By name: rotation about a random axis (rad), translation along a camera axis (m)."""
 
 OBSERVABLE_M = 0.02
-"""An axis of translation is observable where a check knows it to this: 10 cm are five of them."""
+"""An axis of translation is observable where a check knows it to this standard deviation: 10 cm are five of them."""
 
 MIN_RECORDED = 2 * MIN_PAIRS + 1
-"""Pairs of a recording that can be split: a check needs `MIN_PAIRS`, commissioning one more."""
+"""Fewest pairs of a recording that can be split: a check needs `MIN_PAIRS`, commissioning one more."""
 
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
 
 CONFIDENCE = 0.95
-"""Of the interval of a share."""
+"""Confidence of the interval of a share."""
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """Checks after one kind of move: how many, the share that each classifier flagged, and the interval of the first at
-    `CONFIDENCE`, as if every check were of pairs of its own. Of the right pose these are the false alarms. `undecided`
-    is the share that the first left open."""
+    """Checks after one kind of move: their number, the share that each classifier flagged, and for the deciding one the
+    interval of that share at `CONFIDENCE`, as if no two checks shared a pair. At the right pose the flagged checks are
+    false alarms. `undecided` is the share that the deciding classifier left open."""
 
     name: str
     checks: int
@@ -69,7 +69,7 @@ class Detection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tried:
-    """One check: the move it was after, and what both classifiers said."""
+    """One check: the move before it, and what both classifiers said."""
 
     name: str
     opinion: Opinion
@@ -78,10 +78,10 @@ class Tried:
 
 
 def require_enough(pairs: int) -> None:
-    """Whether so many pairs can be split.
+    """Refuses a recording with too few pairs to split.
 
     Raises:
-        CalibrationError: they are fewer than `MIN_RECORDED`.
+        CalibrationError: `pairs` is below `MIN_RECORDED`.
     """
     if pairs < MIN_RECORDED:
         raise CalibrationError(
@@ -98,9 +98,9 @@ def try_detection(
     checks: int,
     heard: Callable[[int, int], None],
 ) -> list[Tried]:
-    """Cuts the pairs, taken as a ring, in two halves `splits` times (seeded), learns on one, and tries `checks` checks
-    after every move on the other; `heard(done, total)` counts the splits. `evidence` is prepared for poses as far as
-    `FAR_RAD` beside the right one.
+    """Cuts the pairs, taken as a ring, into two halves `splits` times (seeded), learns on one half, and tries `checks`
+    checks after every move on the other; `heard(done, total)` counts the splits. `evidence` must be prepared for poses
+    up to `FAR_RAD` from the right one.
 
     Raises:
         CalibrationError: fewer than `MIN_RECORDED` pairs.
@@ -110,7 +110,7 @@ def try_detection(
     tried = []
     for split in range(splits):
         rng = np.random.default_rng([SEED, split])
-        # Neighbours on the same side: the limits are tried at places where they were not learned.
+        # Neighbouring pairs stay in one half, so that limits are tried at places where they were not learned.
         order = (int(rng.integers(count)) + np.arange(count)) % count
         learned, kept = sorted(order[: (count + 1) // 2].tolist()), order[(count + 1) // 2 :].tolist()
         of_learned = evidence.of(learned)
@@ -147,8 +147,8 @@ def table(tried: Sequence[Tried]) -> tuple[Detection, ...]:
 
 
 def interval(hits: int, of: int) -> tuple[float, float]:
-    """Between which shares the true one lies, at `CONFIDENCE`, where `hits` of `of` draws were seen (Wilson 1927): it
-    holds for none and for all of them, too.
+    """Interval of the true share at `CONFIDENCE`, given `hits` in `of` draws (Wilson 1927). It also holds for no hit
+    and for hits alone.
 
     Raises:
         ValueError: no draw was seen.

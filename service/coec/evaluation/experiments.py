@@ -1,4 +1,4 @@
-"""What every experiment of `coec evaluate` does: many solves on one recording whose pose is known."""
+"""The experiments of `coec evaluate`: many solves on one recording whose pose is known."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint, Trial
 from coec.evaluation.steps import KNOCKS, TriedKnock, try_knocks
 
 SUBSETS = 20
-"""Solves for every number of frames and every length of a slice, each with a start of its own."""
+"""Solves for every number of frames and for every length of a slice, each from another start."""
 
 SLICE_SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
-"""Lengths of the slices, of the whole recording: even on a logarithmic axis."""
+"""Lengths of the slices as shares of the recording: even on a logarithmic axis."""
 
 SLICES = 5
-"""Places in a recording from which slices of one length are taken, at most; they do not overlap."""
+"""Most places in a recording from which slices of one length are taken; they do not overlap."""
 
 CHECKS = 10
 """Checks per split and move at which detection is tried, unless told otherwise."""
@@ -41,14 +41,14 @@ class Stages:
     """A progress bar per stage, and the seconds that each took."""
 
     def __init__(self, bars: Progress, prefix: str = "") -> None:
-        """`prefix` stands before the names of the stages on the bars, not in the seconds."""
+        """`prefix` stands before the names of the stages on the bars, not in `elapsed_s`."""
         self._bars = bars
         self._prefix = prefix
         self._began_s = self._mark_s = time.perf_counter()
         self._elapsed_s: dict[str, float] = {}
 
     def begin(self, stage: str, total: int | None) -> Callable[[int, str], None]:
-        """What is to be called with the number of parts done and a note."""
+        """Begins a stage; returns a function to call with the number of parts done and a note."""
         task = self._bars.add_task(self._prefix + stage, total=total, note="")
 
         def heard(done: int, note: str = "") -> None:
@@ -60,7 +60,7 @@ class Stages:
         return heard
 
     def elapsed_s(self) -> dict[str, float]:
-        """By stage, and `total`."""
+        """Seconds by stage, and in `total`."""
         return {**self._elapsed_s, "total": time.perf_counter() - self._began_s}
 
 
@@ -79,7 +79,7 @@ class Bench:
         return self.window.rig.T_camera_lidar_nominal
 
     def solve(self, start: Matrix4, frames: Sequence[int] | None = None) -> Outcome:
-        """From one start, as a guess, on all frames or on those with the given indices."""
+        """Solves from one start, which is taken as a guess, on all frames or on those with the given indices."""
         pairs = self.window.pairs if frames is None else tuple(self.window.pairs[index] for index in frames)
         window = replace(self.window, T_camera_lidar_start=start, start_known_to_rad=pi, pairs=pairs)
         began_s = time.perf_counter()
@@ -92,7 +92,7 @@ class Bench:
 
 
 def inferred(window: Window, model: DepthModel, heard: Callable[[int, str], None]) -> DepthModel:
-    """Depth of every frame, once for all solves.
+    """A model that holds the depth of every frame, inferred once for all solves.
 
     Raises:
         CalibrationError: a frame has no depth.
@@ -113,11 +113,11 @@ def greys_of(window: Window) -> ImageReader:
 
 
 def from_reference(bench: Bench, stages: Stages) -> Outcome:
-    """The solve that starts at the reference: what no start can do better than. It also compiles the kernels, so that
-    the times of the others are those of solving.
+    """The solve that starts at the reference, the best of all starts. It also compiles the kernels, so that the other
+    solves are timed without compiling.
 
     Raises:
-        CalibrationError: from no start there would be an estimate.
+        CalibrationError: no start would give an estimate.
     """
     heard = stages.begin("reference", 1)
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
@@ -128,7 +128,7 @@ def from_reference(bench: Bench, stages: Stages) -> Outcome:
 
 
 def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> Iterator[Outcome]:
-    """One solve from each of the poses (4, 4): each is there as soon as it is solved."""
+    """One solve from each of the poses (4, 4), yielded as soon as it is done."""
     heard = stages.begin("starts", len(poses))
     hits = 0
     for done, pose in enumerate(poses, start=1):
@@ -139,8 +139,8 @@ def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> Itera
 
 
 def against_frames(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> tuple[FramesPoint, ...]:
-    """The same starts for every number of frames, spread over all of them, so that numbers of frames are compared and
-    nothing else."""
+    """Solves with different numbers of frames. Every number gets the same starts, spread over all `poses`, so that only
+    the numbers of frames are compared."""
     available = len(bench.window.pairs)
     counts = starts.frame_counts(available)
     heard = stages.begin("frames", len(counts) * SUBSETS)
@@ -161,8 +161,8 @@ def against_slice(
     poses: Sequence[Matrix4],
     stages: Stages,
 ) -> tuple[SlicePoint, ...]:
-    """Slices of several lengths: for each the same starts, shared by slices at several places of the recording, the
-    first of them at its beginning.
+    """Solves on slices of several lengths. Every length gets the same starts, divided among slices at several places of
+    the recording, the first at its beginning.
 
     Args:
         bench: on the whole recording, from which slices are cut.
@@ -182,7 +182,7 @@ def against_slice(
             try:
                 window = cut(begin_s, begin_s + length_s)
             except SourceError:
-                # No camera frame was taken in this slice: it is no window.
+                # A slice without a camera frame is no window.
                 continue
             slices.append(window)
         outcomes: list[tuple[int, list[Outcome]]] = []
@@ -205,7 +205,7 @@ def against_slice(
 def in_halves(
     bench: Bench, splits: int, rotation_rad: float, translation_m: float, stages: Stages
 ) -> list[tuple[Outcome, Outcome]]:
-    """Disjoint halves of the frames, each solved from a start of its own, this far from the reference."""
+    """Solves disjoint halves of the frames, each from another start, this far from the reference."""
     available = len(bench.window.pairs)
     poses = starts.starts(bench.reference, 2 * splits, rotation_rad, translation_m)
     heard = stages.begin("halves", splits)
@@ -225,9 +225,9 @@ def in_windows(
     true_pose: Callable[[int], Matrix4],
     stages: Stages,
 ) -> list[Outcome]:
-    """The recording cut into as many windows as there are starts, one after the other: they share no frame. Each is
-    solved from its start and held against `true_pose` at the time of its last pair (ns); windows without a camera frame
-    are left out.
+    """Cuts the recording into as many consecutive windows as there are starts; they share no frame. Each is solved from
+    its start and compared with `true_pose` at the time of its last pair (ns). Windows without a camera frame are left
+    out.
 
     Args:
         bench, model, cut: as for `against_slice`.
@@ -236,14 +236,14 @@ def in_windows(
         stages: hears of every window.
     """
     stamps_ns = [pair.stamp_ns for pair in bench.window.pairs]
-    # A microsecond more: the last frame belongs to the last window.
+    # A microsecond more, so that the last frame belongs to the last window.
     length_s = ((stamps_ns[-1] - stamps_ns[0]) * 1e-9 + 1e-6) / len(poses)
     heard = stages.begin("windows", len(poses))
     outcomes = []
     for index, pose in enumerate(poses):
         heard(index, "")
         try:
-            # A nanosecond less than to the next one.
+            # Ends a nanosecond before the next window begins.
             window = cut(index * length_s, (index + 1) * length_s - 1e-9)
         except SourceError:
             continue
@@ -255,8 +255,8 @@ def in_windows(
 
 
 def detected(bench: Bench, splits: int, checks: int, stages: Stages) -> list[Tried]:
-    """How well the monitor sees a wrong extrinsic: limits learned on some pairs, `checks` checks per split and move at
-    the others."""
+    """How well the monitor detects a wrong extrinsic: limits are learned on some pairs, and `checks` checks per split
+    and move are made on the others."""
     decode, heard = stages.begin("checks", None), stages.begin("detection", splits)
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
     evidence = gather(sight_of(window, bench.depth, bench.images, bench.configuration, Silence()), FAR_RAD)
@@ -267,7 +267,7 @@ def detected(bench: Bench, splits: int, checks: int, stages: Stages) -> list[Tri
 
 
 def knocked(bench: Bench, trials: int, stages: Stages) -> list[TriedKnock]:
-    """What is said of the recording with knocks laid into it, `trials` times each kind."""
+    """What calibrations say about the recording with knocks applied to it, `trials` times each kind."""
     total = 1 + trials * sum(knock.moves for knock in KNOCKS)
     heard = stages.begin("steps", total)
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
@@ -286,8 +286,8 @@ def _spread(poses: Sequence[Matrix4], trial: int) -> Matrix4:
 
 
 def _places(length_s: float, whole_s: float) -> list[float]:
-    """Where slices of a length begin, seconds: the beginning, and evenly on to the last that does not overlap."""
-    # A hair of grace: a slice as long as the recording fits into it once.
+    """Where slices of a length begin, seconds: at the beginning, then evenly up to the last that does not overlap."""
+    # 1e-9 of tolerance, so that a slice as long as the recording fits once.
     fits = int(whole_s / length_s + 1e-9) if length_s > 0 else 1
     chosen = {round(index * (fits - 1) / max(min(fits, SLICES) - 1, 1)) for index in range(min(fits, SLICES))}
     return [index * length_s for index in sorted(chosen)]

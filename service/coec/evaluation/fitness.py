@@ -1,6 +1,6 @@
 """What a recording holds and what it is good for, before anyone waits for a calibration.
 
-Stamps of all frames are known without loading them; of the frames themselves a few are looked at, evenly chosen.
+The stamps of all frames are known without loading them; only a few frames, evenly chosen, are loaded.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ LOOKED_AT = 12
 """Camera frames that are loaded."""
 
 LITTLE_IN_VIEW = 0.03
-"""Share of a sweep's points. A camera of 60° sees a tenth of a turning LiDAR's."""
+"""Share of a sweep's points in view below which there is a remark. A 60° camera sees a tenth of a turning LiDAR's."""
 
 SMEARING_MPS = 1.0
-"""Speed from which an uncompensated sweep of 0.1 s smears what is near by more than its beams are apart."""
+"""Above this speed an uncompensated sweep of 0.1 s smears near objects by more than the spacing of its beams."""
 
 MANY_GAPS = 3.0
-"""Gaps between frames are long from so many median intervals on."""
+"""A gap between frames is long from this many median intervals on."""
 
 FEW_PASSES = range(2, 9)
-"""How often the times of a cloud of several LiDARs begin anew; those of one that is stored row by row do so oftener."""
+"""How often the times run through in a cloud joined from several LiDARs; in a cloud stored row by row, more often."""
 
 Level = Literal["ok", "warn", "fail"]
 
 
 @dataclass(frozen=True, slots=True)
 class Cadence:
-    """How one stream comes: frames, Hz (of the median interval), and its longest gap, seconds."""
+    """Timing of one stream: frames, Hz (from the median interval), and its longest gap, seconds."""
 
     frames: int
     rate_hz: float
@@ -53,7 +53,7 @@ class Cadence:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Something that a person should know: machine-readable code, and a sentence that says what to do."""
+    """Something that a person should know: a machine-readable code, and a sentence that says what to do."""
 
     level: Level
     code: str
@@ -68,18 +68,18 @@ class Fitness:
         seconds: from its first camera frame to its last.
         camera, lidar, motion: cadence of the streams; motion None where there is none.
         width, height: of the images, pixels.
-        points, rings: of a sweep, medians; no rings: 0.
+        points, rings: of a sweep, medians; 0 rings where there are none.
         range_m: (near, far) within which nine of ten points lie.
-        passes: how often the points' times run from the begin of a sweep to its end, in the order in which they lie,
+        passes: how often the times run from the begin of a sweep to its end, in the order in which points are stored,
             median; 0 without times.
         point_time: whether points carry their own time, or the rig knows the sweep's.
-        timed_by: how the times of points were read, in a line; empty where that is not open.
+        timed_by: how the times of points were read, in a line; empty where there is no doubt.
         speed_mps, turn_degps: (median, most) of the vehicle; None where the ego-motion does not tell.
-        standing: share of the pairs that were taken while the vehicle stood; None where that is not known.
+        standing: share of the pairs that were taken while the vehicle stood; None where the speed is unknown.
         paired: share of the frames looked at that found a sweep.
         sync_ms: (median, most) of camera stamp minus sweep stamp, milliseconds.
         in_view: share of a sweep's points that the nominal extrinsic puts into the image, median.
-        remarks: those that matter most first.
+        remarks: the most important first.
     """
 
     seconds: float
@@ -104,10 +104,10 @@ class Fitness:
 
 
 def fitness_of(recording: Recording) -> Fitness:
-    """Looks at a recording.
+    """What a recording holds, and remarks on it.
 
     Raises:
-        SourceError: a file cannot be read, or a cloud contradicts its origin; names it.
+        SourceError: a file cannot be read, or a cloud contradicts its origin; names the file.
     """
     stamps_ns = recording.camera_stamps_ns
     chosen = evenly(len(stamps_ns), min(LOOKED_AT, len(stamps_ns)))
@@ -157,7 +157,7 @@ def fitness_of(recording: Recording) -> Fitness:
 
 
 def cadence(stamps_ns: Sequence[int]) -> Cadence:
-    """Of ascending stamps, nanoseconds. Of fewer than two the rate is 0."""
+    """Timing of a stream from its ascending stamps, nanoseconds. With fewer than two, rate and gap are 0."""
     if len(stamps_ns) < 2:
         return Cadence(len(stamps_ns), 0.0, 0.0)
     gaps_s = np.diff(np.array(stamps_ns, dtype=np.int64)) / NS_PER_S
@@ -175,8 +175,8 @@ def in_view(sweep: LidarFrame, rig: Rig) -> float:
 
 
 def passes(sweep: LidarFrame) -> int:
-    """How often the times of a sweep's points begin anew, in the order in which they lie, and once more; 0 where they
-    have none."""
+    """How often the times of a sweep's points run through, in the order in which the points are stored: one more than
+    they begin anew; 0 without times."""
     times_s = sweep.time_offset_s
     if times_s is None or len(times_s) == 0:
         return 0
@@ -281,7 +281,7 @@ def _median(counts: Sequence[int]) -> int:
 
 
 def _known(values: Iterable[float | None]) -> list[float]:
-    """Those that are."""
+    """The values that are not None."""
     return [value for value in values if value is not None]
 
 

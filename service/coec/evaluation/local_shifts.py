@@ -1,8 +1,8 @@
-"""Where in the picture range edges and image edges agree at an extrinsic, and by how much they do not.
+"""Where in the picture range edges and image edges agree at an extrinsic, and how far apart they are elsewhere.
 
-The picture is cut into cells. In each, the range edges of all pairs are moved about by a few pixels, all alike, and
-what is told is where they lie best: on the spot where extrinsic and lens are right, beside it where they are not. A
-turn of the camera moves all cells alike, a wrong lens those at the rim, a step those with something near.
+The picture is cut into cells. In each cell the range edges of all pairs are shifted together by a few pixels, and the
+shift at which they fit the image best is reported: zero where extrinsic and lens are right, not zero where they are
+wrong. A turn of the camera shifts all cells alike, a wrong lens those at the rim, a step those with near objects.
 """
 
 from __future__ import annotations
@@ -26,39 +26,40 @@ FRAMES = 25
 """Pairs that are looked at, at most: those of a window."""
 
 CELLS = (12, 8, 6, 4)
-"""Along the longer side of the image: as many as most range edges have enough beside them."""
+"""Cells along the longer side of the image: the most with which enough range edges lie in well-filled cells."""
 
 ENOUGH, MOST_SHARE = 150, 0.8
-"""Range edges that are enough for a cell, and the share of them that have as many."""
+"""A cell is well filled with so many range edges, and so large a share of all range edges must lie in such cells."""
 
 REACH_SHARE, LEAST_REACH_PX = 0.008, 6
-"""How far range edges are moved: so much of the longer side, 11 px on 1408, which is a degree and more."""
+"""How far range edges are shifted, as a share of the longer side: 11 px on 1408, which is more than a degree."""
 
 LEAST_EDGES = 100
-"""Range edges without which a cell tells nothing: of a few dozen, the same ones again while the vehicle stands, some
-place looks best by chance."""
+"""A cell with fewer range edges tells nothing: with a few dozen, which repeat while the vehicle stands, some shift
+looks best by chance."""
 
 TELLING = 4.0
-"""Standard deviations by which the best place stands out from the mean of all: of some hundred places, which are no
-more than a few dozen independent ones, chance reaches 3."""
+"""Standard deviations by which the best shift must stand out from the median of all. Chance reaches 3, because some
+hundred shifts are no more than a few dozen independent ones."""
 
 CLEARER = 1.0
-"""Standard deviations by which it must lie above every place that is not next to it, or it is one of two. On five
-simulated drives, 0 and 0.4 degrees beside the truth, 185 of 368 cells tell, 9 % of them wrong by 2 px and more; with 2
-it is 101, and 5 %."""
+"""Standard deviations by which the best shift must lie above every shift that is not next to it; otherwise there are
+two candidates. On five simulated drives, 0 and 0.4 degrees off the truth, 185 of 368 cells tell, 9 % of them wrong by
+2 px or more; with 2 instead it is 101 cells, and 5 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalShifts:
-    """Of the cells of a picture, row by row (R, C).
+    """Figures of the cells of a picture, row by row (R, C).
 
     Attributes:
-        edges: how many range edges lie in it, of all pairs.
-        shift_px: (R, C, 2) right and down, by which they would have to be moved to lie best; NaN where they do not
+        edges: number of range edges in the cell, over all pairs.
+        shift_px: (R, C, 2) right and down, by which they would have to be shifted to fit best; NaN where they do not
             tell.
-        strength: of the image's edges under them as they are, standard deviations from the mean over the image.
+        strength: of the image's edges under the unshifted range edges, standard deviations from the mean over the
+            image.
         frames: how many pairs were looked at.
-        reach_px: how far they were moved.
+        reach_px: how far range edges were shifted.
     """
 
     edges: NDArray[np.int64]
@@ -79,7 +80,7 @@ class LocalShifts:
 
 
 def local_shifts(window: Window, images: ImageReader, T_camera_lidar: Matrix4, *, compensated: bool) -> LocalShifts:
-    """Of a window at an extrinsic (4, 4).
+    """The shifts of a window at an extrinsic (4, 4).
 
     Raises:
         DecodeError: an image cannot be decoded.
@@ -162,16 +163,17 @@ def _cells(uv_px: NDArray[np.int64], camera: Camera, rows: int, columns: int) ->
 
 
 def _padded(edges: NDArray[np.int8], reach: int) -> NDArray[np.float32]:
-    """Strengths, with nothing about the image and where it is masked."""
+    """Edge strengths, padded by `reach`; zero in the padding and where the image is masked."""
     strength = np.where(edges == VOID, np.float32(0.0), edges.astype(np.float32) / STRENGTH_STEPS)
     return np.pad(strength, reach)
 
 
 def _best(z: NDArray[np.float64], reach: int) -> tuple[float, float]:
-    """Right and down of the summit of a cell's significances, to a fraction of a step; NaN where none stands out."""
+    """The shift, right and down, at the peak of a cell's significances, to a fraction of a step; NaN if none stands
+    out."""
     nothing = (np.nan, np.nan)
     row, column = (int(k) for k in np.unravel_index(int(np.argmax(z)), z.shape))
-    # At the rim of what was tried the summit lies beyond.
+    # With the best shift at the rim of those tried, the peak lies beyond.
     if not (0 < row < 2 * reach and 0 < column < 2 * reach):
         return nothing
     top = float(z[row, column])
@@ -185,6 +187,6 @@ def _best(z: NDArray[np.float64], reach: int) -> tuple[float, float]:
 
 
 def _summit(before: float, top: float, after: float) -> float:
-    """Of the parabola through three values at -1, 0 and 1."""
+    """Place of the summit of the parabola through three values at -1, 0 and 1."""
     bend = 2.0 * top - before - after
     return 0.5 * (after - before) / bend if bend > 0.0 else 0.0

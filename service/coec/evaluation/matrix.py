@@ -1,7 +1,7 @@
 """Statistics of the matrix of drives: from rows to figures, nothing else.
 
-An estimate is as good as it says where its errors, each over the sigma that it claims, are spread as a normal
-distribution of variance one. Errors and sigmas are those of the accepted windows: only they would be served.
+The claims of an estimate hold if its errors, each divided by the claimed sigma, follow a normal distribution of
+variance one. Errors and sigmas are those of the accepted windows, because only these would be served.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from coec.schemas.matrix import (
 )
 
 HIT_DEG, HIT_M = 0.5, 0.10
-"""A hit is at most so far from the truth."""
+"""A hit is at most this far from the truth."""
 WRONG_DEG, WRONG_M, WRONG_SIGMAS = 0.3, 0.10, 4.0
-"""An accepted window is wrong on an axis where it is off by more than this and by more than so many sigmas."""
+"""An accepted window is wrong on an axis where it is off by more than this and by more than `WRONG_SIGMAS` sigmas."""
 AXES: tuple[Literal["rx", "ry", "rz", "tx", "ty", "tz"], ...] = ("rx", "ry", "rz", "tx", "ty", "tz")
 DOFS: tuple[Literal[3, 6], ...] = (3, 6)
 PROPERTIES: dict[str, Callable[[MatrixRow], str]] = {
@@ -42,7 +42,7 @@ Solves = list[tuple[MatrixRow, int, SolvedWindow]]
 
 
 def is_hit(rotation_deg: float, translation_m: float, dof: int) -> bool:
-    """Whether an error is that of a hit; the translation counts where it was searched."""
+    """Whether an error counts as a hit; the translation counts only where it was searched."""
     return rotation_deg <= HIT_DEG and (dof == 3 or translation_m <= HIT_M)
 
 
@@ -64,7 +64,7 @@ def report(rows: Sequence[MatrixRow]) -> MatrixReport:
 
 
 def of_solves(dof: Literal[3, 6], solves: Solves) -> SolveStatistics:
-    """Of the windows of one number of degrees of freedom."""
+    """Figures of the windows solved with one number of degrees of freedom."""
     accepted = [window for _, _, window in solves if window.accepted]
     wrong = [text for row, place, window in solves for text in wrong_axes(f"{row.name}#{place + 1}", window)]
     return SolveStatistics(
@@ -82,7 +82,7 @@ def of_solves(dof: Literal[3, 6], solves: Solves) -> SolveStatistics:
 
 
 def of_axis(axis: int, windows: Iterable[SolvedWindow]) -> AxisStatistics:
-    """Errors on one axis against what was claimed."""
+    """Errors on one axis against the claimed sigmas."""
     both = [(window.error[axis], window.sigma[axis]) for window in windows]
     known = [(error, sigma) for error, sigma in both if error is not None and sigma is not None and sigma > 0.0]
     errors, sigmas = [error for error, _ in known], [sigma for _, sigma in known]
@@ -103,13 +103,13 @@ def of_axis(axis: int, windows: Iterable[SolvedWindow]) -> AxisStatistics:
 
 
 def normalised_errors(axis: int, windows: Iterable[SolvedWindow]) -> list[float]:
-    """Errors on an axis over the sigmas that were claimed, of the windows that claim one."""
+    """Errors on an axis divided by the claimed sigmas, of the windows that claim one."""
     both = [(window.error[axis], window.sigma[axis]) for window in windows]
     return [error / sigma for error, sigma in both if error is not None and sigma is not None and sigma > 0.0]
 
 
 def wrong_axes(name: str, window: SolvedWindow) -> list[str]:
-    """The axes on which an accepted window is wrong, each with its figures; none of a refused one."""
+    """The axes on which an accepted window is wrong, each with its figures; none for a refused window."""
     if not window.accepted:
         return []
     found = []
@@ -121,7 +121,7 @@ def wrong_axes(name: str, window: SolvedWindow) -> list[str]:
 
 
 def of_watches(moved: str, watches: Sequence[tuple[str, Watched]]) -> WatchStatistics:
-    """Of all checks of one served pose, by the names of their drives."""
+    """Figures of all checks of one served pose; `watches` are given with the names of their drives."""
     told = sum(watch.checks - watch.blind for _, watch in watches)
     hours = fsum(watch.seconds for _, watch in watches) / 3600.0
     alarms = sum(watch.alarms for _, watch in watches)

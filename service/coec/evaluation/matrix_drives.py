@@ -1,7 +1,7 @@
 """The matrix: simulated drives of many scenes, lenses, LiDARs, lights and faults, as data.
 
-Seeds are beyond those of training, demonstration and tests. What the first round has taught (`docs/measured.md`) is
-tried on the next: the same kinds of drives, other seeds.
+Their seeds are beyond those of training, demonstration and tests. What the first round taught (`docs/measured.md`) is
+tried on the next round, which has the same kinds of drives with other seeds.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 FIRST_SEED = 500_001
-"""Beyond all seeds that anything was learned on, or is shown with."""
+"""Beyond all seeds that are used for learning or for showing."""
 SEEDS, SEEDS_EACH = 3, 2
 """Seeds of a round, and how many of them each kind of drive takes, in turn."""
 
@@ -50,7 +50,7 @@ FAULTS = {
 """By name, the words of a `sim:` SOURCE. A step of 1.4° lies in the first of two windows."""
 
 MOVING_MOUNT = ("step",)
-"""Faults after which the truth is another: no pose is right all along."""
+"""Faults that change the truth, so that no pose is right all along."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class MatrixDrive:
 
     @property
     def name(self) -> str:
-        """What it is called: all its words."""
+        """Its name: all its words, and the number of its seed."""
         words = (self.scene, self.lens, self.lidar, self.light, self.fault, f"s{self.seed - FIRST_SEED + 1}")
         return "_".join(words)
 
@@ -76,7 +76,7 @@ class MatrixDrive:
         return self.fault in MOVING_MOUNT
 
     def source(self, seconds: float, hertz: float, *, depth: bool) -> str:
-        """The SOURCE that draws it: pictures and sweeps this often; `depth`: with exact depth maps."""
+        """The SOURCE that draws it, with pictures and sweeps at `hertz`, and with exact depth maps if `depth`."""
         words = [f"seed={self.seed}", f"seconds={seconds:g}", f"camera_hz={hertz:g}", f"lidar_hz={hertz:g}"]
         words += ["ego_hz=20", f"lidar={self.lidar}", *(["depth=yes"] if depth else [])]
         faults = []
@@ -141,8 +141,8 @@ KINDS: tuple[tuple[str, str, str, str, str], ...] = (
 
 
 def drives(number: int) -> tuple[MatrixDrive, ...]:
-    """Those of a round, counted from 1. Every kind with its first seed comes before any with its second: half a run has
-    seen them all."""
+    """The drives of a round, counted from 1. Every kind with its first seed comes before any kind with its second, so
+    that half a run covers all kinds."""
     first = FIRST_SEED + (number - 1) * SEEDS
     return tuple(
         MatrixDrive(*kind, first + (place + turn) % SEEDS)
@@ -152,5 +152,5 @@ def drives(number: int) -> tuple[MatrixDrive, ...]:
 
 
 def chosen(number: int, pattern: str | None) -> tuple[MatrixDrive, ...]:
-    """The drives of a round whose name fits a pattern of the shell (`*`, `?`); all for None."""
+    """The drives of a round whose name matches a shell pattern (`*`, `?`); all for None."""
     return tuple(drive for drive in drives(number) if pattern is None or fnmatchcase(drive.name, pattern))

@@ -1,4 +1,5 @@
-"""One drive of the matrix: drawn, its windows solved from wrong starts, its monitor tried at right and wrong poses."""
+"""One drive of the matrix: it is drawn, its windows are solved from wrong starts, and its monitor is tried at right and
+wrong poses."""
 
 from __future__ import annotations
 
@@ -38,20 +39,20 @@ if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
 
 WINDOWS = 2
-"""Of a drive, one after the other."""
+"""Windows of a drive, one after the other."""
 PAIR_S = 2.0
-"""Between two pairs: at 8 m/s another place each time."""
+"""Time between two pairs: at 8 m/s each is at another place."""
 START_DEG, START_M = (2.0, 10.0), (0.0, 0.1)
-"""Least and greatest error of a start, in a random direction; of a translation that is searched."""
+"""Least and greatest error of a start, in a random direction; `START_M` applies where the translation is searched."""
 CHECK_PAIRS = MIN_PAIRS
-"""Pairs of a check, all of them new: as few as a check takes, so that a short drive has several."""
+"""Pairs of a check, none shared with another check: the fewest a check takes, so that a short drive has several."""
 MOVES_DEG = (("right", 0.0), ("0.5 deg", 0.5), ("1 deg", 1.0))
 """By name: by how much the served pose is turned from the truth, about a random axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What decides the rows beside the drives: degrees of freedom, pairs of a window, the depth model."""
+    """What decides the rows apart from the drives: degrees of freedom, pairs of a window, the depth model."""
 
     dofs: tuple[int, ...]
     frames: int
@@ -59,13 +60,13 @@ class Settings:
 
     @property
     def fingerprint(self) -> str:
-        """Equal for equal results."""
+        """Rows with the same fingerprint are comparable."""
         return f"dof {self.dofs}, {WINDOWS} windows of {self.frames}, depth {self.depth}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stage:
-    """A drawn drive, ready to be solved: all its pairs, and what reads them once for all."""
+    """A drawn drive, ready to be solved: all its pairs, and readers that decode each of them only once."""
 
     drive: SimulatedDrive
     pairs: tuple[FramePair, ...]
@@ -73,13 +74,13 @@ class _Stage:
     images: ImageReader
 
     def window(self, pairs: Sequence[FramePair], start: Matrix4) -> Window:
-        """A window of some pairs whose start and nominal calibration are the same: nothing tells the truth."""
+        """A window of some pairs. Its nominal calibration is the start as well, so nothing in it tells the truth."""
         rig = replace(self.drive.rig, T_camera_lidar_nominal=start)
         return Window(f"{rig.pair}-{pairs[0].stamp_ns}", rig, start, tuple(pairs))
 
 
 def run(drive: MatrixDrive, settings: Settings) -> MatrixRow:
-    """The row of a drive; whatever goes wrong is its `failure`."""
+    """The row of a drive; an error becomes its `failure`."""
     began_s = time.process_time()
     seconds = WINDOWS * settings.frames * PAIR_S
     source = drive.source(seconds, 1.0 / PAIR_S, depth=settings.depth == STEREO)
@@ -100,7 +101,7 @@ def run(drive: MatrixDrive, settings: Settings) -> MatrixRow:
 
 def _configuration(settings: Settings) -> CalibrationConfig:
     values = CalibrationConfig().model_dump()
-    # One process draws and solves one drive: its thread is its own.
+    # Each process draws and solves one drive, so one thread is enough.
     values["depth"] |= {"model": settings.depth, "threads": 1}
     return CalibrationConfig.model_validate(values)
 
@@ -131,9 +132,8 @@ def _solved(
 
 
 def drawn_start(name: str, place: int, dof: int, held_m: float) -> NDArray[np.float64]:
-    """(6,) ξ of the start of a window, the `place`-th of the drive of this name, from the truth. A translation that is
-    held is as wrong as the budget of σ says that it is, `held_m` along each axis: an exact one would flatter the
-    estimate."""
+    """(6,) ξ from the truth to the start of the `place`-th window of the drive of this name. A held translation is
+    wrong by what the budget of σ assumes, `held_m` along each axis, because an exact one would flatter the estimate."""
     rng = np.random.default_rng([_number_of(name), place, dof])
     turn = radians(float(rng.uniform(*START_DEG))) * random_direction(rng)
     shift = float(rng.uniform(*START_M)) * random_direction(rng) if dof == 6 else rng.normal(0.0, held_m, 3)
@@ -175,7 +175,7 @@ def _solve(
 
 
 def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig) -> tuple[Watched, ...]:
-    """The checks of an uncommissioned rig that serves the truth, or a pose beside it."""
+    """The checks of an uncommissioned rig that serves the truth, and of one that serves a pose turned from it."""
     if len(stage.pairs) < CHECK_PAIRS:
         return ()
     truth = stage.drive.truth(stage.pairs[0].stamp_ns)
@@ -209,12 +209,12 @@ def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig
 
 
 def _number_of(name: str) -> int:
-    """A seed that depends on the name alone, so that a drive draws the same whatever others are run."""
+    """A seed that depends on the name alone, so that a drive draws the same whichever others are run."""
     return zlib.crc32(name.encode())
 
 
 def _maybe(values: NDArray[np.float64]) -> Maybe6:
-    """Radians to degrees, what is no number to null."""
+    """Radians to degrees, and what is not finite to None."""
     scaled = [*np.degrees(values[:3]), *values[3:]]
     rx, ry, rz, tx, ty, tz = (float(value) if abs(value) < inf else None for value in scaled)
     return rx, ry, rz, tx, ty, tz

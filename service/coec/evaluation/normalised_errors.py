@@ -1,8 +1,8 @@
-"""Does a claimed standard deviation hold? Errors over what was claimed for them: the calibration of the calibrator.
+"""Does a claimed standard deviation hold? Errors divided by what was claimed for them.
 
-An error e with the claimed covariance C is told by two figures: per axis e_i / √C_ii, of which 68, 95 and 99.7 % lie
-within 1, 2 and 3 if the claim holds and errors are normal; and over all axes the normalised error squared eᵀ·C⁻¹·e
-(NEES), whose mean per axis is 1 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and
+An error e with the claimed covariance C gives two figures: per axis e_i / √C_ii, of which 68, 95 and 99.7 % lie within
+1, 2 and 3 if the claim holds and errors are normal; and over all axes the normalised estimation error squared
+eᵀ·C⁻¹·e (NEES), whose mean per axis is 1 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and
 navigation", 2001, section 5.4).
 """
 
@@ -21,10 +21,10 @@ from coec.evaluation.statistics import Outcome
 from coec.geometry import se3
 
 SIGMAS = (1.0, 2.0, 3.0)
-"""Within so many claimed standard deviations coverage is told."""
+"""Coverage is reported within these numbers of claimed standard deviations."""
 
 BIN_EDGES = tuple(0.5 * step for step in range(-10, 11))
-"""Of the histogram of e / σ; the first and the last bin also hold what lies beyond."""
+"""Edges of the histogram of e / σ; the first and the last bin also hold what lies beyond."""
 
 CONFIDENCES = tuple(0.1 * step for step in range(1, 10))
 """Levels of the reliability plot: the share of errors that a normal distribution puts within √2·erf⁻¹ of them."""
@@ -39,8 +39,8 @@ class Claims:
 
     Attributes:
         errors: (n, 6) ξ, rx ry rz (rad) tx ty tz (m).
-        covariances: (n, 6, 6) in the same units; rows and columns of axes of which nothing is claimed are NaN.
-        refused: results that were not accepted, or claim nothing: they stand in no figure.
+        covariances: (n, 6, 6) in the same units; NaN in the rows and columns of axes without a claim.
+        refused: number of results that were not accepted or claim nothing; no figure includes them.
     """
 
     errors: NDArray[np.float64]
@@ -54,7 +54,7 @@ class NormalisedErrors:
 
     Attributes:
         judged, refused: results with and without a claim.
-        independent: of them, how many share no frame: the bounds are those of so many.
+        independent: how many of the judged share no frame; `nees_bounds` are for so many.
         rms, largest: (6,) root mean square and largest absolute error, rad and m.
         sigma: (6,) mean claimed standard deviation.
         sigma_over_rms: (6,) their ratio: above 1 the claims are wider than the errors.
@@ -62,7 +62,7 @@ class NormalisedErrors:
         histogram: (6, len(BIN_EDGES) - 1) counts of e / σ.
         reliability: (len(CONFIDENCES), 6) share of the errors within the interval that should hold that share.
         nees: mean of eᵀ·C⁻¹·e per axis, 1 if the claims hold.
-        nees_bounds: between which it lies in `BOUNDS` of all evaluations, if they do.
+        nees_bounds: interval that holds `nees` in the share `BOUNDS` of all evaluations, if the claims hold.
     """
 
     judged: int
@@ -80,7 +80,7 @@ class NormalisedErrors:
 
 
 def normalise(claims: Claims, independent: int) -> NormalisedErrors:
-    """The figures of some claims, of which `independent` share no frame (at most all of them count)."""
+    """The figures of some claims, of which `independent` share no frame (capped at their number)."""
     errors, covariances = claims.errors, claims.covariances
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     known = np.isfinite(sigma)
@@ -108,7 +108,7 @@ def normalise(claims: Claims, independent: int) -> NormalisedErrors:
 
 
 def within(share: float) -> float:
-    """So many standard deviations about the mean hold this share of a normal distribution."""
+    """How many standard deviations about the mean hold this share of a normal distribution."""
     return NormalDist().inv_cdf(0.5 + 0.5 * share)
 
 
@@ -119,7 +119,7 @@ def of_outcomes(outcomes: Sequence[Outcome]) -> Claims:
 
 
 def of_differences(outcomes: Sequence[tuple[Outcome, Outcome]]) -> Claims:
-    """Differences of results that share no frame: the variances add up."""
+    """Differences of results that share no frame, so their variances add up."""
     differences: list[tuple[NDArray[np.float64], NDArray[np.float64]] | None] = []
     for a, b in outcomes:
         first, second = claimed(a), claimed(b)
@@ -131,7 +131,7 @@ def of_differences(outcomes: Sequence[tuple[Outcome, Outcome]]) -> Claims:
 
 
 def gathered(results: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]] | None]) -> Claims:
-    """Claims from error (6,) and covariance (6, 6) of each result; None was refused."""
+    """Claims from error (6,) and covariance (6, 6) of each result; None stands for a refused one."""
     told = [result for result in results if result is not None]
     return Claims(
         errors=np.array([error for error, _ in told]).reshape(-1, 6),
@@ -141,7 +141,7 @@ def gathered(results: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]] |
 
 
 def claimed(outcome: Outcome) -> NDArray[np.float64] | None:
-    """(6, 6) what an accepted outcome claims; None of any other, or where it claims nothing at all."""
+    """The covariance (6, 6) that an outcome claims; None if it was not accepted or claims nothing at all."""
     estimate = outcome.trial.estimate
     if estimate is None or not outcome.accepted:
         return None
@@ -150,8 +150,8 @@ def claimed(outcome: Outcome) -> NDArray[np.float64] | None:
 
 
 def covariance_of(estimate: Estimate) -> NDArray[np.float64]:
-    """(6, 6) from the standard deviations of an estimate, whose axes count as independent; NaN on axes that were not
-    solved."""
+    """Covariance (6, 6) from the standard deviations of an estimate, taking axes as independent; NaN on axes that were
+    not solved."""
     sigma = np.where(estimate.solved, estimate.sigma, np.nan)
     known = np.isfinite(sigma)
     covariance = np.diag(sigma**2)
@@ -160,7 +160,7 @@ def covariance_of(estimate: Estimate) -> NDArray[np.float64]:
 
 
 def _nees(errors: NDArray[np.float64], covariances: NDArray[np.float64], known: NDArray[np.bool_]) -> tuple[float, int]:
-    """Mean NEES per axis, NaN of none, and the number of axes of all results together."""
+    """Mean NEES per axis (NaN without a claim), and the number of claimed axes over all results."""
     total, axes = 0.0, 0
     for error, covariance, of in zip(errors, covariances, known, strict=True):
         if of.any():
@@ -170,7 +170,7 @@ def _nees(errors: NDArray[np.float64], covariances: NDArray[np.float64], known: 
 
 
 def _bounds(dof: int) -> tuple[float, float]:
-    """Of a mean of χ² per degree of freedom."""
+    """Interval of a mean of χ² per degree of freedom."""
     if dof < 1:
         return (float("nan"), float("nan"))
     outside = 0.5 * (1.0 - BOUNDS)
@@ -184,12 +184,12 @@ def _histogram(values: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 UNKNOWN_SHARE = 0.1
-"""An axis that takes more than this share of its length from an axis of which nothing is claimed claims nothing, too:
-less is a lever of parallel cameras, whose axes differ by rounding."""
+"""An axis that rests by more than this share of its length on an axis without a claim has no claim either. Smaller
+shares come from parallel cameras, whose axes differ by rounding."""
 
 
 def carried(covariance: NDArray[np.float64], jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6, 6) J·C·Jᵀ, with NaN on the axes that rest upon one of which nothing is claimed."""
+    """(6, 6) J·C·Jᵀ, with NaN on the axes that rest on an axis without a claim."""
     unknown = ~np.isfinite(np.diagonal(covariance))
     moved = jacobian @ np.where(np.isfinite(covariance), covariance, 0.0) @ jacobian.T
     spoiled = np.sqrt((jacobian**2 * unknown).sum(axis=1)) > UNKNOWN_SHARE

@@ -1,8 +1,8 @@
-"""Outlines of near things as a LiDAR tells them: its range edges, one scan line joined to the next.
+"""Outlines of near objects as a LiDAR sees them: its range edges, joined from one scan line to the next.
 
-What a person compares with the image is a line, not a dot: the side of a car, a pole, the corner of a house. A range
-edge is joined to the nearest one of the scan line above if that is as far away and in nearly the same direction; what
-is joined to nothing, foliage mostly, is no outline.
+A person compares lines with the image, not dots: the side of a car, a pole, the corner of a house. A range edge is
+joined to the nearest one on the scan line above if both are equally far away and in nearly the same direction. A range
+edge that is joined to nothing, mostly in foliage, belongs to no outline.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from coec.geometry.edges.range_edges import range_edges
 from coec.geometry.projection import project
 
 NEXT_LINE_RAD = (radians(0.05), radians(2.2))
-"""Elevations between a range edge and the one above it: more than the noise of one scan line, no more than the spacing
-of a LiDAR of 16 beams (data sheet of the VLP-16: 2 degrees)."""
+"""Elevation from a range edge to the one above it: more than the noise of one scan line, no more than the spacing of a
+LiDAR of 16 beams (data sheet of the VLP-16: 2 degrees)."""
 
 ASIDE_RAD = radians(0.6)
-"""Azimuth between them, at most: two columns of a slow sensor."""
+"""Azimuth between the two, at most: two columns of a slow sensor."""
 
 ALIKE_SHARE = 0.03
-"""Ranges of one outline differ from line to line by no more than this share of them."""
+"""Ranges along one outline differ from line to line by no more than this share of the range."""
 
 BEND_RAD = radians(35.0)
-"""Where an outline bends by more, it ends: range edges jitter by a column, which is a quarter to half of the way to the
+"""An outline ends where it bends by more. Range edges jitter by a column, which is a quarter to half of the way to the
 next line (HDL-64: 0.17 and 0.4 degrees)."""
 
 COMPARED = 96
-"""Range edges next in azimuth that each is compared with: within `ASIDE_RAD` there are fewer, but in foliage."""
+"""Each range edge is compared with so many next in azimuth: except in foliage, fewer lie within `ASIDE_RAD`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class Outlines:
         xyz_m: (E, 3) float32, LiDAR frame, at the instant of the exposure.
         weight: (E,) float32, as `RangeEdges` has it.
         pieces: (L, 2) the lower and the upper edge of each piece of an outline.
-        outline: (L,) to which each belongs: its lowest edge.
+        outline: (L,) the outline that each piece belongs to, as the index of its lowest edge.
     """
 
     xyz_m: NDArray[np.float32]
@@ -57,14 +57,14 @@ class Outlines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Where a camera has edges: (E, 2) pixels, and (E,) whether there is a pixel that counts."""
+    """Range edges in an image: (E, 2) pixels, and (E,) whether each lies in the image and not on the mask."""
 
     uv_px: NDArray[np.float64]
     seen: NDArray[np.bool_]
 
 
 def outlines_of(pair: FramePair, rig: Rig, *, compensated: bool) -> Outlines:
-    """Those of the sweep of a pair; none where it has no jump in range."""
+    """The outlines of the sweep of a pair; none where the sweep has no jump in range."""
     found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
     # Found as measured, placed motion-compensated, as the estimator does.
     xyz_m = compensate(pair, rig, enabled=compensated, chosen=found.index) + found.shift_m
@@ -95,7 +95,7 @@ def _joined(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:
     count = len(xyz_m)
     up, down = np.full(count, -1), np.full(count, -1)
     up[below], down[above] = above, below
-    # Where an outline goes on: both pieces in about one direction.
+    # An outline goes on where both its pieces have about the same direction.
     through = np.flatnonzero((up >= 0) & (down >= 0))
     direction = np.zeros((count, 2))
     direction[below, 0] = seen.azimuth[above] - seen.azimuth[below]
@@ -106,7 +106,7 @@ def _joined(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:
     goes_on[through[cosine >= cos(BEND_RAD)]] = True
     kept = goes_on[below] | goes_on[above]
     below, above = below[kept], above[kept]
-    # The lowest edge of each: where nothing comes from below, or what comes is bent.
+    # The lowest edge of each outline: where no piece arrives from below, or the one that does bends too much.
     lowest = np.arange(count)
     for lower in below[np.argsort(seen.elevation[below], kind="stable")]:
         if goes_on[lower]:
@@ -115,8 +115,8 @@ def _joined(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def _mutual(seen: Bearings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of edges that are next to each other: of all above the one, the nearest is the other, and of all below the
-    other, the nearest is the one."""
+    """Pairs (lower, upper) of mutually nearest edges: the upper is the nearest of all above the lower, and the lower
+    the nearest of all below the upper."""
     order = np.argsort(seen.azimuth, kind="stable")
     azimuth, elevation, range_m = seen.azimuth[order], seen.elevation[order], seen.range_m[order]
     lower, upper, apart = [], [], []
@@ -139,6 +139,6 @@ def _mutual(seen: Bearings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _nearest(group: NDArray[np.int64], distance: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Of each group the index with the least distance."""
+    """The index with the least distance in each group."""
     by_distance = np.lexsort((distance, group))
     return by_distance[np.unique(group[by_distance], return_index=True)[1]]

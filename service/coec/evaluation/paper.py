@@ -1,7 +1,7 @@
 """The published experiments on the method itself (Borer et al. 2023, sections 4.2 to 4.4), on any recording.
 
-They use mutual information alone and the paper's own classifier, equation (2), so that what is new can be held against
-them.
+They use mutual information alone and the paper's own classifier, equation (2), so that what is new here can be compared
+with them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MOVES_DEG = (0.0, 1.0, 3.0)
 """Errors of the extrinsic at which the figures are taken, degrees: those of the paper."""
 
 FALSE_ALARM_RATE = 0.01
-"""Share of right poses that each of the three limits may refuse, a third each."""
+"""Share of right poses that the three limits together may refuse, a third each."""
 
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
@@ -82,5 +82,5 @@ def learned(figures: Sequence[Figures]) -> PaperLimits:
 
 
 def slices(count: int, length: int) -> list[list[int]]:
-    """Indices of neighbouring pairs: every run of `length` of `count`, in order."""
+    """Indices of neighbouring pairs: every run of `length` out of `count`, in order."""
     return [list(range(first, first + length)) for first in range(max(count - length + 1, 1))]

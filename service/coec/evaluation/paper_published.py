@@ -1,5 +1,5 @@
-"""The figures of Borer, Tschirner, Ölsner and Milz, CVPR-W 2023, beside which ours stand: KITTI-360 drive 0000, raw
-fisheye, MiDaS `dpt_beit_large_512`; run times on a 12-core Jetson Orin."""
+"""The published figures of Borer, Tschirner, Ölsner and Milz, CVPR-W 2023, to compare ours with: KITTI-360 drive 0000,
+raw fisheye, MiDaS `dpt_beit_large_512`; run times on a 12-core Jetson Orin."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ FLAGGED = {1.0: 0.998, 3.0: 1.0}
 """Share of wrong extrinsics that equation (2) flags, by the degrees they are off; 50 frames."""
 
 FAR_RUNS, FAR_HITS = 100, 36
-"""Runs from 25° away with 25 frames, and those that end within 0.5°; all of them are classified correctly."""
+"""Runs from 25° away with 25 frames, and how many end within 0.5°; all runs are classified correctly."""
 
 ERRORS_DEG = {
     5.0: ((0.129, 0.117), (-0.010, 0.151), (-0.118, 0.175)),

@@ -23,7 +23,7 @@ FRAME_COUNTS = (5, 25, 50)
 """Those of the paper."""
 
 REPEATS, SOLVES = 20, 3
-"""Runs of which the fastest counts: what else the machine does only ever adds."""
+"""Runs of which the fastest counts, because other load on the machine only ever adds time."""
 
 START = np.array([radians(3.0), radians(-3.0), radians(2.6), 0.0, 0.0, 0.0])
 """5.0° from the source's calibration, about all three axes."""
@@ -31,7 +31,7 @@ START = np.array([radians(3.0), radians(-3.0), radians(2.6), 0.0, 0.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class RunTime:
-    """Of one number of frames: milliseconds of one evaluation and of one solve, depth being inferred already."""
+    """Milliseconds of one evaluation and of one solve at one number of frames, with depth inferred beforehand."""
 
     frames: int
     mi_ms: float
@@ -39,7 +39,7 @@ class RunTime:
 
 
 def run_times(source: str, configuration: CalibrationConfig, stages: Stages) -> list[RunTime]:
-    """Of every number of frames that the source has; of all it has, where it has fewer than the least.
+    """Run times for each of `FRAME_COUNTS`; a count that the source does not reach is replaced by all its frames.
 
     Raises:
         CoecError: the source cannot be read, or cannot be solved.

@@ -1,7 +1,7 @@
-"""Where in the pictures of a window two extrinsics differ most, for whoever is to see which of them is right.
+"""Where in the pictures of a window two extrinsics differ most, so that a person can see which of them is right.
 
-A shift along an outline cannot be seen, nor one where no outline is: what counts is the area that outlines sweep
-between one extrinsic and the other.
+A shift along an outline cannot be seen, and neither can a shift where there is no outline. So what counts is the area
+that outlines sweep from one extrinsic to the other.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from coec.evaluation.outlines import Outlines, drawn_at, outlines_of
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales, Rectangle
 
 STRIDES = 4
-"""Rectangles are tried at every fourth of their width and height."""
+"""Rectangles are tried in steps of a fourth of their width and height."""
 
 UNTOLD = 0.05
-"""What is swept counts so much, standard deviations, where the image tells nothing: of two wrong extrinsics neither has
+"""Worth of a swept area, standard deviations, where the image tells nothing: if both extrinsics are wrong, neither puts
 outlines on edges."""
 
 LEAST_LENGTH_PX = 1e-9
 """Shorter pieces have no direction."""
 
 FRAMES = 12
-"""Pairs of a window that are looked at, at most, evenly chosen: a second of work on a large sweep."""
+"""Most pairs of a window that are looked at, evenly chosen: a second of work on a large sweep."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,12 +36,12 @@ class Swept:
     """What the pieces (L,) of the outlines of a pair sweep between two extrinsics.
 
     Attributes:
-        middle_px: (L, 2) in the middle between the two.
-        length_px: (L,) there.
-        across_px: (L,) the shift across the piece.
-        area_px2: (L,) swept, weighted as range edges are.
-        strength: (L, 2) of the image's edges under the whole outline at the one and at the other, in standard
-            deviations from their mean.
+        middle_px: (L, 2) the middle of the piece half-way between the two.
+        length_px: (L,) its length there.
+        across_px: (L,) its shift, measured across it.
+        area_px2: (L,) the area it sweeps, weighted as range edges are.
+        strength: (L, 2) of the image's edges under its whole outline, at the one extrinsic and at the other, in
+            standard deviations from their mean.
     """
 
     middle_px: NDArray[np.float64]
@@ -52,20 +52,20 @@ class Swept:
 
     @property
     def worth(self) -> NDArray[np.float64]:
-        """(L,) the area times how clearly the image tells the two apart, whichever it prefers, px² · σ². The square:
-        one clear outline shows more than many vague ones."""
+        """(L,) the area times the square of how clearly the image tells the two apart, px² · σ², whichever it prefers.
+        Squared, because one clear outline shows more than many vague ones."""
         told = np.abs(self.strength[:, 0] - self.strength[:, 1])
         return self.area_px2 * (UNTOLD + np.where(self.strength.max(axis=1, initial=0.0) > 0.0, told, 0.0)) ** 2
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A part of an image, and of what is swept there, weighted by worth.
+    """A part of an image, and figures of what is swept there, weighted by worth.
 
     Attributes:
-        worth: in all, px² · σ².
+        worth: the sum, px² · σ².
         across_px: the median shift across outlines.
-        strength: of the image's edges under them at the one and at the other extrinsic, standard deviations.
+        strength: of the image's edges under the outlines, at the one extrinsic and at the other, standard deviations.
     """
 
     part: Rectangle
@@ -76,14 +76,14 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """The most telling ones of one pair of a window, the best first; none where it has no outline in view.
+    """The most telling places of one pair of a window, the best first; none where no outline is in view.
 
     Attributes:
         index: of the pair.
         outlines: its range edges.
         frames: how many pairs were looked at.
-        strength: of the image's edges under all outlines of all of them, chosen or not, at the one and at the other
-            extrinsic, standard deviations; NaN without an outline.
+        strength: of the image's edges under all outlines of all pairs looked at, at the one extrinsic and at the other,
+            standard deviations; NaN without an outline.
     """
 
     index: int
@@ -95,15 +95,15 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """Of range edges in the image: the median and the largest, pixels."""
+    """Shift of range edges in the image: the median and the largest, pixels."""
 
     median_px: float
     largest_px: float
 
 
 def swept(outlines: Outlines, edges: NDArray[np.int8], rig: Rig, T_one: Matrix4, T_other: Matrix4) -> Swept:
-    """Between two extrinsics (4, 4), where both have the outline in the image; `edges` (height, width) is what
-    `EdgePyramid.sharp` has of it."""
+    """What outlines sweep between two extrinsics (4, 4), where both put them into the image; `edges` (height, width) is
+    `EdgePyramid.sharp` of the image."""
     one, other = drawn_at(outlines, rig, T_one), drawn_at(outlines, rig, T_other)
     in_both = (one.seen & other.seen)[outlines.pieces].all(axis=1)
     lower, upper = outlines.pieces[in_both].T
@@ -125,7 +125,7 @@ def swept(outlines: Outlines, edges: NDArray[np.int8], rig: Rig, T_one: Matrix4,
 def _under_outlines(
     edges: NDArray[np.int8], uv_px: NDArray[np.float64], of_outline: NDArray[np.int64], length: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Of each outline the mean strength of the image's edges under its pieces, standard deviations."""
+    """Mean strength of the image's edges under the pieces of each outline, standard deviations."""
     columns, rows = np.rint(uv_px).astype(np.int64).T
     at = edges[np.clip(rows, 0, edges.shape[0] - 1), np.clip(columns, 0, edges.shape[1] - 1)]
     strength = np.where(at == VOID, 0.0, at / STRENGTH_STEPS)
@@ -144,8 +144,8 @@ def places(
     *,
     compensated: bool,
 ) -> Places:
-    """The pair, and at most `count` rectangles of (width, height) `size_px` in its image that do not overlap, in which
-    two extrinsics (4, 4) differ most.
+    """The pair on which two extrinsics (4, 4) differ most, and at most `count` rectangles of its image, of (width,
+    height) `size_px` and without overlap, in which they do.
 
     Raises:
         DecodeError: an image cannot be decoded.
@@ -206,7 +206,7 @@ def _largest(seen: Swept, image_px: tuple[int, int], size_px: tuple[int, int], c
         strength = weight @ seen.strength[inside] / weight.sum()
         across_px = _weighted_median(seen.across_px[inside], weight)
         found.append(Place(part, float(weight.sum()), across_px, (float(strength[0]), float(strength[1]))))
-        # What overlaps it would show the same once more.
+        # A rectangle that overlaps this one would show the same again.
         beside = np.abs(seen.middle_px - (part.left + width / 2, part.top + height / 2)) < (width, height)
         worth[beside.all(axis=1)] = 0.0
     return tuple(found)
@@ -215,8 +215,7 @@ def _largest(seen: Swept, image_px: tuple[int, int], size_px: tuple[int, int], c
 def _best(
     middle_px: NDArray[np.float64], area: NDArray[np.float64], image_px: tuple[int, int], size_px: tuple[int, int]
 ) -> Rectangle:
-    """The rectangle of this size with the largest sum of areas, of those that begin at every fourth of it; it lies in
-    the image."""
+    """The rectangle of this size in the image with the largest sum of `area`, tried in steps of a fourth of it."""
     steps = [max(1.0, size / STRIDES) for size in size_px]
     bins = [max(STRIDES, int(np.ceil(whole / step))) for whole, step in zip(image_px, steps, strict=True)]
     cells = np.minimum(((middle_px + 0.5) / steps).astype(np.int64), np.array(bins) - 1)
@@ -235,7 +234,7 @@ def _best(
 def _about_its_middle(
     part: Rectangle, middle_px: NDArray[np.float64], worth: NDArray[np.float64], image_px: tuple[int, int]
 ) -> Rectangle:
-    """A rectangle of the same size whose middle is that of what the other holds, as far as the image allows."""
+    """`part`, moved so that its middle is the weighted mean of what it holds, as far as the image allows."""
     inside = _within(middle_px[:, 0], part.left, part.width) & _within(middle_px[:, 1], part.top, part.height)
     u, v = worth[inside] @ middle_px[inside] / worth[inside].sum()
     left = min(max(round(u - part.width / 2), 0), image_px[0] - part.width)
@@ -244,7 +243,7 @@ def _about_its_middle(
 
 
 def _within(values: NDArray[np.float64], first: int, size: int) -> NDArray[np.bool_]:
-    """Pixels are a pixel wide: those from half a pixel before the first one's centre."""
+    """Which values lie in `size` pixels from `first` on; a pixel begins half a pixel before its centre."""
     return (values >= first - 0.5) & (values < first + size - 0.5)
 
 

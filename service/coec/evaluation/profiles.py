@@ -1,4 +1,4 @@
-"""Objectives along each axis about a pose: what a search sees of them, from afar and from near."""
+"""Objectives along each axis about a pose: what a search sees of them from afar and up close."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from coec.config import CalibrationConfig
 from coec.geometry import se3
 
 CROWDING = 1.5
-"""Power by which the points of a scan crowd about the middle: a peak of 0.2 degrees is not stepped over."""
+"""Power by which the points of a scan crowd about its middle, so that a peak of 0.2 degrees is not stepped over."""
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Half-widths of a scan, radians and metres, and how many values are taken per axis (an odd number: the pose itself
-    is among them)."""
+    """Half-widths of a scan, radians and metres, and the number of values per axis (odd, so that the pose itself is
+    among them)."""
 
     rotation_rad: float
     translation_m: float
@@ -35,7 +35,7 @@ WIDE = Span(radians(25.0), 0.6, 121)
 """What a search from the far end of the protocol (METHOD, section 2) has to cross."""
 
 NARROW = Span(radians(2.0), 0.1, 81)
-"""The peaks: that of mutual information is degrees wide, that of the edges a fraction of one."""
+"""Shows the peaks: that of mutual information is degrees wide, that of the edges a fraction of a degree."""
 
 
 class Landscape(Protocol):
@@ -63,7 +63,7 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Scans of one objective from afar and from near, one per axis each."""
+    """Wide and narrow scans of one objective, one of each per axis."""
 
     wide: tuple[Scan, ...]
     narrow: tuple[Scan, ...]
@@ -81,8 +81,8 @@ class ObjectiveLandscape:
 
 
 def landscapes(sight: Sight, config: CalibrationConfig) -> dict[str, Landscape]:
-    """What the methods see in a window, by name: the fused objective, its two witnesses alone (`mi` is the paper's
-    objective, too), and the objective of the configuration if it is another.
+    """The objectives on a window, by name: the fused one, its two witnesses alone (`mi` is also the paper's objective),
+    and the configured one if it is another.
 
     Raises:
         CalibrationError: the window has no edges or no depth.
@@ -110,7 +110,7 @@ def scan(landscape: Landscape, centre: Matrix4, axes: int, span: Span) -> tuple[
 def views(
     named: Mapping[str, Landscape], centre: Matrix4, axes: int, heard: Callable[[int, str], None]
 ) -> dict[str, Views]:
-    """Every landscape from afar and from near; `heard(done, name)` counts the landscapes."""
+    """Wide and narrow scans of every landscape; `heard(done, name)` counts the landscapes."""
     seen = {}
     for done, (name, landscape) in enumerate(named.items(), start=1):
         seen[name] = Views(scan(landscape, centre, axes, WIDE), scan(landscape, centre, axes, NARROW))

@@ -1,4 +1,4 @@
-"""Who moved on rendered drives of a rig: attribution and the alarms of the pairs, of looks that were taken before."""
+"""Which sensor moved on rendered drives of a rig: attribution and alarms of the pairs, run on looks taken before."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ RULES = Rules(PolicyConfig(), TrackerConfig(), MonitorConfig(period_s=PERIOD_S, 
 
 @dataclass(frozen=True, slots=True)
 class Knock:
-    """How many of the knocked cameras of a drive are, and whether its LiDAR is."""
+    """A fault: how many of a drive's two cameras are knocked, and whether its LiDAR is."""
 
     name: str
     cameras: int = 0
     lidar: bool = False
 
     def sensors(self, drive: KnockedDrive) -> frozenset[str]:
-        """Their names."""
+        """Names of the sensors that it knocks on a drive."""
         return frozenset((*drive.cameras[: self.cameras], *((LIDAR,) if self.lidar else ())))
 
 
@@ -74,7 +74,8 @@ def _row(knock: Knock, rows: Sequence[RigDriveRow]) -> RigDrivesRow:
 
 
 def moves_of(row: RigDriveRow, knock: Knock) -> RigDriveMoves:
-    """Of one drive with one fault. Where nobody moved it is right, after 0 s, if none is ever named."""
+    """What was named on one drive with one fault. Where no sensor moved, the drive is right after 0 s if none is ever
+    named."""
     drive = KnockedDrive(row.seed - FIRST_SEED, row.camera)
     who = knock.sensors(drive)
     named_s: float | None = None if who else 0.0
@@ -100,7 +101,7 @@ def moves_of(row: RigDriveRow, knock: Knock) -> RigDriveMoves:
 
 
 def _looks_of(row: RigDriveRow, who: frozenset[str]) -> Iterator[RigLook]:
-    """Those that see the sensors where they are when these have moved."""
+    """The variant of each look in which the sensors `who` have moved."""
     taken: dict[tuple[str, int], dict[Mounts, RigLook]] = {}
     for look in row.looks:
         taken.setdefault((look.edge, look.pair_stamps_ns[-1]), {})[look.mounts] = look
@@ -111,7 +112,7 @@ def _looks_of(row: RigDriveRow, who: frozenset[str]) -> Iterator[RigLook]:
 
 
 def _told(drive: KnockedDrive, looks: Iterator[RigLook]) -> Iterator[tuple[float, frozenset[str], frozenset[str]]]:
-    """After each look: second of the drive, the sensors that are named, and the pairs that are sure of a move."""
+    """After each look: the second of the drive, the sensors named, and the pairs that have confirmed a move."""
     graph = drive.graph
     state: RigState = begun(graph)
     for edge, pose in drive.served.items():
@@ -133,7 +134,7 @@ def _told(drive: KnockedDrive, looks: Iterator[RigLook]) -> Iterator[tuple[float
 
 
 def observation_of(look: RigLook) -> Observation:
-    """The look as the detector takes it; figures that decide nothing are left out."""
+    """The look as the change detector takes it, without the figures that decide nothing."""
     offset, sigma, noise, place = (np.array(six) for six in (look.offset, look.sigma, look.noise, look.place))
     return Observation(
         stamp_ns=look.pair_stamps_ns[-1], pair_stamps_ns=look.pair_stamps_ns, metrics=(), offset=offset, sigma=sigma,

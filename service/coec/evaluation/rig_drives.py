@@ -1,7 +1,7 @@
-"""Rendered drives of a rig on which sensors are knocked: each is drawn once as the rig was built and once with the
-knocked sensors where they then are, and looked at pair by pair. Who moved is asked afterwards (`rig_drive_statistics`).
+"""Rendered drives of a rig on which sensors are knocked. Each drive is drawn twice, with the rig as it was built and
+with the knocked sensors displaced, and every pair is looked at. `rig_drive_statistics` later asks which sensor moved.
 
-Faults of one number share their street: a frame of a sensor that stands still is the same in all of them.
+All faults of one drive number share a street, so the frames of a sensor that did not move are the same in all of them.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from coec.simulation.rig_drive import RigConfig, RigDrive
 from coec.simulation.rig_instants import Instant, instants, pair_of
 
 LIDAR = "roof"
-"""Of four fisheyes and one LiDAR of 64 beams."""
+"""Name of the rig's LiDAR; the rig has four fisheyes and one LiDAR of 64 beams."""
 
 AT_S = (16.0, 22.0)
-"""Within which sensors are knocked, seconds of the drive: after two or three looks at every pair."""
+"""Sensors are knocked at a random time within these, seconds of the drive: after two or three looks at every pair."""
 
 AFTER_S = 60.5
-"""Of driving after that: as long as an alarm may take, and the last pair is begun."""
+"""Driving after the knock: as long as an alarm may take, and long enough that the last pair is begun."""
 
 STEP_RAD = radians(1.0)
 
 FIRST_SEED = 1_760_001
-"""Beyond all seeds that anything was learned on."""
+"""Beyond all seeds from which anything was learned."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class KnockedDrive:
     """A drive by its number.
 
     Attributes:
-        camera: of every camera, `fisheyeW`.
+        camera: model of every camera, `fisheyeW`.
     """
 
     number: int
@@ -77,7 +77,7 @@ class KnockedDrive:
 
     @property
     def cameras(self) -> tuple[str, str]:
-        """Which: the first alone, or both."""
+        """The cameras that may be knocked: a fault takes the first alone, or both."""
         return self._drawn[1]
 
     @cached_property
@@ -101,7 +101,7 @@ class KnockedDrive:
 
     @cached_property
     def served(self) -> dict[str, Matrix4]:
-        """(4, 4) by pair: beside the truth as far as windows are (`WINDOW`)."""
+        """Served extrinsic (4, 4) of each pair: off the truth by as much as windows are (`WINDOW`)."""
         rng = np.random.default_rng([FIRST_SEED, self.number, 1])
         return {edge.name: se3.perturb(edge.T_a_b, WINDOW * rng.normal(size=6)) for edge in self.graph.edges}
 
@@ -113,7 +113,7 @@ class KnockedDrive:
 
 
 def looked_at(drive: KnockedDrive) -> RigDriveRow:
-    """All looks of a drive; what goes wrong is the `failure`.
+    """All looks of a drive; an error becomes the row's `failure`.
 
     Raises:
         UsageError: there is no such camera.
@@ -137,7 +137,7 @@ def _looks(drive: KnockedDrive, stops: Sequence[Instant]) -> Iterator[RigLook]:
 
 
 def _looks_of(drive: KnockedDrive, camera: str, kept: list[dict[tuple[str, Mounts], SeenPair]]) -> Iterator[RigLook]:
-    """At a pair: as all sensors were built, and if one that moved is in its latest frames, with that one moved."""
+    """Looks at one pair: with all sensors as built, and with each sensor moved that has moved in its latest frames."""
     rig = drive.right.pair(camera, LIDAR).rig
     for mounts in Mounts:
         if (camera, mounts) not in kept[-1] and mounts is not Mounts.AS_BUILT:
@@ -154,8 +154,8 @@ def _looks_of(drive: KnockedDrive, camera: str, kept: list[dict[tuple[str, Mount
 
 
 def _seen(drive: KnockedDrive, instant: Instant) -> dict[tuple[str, Mounts], SeenPair]:
-    """The pairs of an instant: of every camera as all was built, and, once sensors have been knocked, of those that
-    have a knocked one."""
+    """The pairs of an instant: one of every camera with all sensors as built, and after the knock also one for each
+    knocked sensor in it."""
     right, knocked = drive.right, drive.knocked
     motions = tuple(right.message(entry) for entry in instant.motions)
     found: dict[tuple[str, Mounts], SeenPair] = {}

@@ -1,10 +1,10 @@
-"""Drawn evidence of a rig: what checks and windows of its pairs say, wrong in all the ways that real ones are.
+"""Drawn evidence of a rig: what checks and windows of its pairs say, with all the errors that real ones have.
 
-Each pair has an estimator of its own, biased, and more so in one pair than in the others; streets displace it, together
-for as long as the street lasts; single checks scatter with longer tails than the attribution believes in, are bad in
-runs, faint, late, or missing for a whole drive. Sizes are those of `commissioning.baseline`, which were measured on the
-recordings; the shares are worse than what was seen on simulated drives (`monitor.likelihood`). Looks at two LiDARs
-scatter as they do on rendered streets, and come when the service has them.
+Each pair has an estimator with a bias of its own, and one pair has a larger bias than the others. A street displaces
+all checks of a pair alike for as long as it lasts. Single checks scatter with longer tails than the attribution
+assumes; they are bad in runs, faint, late, or missing for a whole drive. Sizes are those of `commissioning.baseline`,
+measured on the recordings; the shares are worse than those seen on simulated drives (`monitor.likelihood`). Looks at
+two LiDARs scatter as on rendered streets, and come when the service would have them.
 """
 
 from __future__ import annotations
@@ -49,49 +49,50 @@ WINDOW = np.array([*np.radians([0.04, 0.03, 0.08]), 0.010, 0.015, 0.020])
 five such; translations end within some centimetres."""
 
 LENS_RAD = radians(0.02)
-"""What all windows of a camera share."""
+"""Standard deviation of the displacement that all windows of a camera share."""
 
 BUILT = np.array([radians(0.5)] * 3 + [0.02] * 3)
-"""(6,) how far sensors are from where they were meant to be."""
+"""(6,) standard deviation of sensors from where they were meant to be (rad, m)."""
 
 TAILS = 3.0
-"""Degrees of freedom of the Student distribution of checks and windows; the attribution believes in four."""
+"""Degrees of freedom of the Student distribution of checks and windows; the attribution assumes four."""
 
 STREET_S = 60.0
 """How long a street lasts, on average."""
 
 PERIODS_S = (5.0, 10.0, 15.0)
-"""Between two checks of a pair, one of these per pair and drive; after one that is flagged the next comes after the
-shortest of them, as who schedules looks puts suspicions first."""
+"""Time between two checks of a pair: one of these per pair and drive. After a flagged check the next one comes after
+the shortest of these, because the scheduler of looks puts suspicions first."""
 
 FLAGGED = 4.0
-"""Standard deviations on any axis, beyond which a check is flagged: about one in a hundred is by chance."""
+"""A check is flagged beyond so many standard deviations on any axis: about one in a hundred is flagged by chance."""
 
 LATE_S = 3.0
-"""By how much an answer may come late, at most: others overtake it."""
+"""By how much an answer may be late, at most, so that others overtake it."""
 
 BAD, BAD_LASTS, SAME, FAINT, FAINT_BAD, MISSING, BLIND = 0.02, 0.5, 0.1, 0.1, 0.5, 0.1, 0.05
-"""Shares: of checks that begin a bad run, and that continue one; of these at the very place of the one before; with
-faint edges, and those of them that are bad; without an answer; and of pairs of sensors that stand still, which have
-none in a whole drive."""
+"""Shares, in this order: checks that begin a bad run; bad checks that continue one; bad checks at exactly the place of
+the one before; checks with faint edges; faint checks that are bad; checks without an answer; and pairs of sensors that
+do not move that have no answer in a whole drive."""
 
 BIASED = 2.0
-"""Times the bias of the others that one pair of each rig has."""
+"""One pair of each rig has so many times the bias of the others."""
 
 POOR, POOREST = 0.2, 3.0
-"""Share of streets on which the looks at a pair scatter by more than on others, and by how many times at most: looks at
-right mounts with the faintest contrast lie 2.6 standard deviations of a street off (`monitor.dispersion`). Who looks
-says nothing of it."""
+"""Share of streets on which the looks at a pair scatter more than on others, and by how many times at most: looks at
+right mounts with the faintest contrast lie 2.6 standard deviations of a street off (`monitor.dispersion`). The looks
+do not report it."""
 
 CHECK_S = 4.0
-"""From the first frame of a check to its last."""
+"""Time from the first frame of a check to its last."""
 
 LIDAR_LOOK = np.array([*np.radians([0.037, 0.020, 0.015]), 0.0092, 0.0040, 0.0048])
 """(6,) standard deviation that a look at two LiDARs claims (rad, m): the median of 48 looks on six simulated streets
 (seeds 52000 to 52005), a roof LiDAR and one on each flank."""
 
 LIDAR_PERIOD_S, LIDAR_LATE_S = LidarEdgesConfig().period_s, 17.0
-"""Between two looks at two LiDARs, all of a vehicle at once, and from the first sweep of one to when it counts."""
+"""Time between two looks at two LiDARs (all LiDAR edges of a vehicle at once), and from a look's first sweep to when it
+counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +149,7 @@ FULL = _rig(
 
 
 def moved(poses: Poses, who: Sequence[str], angle_rad: float, rng: np.random.Generator) -> Poses:
-    """The poses after some sensors turned by an angle about axes of their own."""
+    """The poses after the sensors `who` turned by an angle, each about its own random axis."""
     return {
         name: se3.perturb(pose, np.concatenate([angle_rad * random_direction(rng), np.zeros(3)]))
         if name in who
@@ -158,13 +159,13 @@ def moved(poses: Poses, who: Sequence[str], angle_rad: float, rng: np.random.Gen
 
 
 def off(poses: Poses, sigma: Array, rng: np.random.Generator) -> Poses:
-    """Each sensor off by (6,) standard deviations."""
+    """The poses with each sensor off at random, by standard deviations `sigma` (6,)."""
     return {name: se3.perturb(pose, sigma * rng.normal(size=6)) for name, pose in poses.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bend:
-    """Something else that displaces one edge alone, by ξ (6,)."""
+    """Something other than a sensor's move that displaces one edge alone, by ξ (6,)."""
 
     edge: str
     xi: Array
@@ -172,7 +173,7 @@ class Bend:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Happening:
-    """What happens on a drive: sensors are elsewhere from `at_s` on, and an edge may be bent. It ends at `until_s`."""
+    """What happens on a drive: from `at_s` on sensors are elsewhere, and an edge may be bent. It ends at `until_s`."""
 
     before: Poses
     after: Poses
@@ -181,7 +182,7 @@ class Happening:
     until_s: float
 
     def where(self, edge: Edge, at_s: float) -> Array:
-        """(6,) by how much an edge is off at a time."""
+        """(6,) ξ by which an edge is off at a time."""
         poses = self.before if at_s < self.at_s else self.after
         here = se3.difference(poses[edge.a] @ se3.inverse(poses[edge.b]), edge.T_a_b)
         if self.bend is not None and edge.name == self.bend.edge and at_s >= self.at_s:
@@ -189,17 +190,17 @@ class Happening:
         return here
 
     def is_blind(self, edge: Edge, rng: np.random.Generator) -> bool:
-        """Whether nothing is seen of an edge that stays as it is."""
+        """Whether an edge has no looks in this drive; only an edge whose sensors do not move can have none."""
         still = all(np.array_equal(self.before[name], self.after[name]) for name in (edge.a, edge.b))
         return still and bool(rng.random() < BLIND)
 
 
 Heard = tuple[float, Look]
-"""When a look is known, s, and what it says."""
+"""The time at which a look becomes known, s, and the look."""
 
 
 def looks(rig: DrawnRig, drive: Happening, rng: np.random.Generator) -> list[Heard]:
-    """Of a drive, in the order in which they are known."""
+    """All looks of a drive, in the order in which they become known."""
     found: list[Heard] = []
     biased = int(rng.integers(len(rig.graph.edges)))
     lidars_at_s = float(rng.uniform(0.0, LIDAR_PERIOD_S))
@@ -212,7 +213,7 @@ def looks(rig: DrawnRig, drive: Happening, rng: np.random.Generator) -> list[Hea
 
 
 def _checks(edge: Edge, drive: Happening, biased: float, rng: np.random.Generator) -> list[Heard]:
-    """Of one pair."""
+    """Checks of one pair of a camera and a LiDAR."""
     found: list[Heard] = []
     bias = UNCOMMISSIONED_BIAS * rng.normal(size=6) * biased
     blind = drive.is_blind(edge, rng)
@@ -244,7 +245,7 @@ def _checks(edge: Edge, drive: Happening, biased: float, rng: np.random.Generato
 
 
 def _lidar_looks(edge: Edge, drive: Happening, at_s: float, rng: np.random.Generator) -> list[Heard]:
-    """At two LiDARs, the first at a time."""
+    """Looks at two LiDARs, the first of them at `at_s`."""
     found: list[Heard] = []
     bias, street = lidar_looks.BIAS * rng.normal(size=6), lidar_looks.PLACE * rng.normal(size=6)
     blind = drive.is_blind(edge, rng)
@@ -264,17 +265,17 @@ def _lidar_looks(edge: Edge, drive: Happening, at_s: float, rng: np.random.Gener
 
 
 def _student(sigma: Array, rng: np.random.Generator) -> Array:
-    """(6,) an error of these standard deviations, with long tails."""
+    """(6,) a random error with these standard deviations and long tails."""
     return np.asarray(sigma * rng.standard_t(TAILS, size=6) / np.sqrt(TAILS / (TAILS - 2.0)))
 
 
 def _varied(sigma: Array, rng: np.random.Generator) -> Array:
-    """(6,) what one look or window claims of what is usual."""
+    """(6,) the standard deviations that one look or window claims, varied about the usual ones."""
     return np.asarray(sigma * np.exp(0.3 * rng.normal(size=6)))
 
 
 def _poor(rng: np.random.Generator) -> float:
-    """Times the scatter of others that looks at one pair in a street have."""
+    """By how many times the looks at one pair in a street scatter more than usual."""
     return float(rng.uniform(1.0, POOREST)) if rng.random() < POOR else 1.0
 
 
@@ -293,10 +294,10 @@ def _look(edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool, suspe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lasting:
-    """What all windows of a rig share.
+    """Errors that all windows of a rig share.
 
     Attributes:
-        lens: (2,) by how many standard deviations the lens of each camera is displaced, down and across, by name.
+        lens: (2,) by how many standard deviations the lens of each camera is displaced, down and across; by name.
         between: (6,) bias of looks at two LiDARs, by edge.
     """
 
@@ -313,8 +314,8 @@ class Lasting:
 def windows(
     rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator, off_by_rad: float = 0.0
 ) -> dict[str, Measurement]:
-    """One window of each edge, of LiDARs a look. One of them lies beside by an angle, if that is not zero: the
-    first."""
+    """One window of each edge between a camera and a LiDAR, one look of each edge between LiDARs. The first is turned
+    from its true pose by `off_by_rad`."""
     found = {}
     for number, edge in enumerate(rig.graph.edges):
         T_a_b = poses[edge.a] @ se3.inverse(poses[edge.b])
@@ -328,10 +329,10 @@ def windows(
 
 
 def window_of(T_a_b: Matrix4, lens: Array, rng: np.random.Generator) -> Measurement:
-    """Of a camera and a LiDAR that are at (4, 4), the lens displaced by (2,) standard deviations."""
+    """A window of a camera and a LiDAR at the true pose (4, 4), the lens displaced by (2,) standard deviations."""
     sigma = _varied(WINDOW, rng)
     noise = np.diag(sigma**2)
-    # Far things tell pitch from height badly, and yaw from a shift to the side.
+    # Far objects hardly distinguish pitch from height, or yaw from a sideways shift.
     for one, other, sign in ((0, 4, 1.0), (1, 3, -1.0)):
         noise[one, other] = noise[other, one] = sign * 0.7 * sigma[one] * sigma[other]
     error = np.linalg.cholesky(noise) @ (rng.standard_t(TAILS * 2.0, size=6) / np.sqrt(1.5))
@@ -341,7 +342,7 @@ def window_of(T_a_b: Matrix4, lens: Array, rng: np.random.Generator) -> Measurem
 
 
 def _look_as_window(T_a_b: Matrix4, bias: Array, rng: np.random.Generator) -> Measurement:
-    """Of two LiDARs (4, 4)."""
+    """A look at two LiDARs at the true pose (4, 4), in the form of a window."""
     sigma = _varied(LIDAR_LOOK, rng)
     error = bias + lidar_looks.PLACE * rng.normal(size=6) + _student(sigma, rng)
     return lidar_looks.window_of(0, se3.perturb(T_a_b, error), np.diag(sigma**2))

@@ -1,5 +1,5 @@
-"""How well the pairs of a LiDAR are known right after it was knocked, by one window each and by what was known before:
-on drawn windows of rigs (`rig_evidence`)."""
+"""How well the pairs of a LiDAR are known right after it was knocked, from one window of each pair and from what was
+known before. The windows are drawn (`rig_evidence`)."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from coec.schemas.replies import Vector6
 from coec.schemas.rig import KnockedRow
 
 SEED = 18_300_002
-"""Any number that nothing was learned on."""
+"""Any number from which nothing was learned."""
 
 LIDAR = "roof"
-"""Which is knocked."""
+"""The LiDAR that is knocked."""
 
 KNOCK_RAD = radians(1.0)
 ALSO_RAD = radians(0.5)
-"""By which one of its cameras is turned as well, to see that this is noticed."""
+"""Turn of one of its cameras in a second run, to see whether the extra move is noticed."""
 
 WINDOWS, SLICE_NS = 6, 180 * NS_PER_S
-"""Of each pair before the knock, and from one to the next: a quarter of an hour of driving."""
+"""Windows of each pair before the knock, and the time from one to the next: a quarter of an hour of driving."""
 
 
 def knocked_row(rig: DrawnRig, rigs: int) -> KnockedRow:
-    """Of so many rigs. Mounts that are not knocked are shaken as much as `before` takes them to be."""
+    """Figures over `rigs` drawn rigs. Mounts that are not knocked are shaken by as much as `before` assumes."""
     of_rig, of_windows, of_pairs = np.zeros(6), np.zeros(6), np.zeros(6)
     nees: list[float] = []
     worst: list[tuple[float, float]] = []
@@ -43,7 +43,7 @@ def knocked_row(rig: DrawnRig, rigs: int) -> KnockedRow:
         rng = np.random.default_rng([SEED, number, *rig.name.encode()])
         lasting, right = Lasting.of(rig, rng), off(rig.poses, BUILT, rng)
         before = _known(rig, right, lasting, rng)
-        shaken = off(right, SHAKEN / np.sqrt(2.0), rng)  # of two sensors of an edge together `SHAKEN`
+        shaken = off(right, SHAKEN / np.sqrt(2.0), rng)  # both sensors of an edge together: `SHAKEN`
         after = moved(shaken, (LIDAR,), KNOCK_RAD, rng)
         told = _windows(rig, after, lasting, rng)
         with_before, without = estimate(rig.graph, told, before), estimate(rig.graph, told)
@@ -81,7 +81,7 @@ def _error(joint: JointEstimate, edge: str, truth: Matrix4) -> NDArray[np.float6
 
 
 def _known(rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator) -> Before:
-    """What tracks of all windows before the knock say of the pairs of the LiDAR."""
+    """What the tracks of all windows before the knock say about the pairs of the LiDAR."""
     config, tracks = TrackerConfig(), dict[str, Track]()
     for number in range(WINDOWS):
         for name, window in windows(rig, poses, lasting, rng).items():
@@ -98,6 +98,6 @@ def _known(rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generat
 
 
 def _windows(rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator) -> dict[str, Measurement]:
-    """One of each edge after the knock."""
+    """One window of each edge after the knock."""
     found = windows(rig, poses, lasting, rng)
     return {name: replace(one, stamp_ns=(WINDOWS + 1) * SLICE_NS) for name, one in found.items()}

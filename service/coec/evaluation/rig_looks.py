@@ -1,5 +1,5 @@
-"""Looks at all pairs of a rig, as the monitor takes them: every sweep and every picture is made ready once, however
-many pairs it serves, and each look becomes evidence of its edge."""
+"""Looks at all pairs of a rig, as the monitor takes them. Every sweep and every picture is prepared once, however many
+pairs use it, and each look becomes evidence for its edge."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from coec.simulation.aboard import product
 from coec.simulation.rig_drive import RigDrive
 
 PERIOD_S = 5.0
-"""Between two looks at one pair, as the monitor takes them; pairs take turns."""
+"""Time between two looks at one pair, as in the monitor; pairs take turns."""
 
 TURN_S = PERIOD_S / CHECK_PAIRS
-"""Between two instants that are drawn."""
+"""Time between two instants that are drawn."""
 
 ROWS = (0.34, 0.70)
-"""Of the pictures that are drawn: what the LiDAR sees lies between 0.40 and 0.64 of their height on a street, and a
-local mean reaches 40 pixels further."""
+"""The rows of the pictures that are drawn, as shares of their height: on a street, what the LiDAR sees lies between
+0.40 and 0.64, and a local mean reaches 40 pixels further."""
 
 TURNS = (0, 1, 3, 4)
-"""By how many instants the looks at each pair are later than those at the first: 0.8 to 1.7 s apart."""
+"""By how many instants the looks at each pair follow those at the first pair: 0.8 to 1.7 s apart."""
 
 
 def due(instants: int, pairs: Sequence[str]) -> tuple[str, ...]:
-    """Those of up to four pairs that are looked at after so many instants, with the latest `CHECK_PAIRS` of them."""
+    """Whose turn it is, of up to four pairs, after so many instants; a look takes the latest `CHECK_PAIRS` instants."""
     return tuple(
         pair
         for turn, pair in zip(TURNS, pairs, strict=False)
@@ -49,14 +49,14 @@ def due(instants: int, pairs: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPair:
-    """A pair of frames, its sweep made ready."""
+    """A pair of frames with its prepared sweep."""
 
     frames: FramePair
     sweep: PreparedSweep
 
 
 def look_at(rig: Rig, pose: Matrix4, seen: Sequence[SeenPair]) -> Observation:
-    """A look of an uncommissioned pair at `pose` (4, 4); the edges decide, so no depth is inferred.
+    """A look at an uncommissioned pair that serves `pose` (4, 4); edges alone decide, so no depth is inferred.
 
     Raises:
         CalibrationError: an image cannot be decoded.
@@ -73,7 +73,7 @@ def look_at(rig: Rig, pose: Matrix4, seen: Sequence[SeenPair]) -> Observation:
 
 
 def graph_of(drive: RigDrive, lidar: str) -> RigGraph:
-    """All cameras of a drive with one of its LiDARs, as the workshop has them; an edge has the name of its pair."""
+    """All cameras of a drive with one of its LiDARs, at their nominal mounts; each edge is named after its pair."""
     sensors = [Sensor(lidar, Kind.LIDAR), *(Sensor(camera, Kind.CAMERA) for camera in drive.cameras)]
     T_ego_lidar = inverse(drive.T_sensor_ego_nominal(lidar))
     edges = [
@@ -85,5 +85,5 @@ def graph_of(drive: RigDrive, lidar: str) -> RigGraph:
 
 @cache
 def _no_depth() -> DepthModel:
-    """Maps that come with the frames: nobody asks for them."""
+    """A depth model that is never asked: edges alone decide."""
     return open_depth(DepthConfig(model="stereo"), LimitsConfig())

@@ -1,5 +1,5 @@
-"""Are the sensors that moved named, and no others? On drawn evidence of rigs (`rig_evidence`), drive after drive; and
-how much better a rig knows its pairs than they know themselves."""
+"""Does a rig name the sensors that moved, and no others? Tried on drawn evidence (`rig_evidence`), drive after drive.
+Also: how much better a rig knows its pairs than each pair alone does."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ from coec.schemas.replies import Vector6
 from coec.schemas.rig import JointRow, MovesRow, RigMovesReport
 
 AT_S, ALLOWED_S = 90.0, 60.0
-"""When sensors move, about; and after how long they have to be named."""
+"""About when sensors move, and how soon they must be named after that, s."""
 
 STEP_RAD = radians(1.0)
 SEED = 18_300_001
-"""Any number that nothing was learned on."""
+"""Any number from which nothing was learned."""
 
 MOVED = frozenset({SensorHealth.CAMERA_MOVED, SensorHealth.LIDAR_MOVED})
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What happens on a drive: how many of which sensors turn by how much; or one pair is disturbed by so much."""
+    """What happens on a drive: how many cameras and LiDARs turn by `angle_rad`, or that one pair is disturbed by it."""
 
     name: str
     cameras: int = 0
@@ -75,20 +75,20 @@ FAULTS: tuple[tuple[DrawnRig, Fault], ...] = (
     (SINGLE, Fault("the LiDAR 1°", lidars=1)),
     (SINGLE, Fault("the camera 1°", cameras=1)),
 )
-"""Rigs and what happens to them. Of the last two rows nobody can know more than that something moved."""
+"""Rigs and what happens to them. In the last two rows it can only be known that something moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What was said on one drive: when exactly those that moved were named, seconds after the fault (None: not in
-    time), and whether ever one was that had not."""
+    """What was named on one drive: when exactly the sensors that moved were, seconds after the fault (None: not in
+    time), and whether a sensor that had not moved ever was."""
 
     delay_s: float | None
     wrong: bool
 
 
 def report(drives: int, rigs: int, heard: Callable[[str], None]) -> RigMovesReport:
-    """All rows, of so many drives each, and of so many rigs whose windows are combined; `heard` is told of each."""
+    """All rows: `drives` drives per fault, and `rigs` rigs whose windows are combined; `heard` hears of each drive."""
     return RigMovesReport(
         allowed_s=ALLOWED_S,
         moves=tuple(_row(rig, fault, drives, heard) for rig, fault in FAULTS),
@@ -116,7 +116,7 @@ def _row(rig: DrawnRig, fault: Fault, drives: int, heard: Callable[[str], None])
 
 
 def drive(rig: DrawnRig, fault: Fault, number: int) -> Drive:
-    """One drive, drawn from its number. Where no sensor moves it is right, after 0 s, if none is ever named."""
+    """One drive, drawn from its number. Where no sensor moves, the drive is right after 0 s if none is ever named."""
     rng = np.random.default_rng([SEED, number, *fault.name.encode(), *rig.name.encode()])
     cameras = [sensor.name for sensor in rig.graph.sensors if sensor.kind == "camera"]
     lidars = [sensor.name for sensor in rig.graph.sensors if sensor.kind == "lidar"]
@@ -149,7 +149,7 @@ def drive(rig: DrawnRig, fault: Fault, number: int) -> Drive:
 def _named(
     rig: DrawnRig, state: RigState, looked: Sequence[Heard], accepted: Sequence[Heard]
 ) -> Iterator[tuple[float, set[str]]]:
-    """Time, seconds, and the sensors that were named then, whenever it was asked; by looks and accepted windows."""
+    """The time, seconds, and the sensors named then, after each look or accepted window that changed the posterior."""
     told = [*((heard, after_look) for heard in looked), *((heard, after_window) for heard in accepted)]
     for (at_s, look), after in sorted(told, key=lambda one: one[0][0]):
         before, state = state, after(state, rig.graph, look)
@@ -158,7 +158,7 @@ def _named(
 
 
 def joint_row(rig: DrawnRig, rigs: int) -> JointRow:
-    """Of windows of some rigs."""
+    """How well the windows of each of `rigs` rigs combine into one estimate."""
     of_rig, of_pairs = np.zeros(6), np.zeros(6)
     nees: list[float] = []
     consistent = found = missed = 0

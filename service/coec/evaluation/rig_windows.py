@@ -1,5 +1,5 @@
-"""Windows of a drawn rig that are hurried: of a pair that suspects a move one is cut at once, and what it says counts
-beside the looks (`calibration.monitor.urgency`)."""
+"""Hurried windows of a drawn rig: when a pair suspects a move, a window is cut at once, and its result counts beside
+the looks (`calibration.monitor.urgency`)."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from coec.geometry import se3
 SLICE_S = MonitorConfig().urgent_slice_s
 
 SUSPECTED = 2
-"""Flagged looks in a row that make a pair suspect: a simulated vehicle that is looked at every five seconds does after
-nine."""
+"""Flagged looks in a row after which a pair suspects a move: a simulated vehicle that is looked at every five seconds
+suspects after nine."""
 
 TAKES_S = (3.0, 18.0)
-"""From the end of a slice to when its answer is known: a window of 25 frames takes the worker four seconds, and as many
-as four pairs of a LiDAR that was knocked wait for each other."""
+"""From the end of a slice to its answer: a window of 25 frames takes the worker four seconds, and up to four pairs of a
+knocked LiDAR wait for each other."""
 
 ACCEPTED = 0.7
-"""Share of windows that are accepted: 73 of 108 on the simulated streets of `coec sim matrix`, those by night, in rain
-and through wrong lenses among them. None of them was wrong."""
+"""Share of windows that are accepted: 73 of 108 on the simulated streets of `coec sim matrix`, including night, rain
+and wrong lenses. None of them was wrong."""
 
 
 def hurried(
     rig: DrawnRig, drive: Happening, looks: Sequence[Heard], lasting: Lasting, rng: np.random.Generator
 ) -> list[Heard]:
-    """What accepted windows say, in the order in which it is known; `looks` are those at all pairs."""
+    """Results of accepted windows, in the order in which they become known; `looks` are those at all pairs."""
     found: list[Heard] = []
     for edge in rig.graph.edges:
         if edge.name not in rig.graph.of_lidars:
@@ -44,7 +44,7 @@ def hurried(
 def _of_pair(
     edge: Edge, drive: Happening, looks: Sequence[Heard], lasting: Lasting, rng: np.random.Generator
 ) -> list[Heard]:
-    """Of one pair: no more than so many in a suspicion, one after the other."""
+    """Results for one pair: at most `TRIES` windows per suspicion, one after the other."""
     found: list[Heard] = []
     flagged, tries, known_s = 0, 0, -np.inf
     for at_s, look in looks:
@@ -58,7 +58,7 @@ def _of_pair(
         end_s = at_s + SLICE_S
         known_s = end_s + float(rng.uniform(*TAKES_S))
         begun, ended = drive.where(edge, at_s), drive.where(edge, end_s)
-        # A window that holds the move is refused.
+        # A window during which the mount moved is refused.
         if rng.random() < ACCEPTED and np.array_equal(begun, ended):
             measured = window_of(se3.perturb(edge.T_a_b, ended), lasting.lens[edge.a], rng)
             told = of_window(edge.name, measured)

@@ -1,7 +1,7 @@
 """Do two halves of one recording agree? The test of an estimator that needs no reference.
 
-The two halves share no frame and no start, so what their results differ by is noise of the estimator alone, and it must
-be as large as the standard deviations that they claim for themselves.
+The two halves share no frame and no start. So their results differ only by the noise of the estimator, and this noise
+must be as large as the standard deviations that the results claim.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SPLIT_SEED = 20_240_104
 """Any number; the first day of WACV 2024, where the protocol appeared."""
 
 COVERING_SIGMAS = 3.0
-"""A difference within so many standard deviations is covered: 99.7 % are, of a normal distribution."""
+"""A difference within so many standard deviations is covered: 99.7 % of a normal distribution are."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,14 +29,15 @@ class Halves:
     Attributes:
         splits: how many times the frames were split.
         pairs: frames in each half.
-        solved: splits with a result from both halves; the figures are those of these.
-        accepted: of them, those whose results were both accepted.
-        hits: of them, those whose results both hit the reference.
+        solved: splits with a result from both halves; all figures are of these.
+        accepted: solved splits whose results were both accepted.
+        hits: solved splits whose results both hit the reference.
         rms, largest: (6,) root mean square and largest absolute difference; NaN on axes that were not searched.
         sigma: (6,) median of the claimed standard deviation of the difference, the root of the sum of both variances;
             NaN where none is claimed.
         claimed: (6,) splits in which both halves claim one.
-        covered: (6,) share of them whose difference lies within `COVERING_SIGMAS` of it; NaN where there are none.
+        covered: (6,) share of the claimed splits whose difference lies within `COVERING_SIGMAS` claimed standard
+            deviations; NaN where none is claimed.
     """
 
     splits: int
@@ -54,7 +55,7 @@ class Halves:
 def split(available: int, trial: int) -> tuple[list[int], list[int]]:
     """Two disjoint halves of `available` indices, each ascending; of an odd number one is left out.
 
-    Seeded, so that every trial has its own and every evaluation the same.
+    Seeded by the trial, so that trials differ and evaluations repeat.
 
     Raises:
         ValueError: there are fewer than two.

@@ -1,5 +1,5 @@
 """Where the solves of an evaluation start, and on which frames: the protocol of Borer et al., WACV 2024 (METHOD,
-section 2). No random number decides a start, so that two evaluations differ by what they evaluate and nothing else.
+section 2). No random number decides a start, so that two evaluations differ only by what they evaluate.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def partners(count: int) -> NDArray[np.int64]:
     """(count,) a permutation: j = (k·i + c) mod count, with c = ⌊count/2⌋ and k the number nearest to count / golden
     ratio (the smaller of two) that is coprime to count.
 
-    Neighbouring rotations so get translations from all over the sphere, and every direction is used once.
+    So neighbouring rotations get translations from all over the sphere, and every direction is used once.
     """
     wanted = count / GOLDEN_RATIO
     coprime = [k for k in range(1, max(count, 2)) if gcd(k, count) == 1]
@@ -53,7 +53,7 @@ def partners(count: int) -> NDArray[np.int64]:
 
 
 def perturbations(count: int, rotation_rad: float, translation_m: float) -> NDArray[np.float64]:
-    """(count, 6) ξ: rotation vector R·d_i about the camera axes and translation T·d_j, j the partner of i."""
+    """(count, 6) ξ: rotation vector R·d_i about the camera axes and translation T·d_j, where j is the partner of i."""
     sphere = directions(count)
     return np.hstack([rotation_rad * sphere, translation_m * sphere[partners(count)]])
 
@@ -74,7 +74,7 @@ def frame_counts(available: int) -> list[int]:
 
 
 def subset(available: int, wanted: int, trial: int) -> list[int]:
-    """`wanted` of `available` indices, ascending, drawn without repetition: seeded, so that every trial has its own and
-    every evaluation the same."""
+    """`wanted` of `available` indices, ascending, drawn without repetition. `wanted` and `trial` seed the draw, so that
+    trials differ and evaluations repeat."""
     drawn = np.random.default_rng([SUBSET_SEED, wanted, trial]).choice(available, size=wanted, replace=False)
     return sorted(int(index) for index in drawn)

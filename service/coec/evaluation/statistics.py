@@ -2,8 +2,8 @@
 
 The figures of METHOD, section 2. Rotation and translation errors, verdicts and efforts are taken over all starts, so
 that no failure is hidden. Bias and spread per axis are taken over the hits alone: a solve that ended in another basin
-says nothing of the width of the true one, and one of them at 20 degrees would outweigh 199 good ones. How many those
-are, and how far off, is in the hit rate and in the tails.
+says nothing about the width of the true one, and one such solve at 20 degrees would outweigh 199 good ones. The hit
+rate and the tails show how many misses there are and how far off.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ HIT_RAD, HIT_M = radians(0.5), 0.20
 """A hit ends nearer than this to the reference (WACV 2024); the translation counts only where it was searched."""
 
 NOT_SOLVED = "not_solved"
-"""Stands for the stop reason of a start from which there is no estimate."""
+"""Stop reason of a start that gave no estimate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """One solve: where it started (4, 4), what came of it (None: no calibration could be computed), and seconds."""
+    """One solve: its start (4, 4), its estimate (None: no calibration could be computed), and its seconds."""
 
     start: Matrix4
     estimate: Estimate | None
@@ -41,11 +41,11 @@ class Outcome:
 
     Attributes:
         T_camera_lidar: (4, 4) where it ended; at its start if there is no estimate.
-        error: (6,) ξ from the reference to there: rotation vector (rad) and translation (m) about the camera axes.
+        error: (6,) ξ from the reference to the end: rotation vector (rad) and translation (m) about the camera axes.
         rotation_rad: the angle of the rotation error.
         translation_m: the length of the translation error.
         excess: the larger of the errors that count, over its limit: below 1 is a hit.
-        accepted: what the self-diagnosis said of it.
+        accepted: whether the verdict accepted it.
     """
 
     trial: Trial
@@ -64,7 +64,7 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Of a figure over the starts. `p95` interpolates linearly between the two nearest of the sorted values."""
+    """Spread of a figure over the starts. `p95` interpolates linearly between the two nearest sorted values."""
 
     median: float
     p95: float
@@ -83,19 +83,19 @@ class Verdicts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Statistics:
-    """Of all outcomes of an evaluation.
+    """Figures of all outcomes of an evaluation.
 
     Attributes:
         starts, hits: how many.
         rotation_rad, translation_m: errors of all starts.
         median: (6,) median error of all starts, hits or not (rad, m): where most of them went.
-        bias: (6,) mean error of the hits (rad, m): what every start has in common; NaN without a hit.
-        std: (6,) sample standard deviation of the hits about it: what is left to the start; NaN below two hits.
+        bias: (6,) mean error of the hits (rad, m): what all starts have in common; NaN without a hit.
+        std: (6,) sample standard deviation of the hits about the bias: what depends on the start; NaN below two hits.
         rms: (6,) root mean square error of the hits; NaN without a hit.
         sigma: (6,) median over the hits of the standard deviation that the estimates claim; NaN where they claim none.
         solve_s: seconds per solve, all starts.
         evaluations: of the objective per solve, of the starts with an estimate.
-        verdicts: see there.
+        verdicts: see `Verdicts`.
         stop_reasons: why searches ended, by name.
     """
 
@@ -126,10 +126,10 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class FramesPoint:
-    """Errors over several subsets of one number of frames: all of them, hits and misses.
+    """Errors over several subsets of one number of frames, hits and misses alike.
 
-    `sigma_rad` is the rotation's standard deviation as the solves claim it (median; NaN where none does): the root of
-    the sum of the variances about the three axes, to be held against the errors.
+    `sigma_rad` is the standard deviation of the rotation that the solves claim (median; NaN where none does): the root
+    of the sum of the variances about the three axes, to compare with the errors.
     """
 
     frames: int
@@ -142,7 +142,7 @@ class FramesPoint:
 
 @dataclass(frozen=True, slots=True)
 class SlicePoint:
-    """Errors over several slices of one length, seconds, with so many frames (median): hits and misses."""
+    """Errors over several slices of one length in seconds, hits and misses alike; `frames` is the median per slice."""
 
     length_s: float
     slices: int
@@ -206,7 +206,7 @@ def summarise(outcomes: Sequence[Outcome]) -> Statistics:
 
 
 def frames_point(frames: int, outcomes: Sequence[Outcome]) -> FramesPoint:
-    """What the outcomes say of windows of so many frames; at least one outcome."""
+    """Figures of windows of `frames` frames, from at least one outcome."""
     return FramesPoint(
         frames=frames,
         subsets=len(outcomes),
@@ -218,7 +218,7 @@ def frames_point(frames: int, outcomes: Sequence[Outcome]) -> FramesPoint:
 
 
 def slice_point(length_s: float, slices: Sequence[tuple[int, Sequence[Outcome]]]) -> SlicePoint:
-    """What the outcomes say of slices of one length: the frames of each, and its outcomes; at least one in all."""
+    """Figures of slices of one length, each given as its frames and outcomes; at least one outcome in all."""
     outcomes = [outcome for _, of_slice in slices for outcome in of_slice]
     return SlicePoint(
         length_s=length_s,
@@ -248,19 +248,19 @@ def spread(figures: Iterable[float]) -> Spread:
 
 
 def worst(outcomes: Sequence[Outcome]) -> int:
-    """Index of the outcome furthest from the reference, measured by the limits of a hit."""
+    """Index of the outcome furthest from the reference, in units of the limits of a hit."""
     return max(range(len(outcomes)), key=lambda index: outcomes[index].excess)
 
 
 def _claimed(hits: Sequence[Outcome]) -> NDArray[np.float64]:
-    """Median per axis of the claims that there are."""
+    """Median claim per axis, over the hits with a claim."""
     claims = np.array([hit.trial.estimate.sigma for hit in hits if hit.trial.estimate is not None]).reshape(-1, 6)
     known = [column[np.isfinite(column)] for column in claims.T]
     return np.array([np.median(column) if len(column) else np.nan for column in known])
 
 
 def _claimed_rotation_rad(outcomes: Sequence[Outcome]) -> float:
-    """Median of the claims that there are."""
+    """Median claimed standard deviation of the rotation, over the outcomes with a claim."""
     sigmas = [outcome.trial.estimate.sigma[:3] for outcome in outcomes if outcome.trial.estimate is not None]
     claims = [float(np.linalg.norm(sigma)) for sigma in sigmas if np.isfinite(sigma).all()]
     return float(np.median(claims)) if claims else float("nan")

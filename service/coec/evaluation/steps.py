@@ -1,8 +1,8 @@
-"""What a calibration says of windows within which the mount moved: knocks of known size at known times, laid into a
-recording whose pose is known.
+"""What a calibration says about windows during which the mount moved: knocks of known size at known times are applied
+to a recording whose pose is known.
 
-To move the late sweeps by S⁻¹ is to move the mount by S: exact, but for the few centimetres by which a turn about the
-camera moves the LiDAR. Sweeps are motion-compensated first, with the mount as it was.
+Moving the later sweeps by S⁻¹ is the same as moving the mount by S, but for the few centimetres by which a turn about
+the camera moves the LiDAR. Sweeps are motion-compensated first, with the mount as it was.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 
 WRONG_RAD, WRONG_SIGMAS = radians(0.3), 4.0
-"""An accepted window is wrong where it ends farther than both from where the mount is at its end."""
+"""An accepted window is wrong if its rotation is farther than both of these from the mount at the window's end."""
 
 KNOWN_TO_S = 2.0
-"""The time of a step is known where it is told to this, s."""
+"""The time of a step counts as known if it is reported to within this, s."""
 
 NS_PER_S = 1_000_000_000
 
@@ -39,8 +39,8 @@ SEED = 20_230_617
 
 @dataclass(frozen=True, slots=True)
 class Knock:
-    """A movement of the mount within a window: a turn about a drawn axis (rad) and a shift in a drawn direction (m),
-    at once between two pairs, or evenly in time from the first pair to the last."""
+    """A movement of the mount within a window: a turn about a random axis (rad) and a shift in a random direction (m),
+    either at once between two pairs or, if it creeps, evenly in time from the first pair to the last."""
 
     name: str
     turn_rad: float
@@ -69,17 +69,17 @@ KNOCKS = (
 
 @dataclass(frozen=True, slots=True)
 class TriedKnock:
-    """What was said of one window.
+    """What the calibration said about one window.
 
     Attributes:
         name: of the knock.
-        accepted: whether the window was.
-        wrong: whether it was accepted elsewhere than where the mount is at its end.
+        accepted: whether the window was accepted.
+        wrong: whether it was accepted with a pose other than that of the mount at its end.
         moved: whether it was refused because the camera moved within it.
-        off_s: how far the middle of the told interval is from the time of the knock, s; None where no time was told,
-            or there was no step.
-        told_s: length of that interval, s, and
-        holds: whether the knock lies in it; None likewise.
+        off_s: how far the middle of the reported interval is from the time of the knock, s; None where no time was
+            reported, or there was no step.
+        told_s: length of the reported interval, s; None likewise.
+        holds: whether the interval holds the knock; None likewise.
         late: share of the pairs after the knock.
     """
 
@@ -95,9 +95,9 @@ class TriedKnock:
 
 @dataclass(frozen=True, slots=True)
 class KnockRow:
-    """The windows with one knock: shares of them, and of those with a step the share whose time is known. Of those
-    whose time was told: how far off it is in the median, s, the interval that was told for it, and in which share that
-    holds it."""
+    """The windows with one knock: shares of them, and for a step the share whose time is known. Over the windows with a
+    reported time: the medians of its error, s, and of the reported interval's length, s, and the share of intervals
+    that hold the knock."""
 
     name: str
     windows: int
@@ -119,8 +119,8 @@ def try_knocks(
     knocks: Sequence[Knock],
     heard: Callable[[int], None],
 ) -> list[TriedKnock]:
-    """Solves `window`, which starts where the mount is, `trials` times with every knock (seeded), and once without one;
-    `heard(done)` counts them.
+    """Solves `window`, whose start must be the true pose, `trials` times with every knock (seeded) and once without
+    one; `heard(done)` counts the solves.
 
     Raises:
         CalibrationError: fewer than two pairs, or there is no estimate even without a knock.
@@ -130,7 +130,7 @@ def try_knocks(
     pairs, between = (_compensated(of, window, config) for of in (window.pairs, window.between))
     still = replace(window, pairs=pairs, between=between, start_known_to_rad=MOUNT_RAD)
     config = config.model_copy(update={"motion_compensation": False})
-    # Other recordings, other knocks: what many of them tell is of many.
+    # Each recording has knocks of its own, so that many recordings show many knocks.
     drawn_for = zlib.crc32(window.pairs[0].camera.image.data)
     tried: list[TriedKnock] = []
     for number, knock in enumerate(knocks):
@@ -212,12 +212,12 @@ def _try(
 
 
 def _median(told: Sequence[float | None]) -> float | None:
-    """Of what was told; None of nothing."""
+    """Median of what was reported; None if nothing was."""
     return float(np.median([one for one in told if one is not None])) if told else None
 
 
 def _compensated(pairs: Sequence[FramePair], window: Window, config: CalibrationConfig) -> tuple[FramePair, ...]:
-    """The pairs with their sweeps as they were at the exposures."""
+    """The pairs with their sweeps compensated to the instants of the exposures."""
 
     def of(pair: FramePair) -> FramePair:
         xyz_m = compensate(pair, window.rig, enabled=config.motion_compensation)
@@ -234,7 +234,7 @@ def _moved(pair: FramePair, T_camera_lidar: Matrix4, xi: NDArray[np.float64]) ->
 
 
 def _is_wrong(estimate: Estimate, truth: Matrix4) -> bool:
-    """By the angle, which every window is to tell."""
+    """Judges the rotation alone, because every window has to find it."""
     error = se3.difference(estimate.optimum.T_camera_lidar, truth)
     sigma_rad = float(np.max(estimate.sigma[:3]))
     return bool(np.linalg.norm(error[:3]) > max(WRONG_RAD, WRONG_SIGMAS * sigma_rad))
