@@ -1,4 +1,4 @@
-"""How often a right mount is accused, and how soon a wrong one: as a document, for the console and as a picture."""
+"""How often a right mount is accused, and how soon a wrong one: as a document, on the console, and as a picture."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def document_of(alarms: Alarms) -> wire.AlarmsReport:
 
 
 def show(report: wire.AlarmsReport) -> None:
-    """The tables."""
+    """Prints the tables."""
     false = console.table("stated between false alarms", "driven", "false alarms", right=range(3))
     for row in report.false:
         false.add_row(f"{row.stated_h:g} h", f"{row.driven_h:g} h", str(row.alarms))
@@ -100,6 +100,6 @@ def delay_curve(report: wire.AlarmsReport) -> bytes:
 
 
 def _spread(values: Sequence[float]) -> wire.Spread:
-    """Null where the figure is that of one that was not noticed in time."""
+    """Spread of some delays; a figure is None if the delay there is infinite, that is, not noticed in time."""
     median, p95 = (float(np.percentile(values, share, method="higher")) for share in (50, 95))
     return wire.Spread(median=number(median), p95=number(p95), max=number(max(values)))

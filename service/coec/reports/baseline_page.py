@@ -16,16 +16,16 @@ from coec.reports.page_parts import axes_table
 from coec.reports.provenance import Made
 
 CHECK_PAIRS = 6
-"""Pairs of a check, of which the spread is told."""
+"""Number of pairs in the check whose spread is shown."""
 
 
 def baselines_page(
     baselines: Mapping[str, Baseline], learned: str, sources: Sequence[str], name: str, made: Made
 ) -> Page:
-    """Every pair of a file of baselines.
+    """The page of every pair in a file of baselines.
 
     Args:
-        learned: the pair that was commissioned just now, from these `sources`.
+        learned: the pair that was just commissioned, from these `sources`.
         name: of the file.
     """
     new = baselines[learned]

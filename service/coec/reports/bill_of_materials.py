@@ -23,7 +23,7 @@ Hashes = Mapping[tuple[str, str], Sequence[str]]
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A depth network that is part of the package; `sha256` of its file, hexadecimal."""
+    """A depth network that is part of the package, with the `sha256` of its file, hexadecimal."""
 
     name: str
     sha256: str
@@ -32,8 +32,8 @@ class Network:
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """What an installation is made of: the application, the packages it needs by canonical name, the interpreter's
-    version, the networks it brings."""
+    """What an installation is made of: the application, the packages that it needs by canonical name, the interpreter's
+    version, and the networks that it brings."""
 
     application: Package
     packages: Mapping[str, Package]
@@ -42,10 +42,10 @@ class Inventory:
 
 
 def cyclonedx(inventory: Inventory, hashes: Hashes, made: datetime) -> dict[str, Any]:
-    """The document; but for `made`, the same installation gives the same one.
+    """The CycloneDX document; the same installation always gives the same one, except for `made`.
 
     Args:
-        hashes: of the archives that the packages may have been installed from; none where they are not known.
+        hashes: of the archives from which the packages may have been installed; none where they are not known.
         made: with a time zone.
     """
     application = inventory.application
@@ -107,7 +107,7 @@ def cyclonedx(inventory: Inventory, hashes: Hashes, made: datetime) -> dict[str,
 
 
 def licence_table(inventory: Inventory) -> str:
-    """The licences as Markdown: what is under which, and what packages of others have packed in."""
+    """The licences as Markdown: each package with its licence, and libraries of others that packages contain."""
     rows = [
         f"| {package.name} | {package.version} | {package.licence or NOT_STATED} |\n"
         for package in inventory.packages.values()
@@ -142,7 +142,7 @@ def names_of(libraries: Sequence[NativeLibrary]) -> list[str]:
 
 
 def _texts(package: Package) -> list[str]:
-    """Those for the whole package, not for a folder of its source."""
+    """Licence files of the whole package, without those of a folder of its source."""
     return [name for name in package.licence_files if "/" not in name]
 
 
@@ -158,7 +158,7 @@ def _component(key: str, package: Package, hashes: Hashes) -> dict[str, Any]:
     }
     archives = hashes.get((key, package.version), ())
     if archives:
-        # Of the archives for all platforms: which of them was unpacked here, no installer writes down.
+        # The archives for all platforms, because no installer records which of them it unpacked.
         links = {"type": "distribution", "url": reference, "hashes": [_sha256(archive) for archive in archives]}
         component["externalReferences"] = [links]
     if package.native:

@@ -1,4 +1,4 @@
-"""Where searches began and where they ended, on discs: places, and the discs of a page."""
+"""Discs that show where searches began and where they ended: the places of points, and the discs of a page."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from coec.reports.page.words import number
 HIT_DEG = degrees(HIT_RAD)
 
 RIMS_DEG = (1.0, 2.0, 5.0, 10.0, 20.0, 45.0, 90.0, 180.0)
-"""Radii of the target: the smallest that holds 95 % of the ends is taken, the others are drawn on its rim. One degree
-is twice the limit of a hit."""
+"""Radii of the target: the smallest that holds 95 % of the ends is taken, and ends beyond it are drawn on its rim. One
+degree is twice the limit of a hit."""
 
 LATITUDES_DEG = (45.0, 90.0, 135.0)
 """Rings on the disc of directions, from +z."""
@@ -25,7 +25,7 @@ QUARTERS = (0.25, 0.5, 0.75)
 """Rings on the target, shares of its rim."""
 
 CLEAR = 0.12
-"""A ring of the target that is nearer to that of a hit is left out: their labels would lie on each other."""
+"""A ring of the target that is closer than this to the ring of a hit is left out, so that labels do not overlap."""
 
 KINDS: Mapping[tuple[bool, bool], DotKind] = {
     (True, True): DotKind("hits, accepted", "good", "circle", full=True),
@@ -33,41 +33,41 @@ KINDS: Mapping[tuple[bool, bool], DotKind] = {
     (False, False): DotKind("misses, refused", "none", "cross", full=False),
     (False, True): DotKind("misses, accepted", "bad", "cross", full=True),
 }
-"""By hit and accepted, the worst last: they are drawn on top."""
+"""By hit and accepted; the worst come last, so that they are drawn on top."""
 
 Places = NDArray[np.float64]
 """(n, 2) angle, radians from the right counter-clockwise, and radius."""
 
 
 def start_places(unit: NDArray[np.float64]) -> Places:
-    """Of directions (n, 3), unit vectors in camera axes, on a disc of radius 1 with equal areas (Lambert): the centre
-    looks along +z (roll), the rim along -z, the middle ring lies across."""
+    """Places of directions (n, 3), unit vectors in camera axes, on an equal-area disc of radius 1 (Lambert): the centre
+    is +z (roll), the rim -z, the middle ring perpendicular to z."""
     from_z = np.arccos(np.clip(unit[:, 2], -1.0, 1.0))
     return np.column_stack([np.arctan2(unit[:, 1], unit[:, 0]), np.sin(from_z / 2.0)])
 
 
 def latitude_radius(from_z_deg: float) -> float:
-    """Of a ring on the disc of `start_places`."""
+    """Radius of a ring on the disc of `start_places`."""
     return float(np.sin(np.radians(from_z_deg) / 2.0))
 
 
 def end_places(outcomes: Sequence[Outcome], rim_deg: float) -> Places:
-    """Of ends on the target, degrees from the reference: yaw to the right and pitch upwards, as the picture moves; what
-    is beyond the rim lies on it."""
+    """Places of ends on the target, degrees from the reference: yaw to the right and pitch upwards, as the picture
+    moves; ends beyond the rim lie on it."""
     errors = np.degrees(np.array([outcome.error[:3] for outcome in outcomes]))
     angle_deg = np.linalg.norm(errors, axis=1)
     return np.column_stack([np.arctan2(errors[:, 0], errors[:, 1]), np.minimum(angle_deg, rim_deg)])
 
 
 def rim_of(outcomes: Sequence[Outcome]) -> float:
-    """See `RIMS_DEG`."""
+    """The radius of the target, degrees, see `RIMS_DEG`."""
     p95_deg = np.quantile(np.degrees([outcome.rotation_rad for outcome in outcomes]), 0.95)
     return next(rim for rim in RIMS_DEG if p95_deg <= rim)
 
 
 def bullseye(methods: Mapping[str, Sequence[Outcome]], directions: Mapping[str, NDArray[np.float64]]) -> Discs:
-    """For each method a disc of its starts by each of `directions` (title, (n, 3) unit vectors in camera axes), and a
-    target of its ends; targets have one radius, that of the worst method. A method without a name stands alone."""
+    """For each method, a disc of its starts by each of `directions` (title, (n, 3) unit vectors in camera axes), and a
+    target of its ends. All targets have the radius of the worst method. A single method may have an empty name."""
     rim_deg = max(rim_of(outcomes) for outcomes in methods.values())
     discs = []
     for method, outcomes in methods.items():

@@ -1,4 +1,4 @@
-"""What `coec calibrate` says to people: the result as it is copied, and what it rests on."""
+"""What `coec calibrate` prints for people: the result in a form to copy, and what it rests on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DIGITS = 9
 and `result.json` have all digits."""
 
 HASH_DIGITS = 12
-"""Of a network, as `coec models` shows them."""
+"""Digits of a network's hash, as in `coec models`."""
 
 NOT_COMPENSATED: Mapping[Compensation, str] = {
     Compensation.NO_EGO_MOTION: "no ego motion in the source",
@@ -39,11 +39,11 @@ def show(
     time_offset: Mapping[str, Any] | None,
     elapsed_s: Mapping[str, float],
 ) -> None:
-    """The result of a window.
+    """Prints the result of a window.
 
     Args:
-        window, result: what was calibrated, and what came of it.
-        configuration: with which it was.
+        window, result: what was calibrated, and the result.
+        configuration: with which it was calibrated.
         camera_fit, time_offset: as `--json` has them; None: not asked for.
         elapsed_s: seconds by stage.
     """
@@ -68,7 +68,7 @@ def show(
 
 
 def remarks(camera_fit: Mapping[str, Any] | None, time_offset: Mapping[str, Any] | None) -> list[str]:
-    """What else was found out, a sentence each; both as `--json` has them, None: not asked for."""
+    """What else was found out, one sentence each; both arguments as `--json` has them, None: not asked for."""
     said = []
     if camera_fit is not None:
         said.append(
@@ -81,14 +81,14 @@ def remarks(camera_fit: Mapping[str, Any] | None, time_offset: Mapping[str, Any]
 
 
 def start_of(window: Window) -> Vector6:
-    """Where the search of a window began, from the recording's own calibration: rx ry rz (deg), tx ty tz (m)."""
+    """Start of a window's search, relative to the recording's own calibration: rx ry rz (deg), tx ty tz (m)."""
     start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
     start[:3] = np.degrees(start[:3])
     return cast("Vector6", tuple(float(value) for value in start))
 
 
 def show_pose(camera_from_lidar: Transform, lidar_frame: str, camera_frame: str) -> None:
-    """The pose as one copies it into another program: a matrix that Python, YAML and JSON read as it stands."""
+    """Prints the pose in a form to copy: a matrix that Python, YAML and JSON read as it stands."""
     console.show(f"T_camera_lidar: p_camera = T · p_lidar, from frame {lidar_frame} to frame {camera_frame}, metres:")
     rows = [f"[{', '.join(f'{value + 0.0:.{DIGITS}f}' for value in row)}]" for row in camera_from_lidar.matrix]
     for before, row, after in zip(("[", " ", " ", " "), rows, (",", ",", ",", "]"), strict=True):
@@ -98,7 +98,7 @@ def show_pose(camera_from_lidar: Transform, lidar_frame: str, camera_frame: str)
 
 
 def show_written(folder: Path, written: Sequence[Path], left_out: Sequence[str] = ()) -> None:
-    """Which files a command left where, and what it left out, a sentence each."""
+    """Prints which files a command wrote and where, and what it left out, one sentence each."""
     console.show(f"written to {folder}: {', '.join(sorted(str(path.relative_to(folder)) for path in written))}")
     for sentence in left_out:
         console.show(sentence)
@@ -108,7 +108,7 @@ def settings_text(configuration: CalibrationConfig, depth_identity: str) -> str:
     """What was maximised over which axes, and where depth came from."""
     searched = "6 degrees of freedom" if configuration.search.dof == 6 else "3 degrees of freedom (rotation only)"
     model = configuration.depth.model
-    # A map that came with the frames has no hash.
+    # Maps that came with the frames have no hash.
     network = model if model == STEREO else f"{Path(model).name} (sha256 {depth_identity[:HASH_DIGITS]})"
     return f"objective {configuration.objective.kind}, {searched}, depth from {network}"
 
@@ -144,7 +144,7 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _together(result: CalibrationResult) -> str:
-    """How the errors of turns and shifts go together, where both were solved."""
+    """How the errors of turns and shifts correlate, where both were solved."""
     pairs = {"pitch and height": result.correlation_pitch_height, "yaw and side": result.correlation_yaw_side}
     told = ", ".join(f"{names} {value:+.2f}" for names, value in pairs.items() if value is not None)
     return f"; correlation of errors: {told}" if told else ""

@@ -37,9 +37,9 @@ def calibration_page(
     """The page of a result.
 
     Args:
-        start: where the search began, from the recording's own calibration: rx ry rz (deg), tx ty tz (m).
-        pictures: what was drawn of it.
-        remarks: what else was found out, a sentence each.
+        start: of the search, relative to the recording's own calibration: rx ry rz (deg), tx ty tz (m).
+        pictures: of the result.
+        remarks: what else was found out, one sentence each.
     """
     sections = (
         Section("Result", (_axes(report, start), *(Text((each,)) for each in remarks))),

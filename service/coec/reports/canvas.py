@@ -22,10 +22,10 @@ DPI = 100
 """A point of type is 1.4 px: type of 9 points, the smallest, is legible without enlarging."""
 
 LETTER_PX = 8.4
-"""Width of a letter of bold type of 10 points, on average of lines with many figures."""
+"""Average width of a letter of bold 10-point type, in lines with many figures."""
 
 BAR_SHARE = 0.3
-"""A bar of scale is at most so much of the width."""
+"""A scale bar takes at most this share of the width."""
 
 BAR_LENGTHS_PX = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -37,7 +37,7 @@ def box(figure: Figure, left: int, top: int, width: int, height: int) -> Axes:
 
 
 def scale_bar(axes: Axes, camera: Camera, part: Rectangle) -> None:
-    """A bar in the lower left corner of a part of an image, and how many pixels and degrees it is there."""
+    """Draws a scale bar in the lower left corner of a part of an image, with its length in pixels and degrees."""
     length = max((bar for bar in BAR_LENGTHS_PX if bar <= BAR_SHARE * part.width), default=BAR_LENGTHS_PX[0])
     x, y = part.left - 0.5 + 0.03 * part.width, part.top - 0.5 + 0.93 * part.height
     u, v = part.left + 0.5 * part.width, part.top + 0.5 * part.height
@@ -51,12 +51,12 @@ def scale_bar(axes: Axes, camera: Camera, part: Rectangle) -> None:
 
 
 def folded(lines: Sequence[str], width_px: int) -> list[str]:
-    """Lines of type of 10 points, none longer than so many pixels."""
+    """The lines wrapped so that none is wider than `width_px` in 10-point type."""
     return [part for line in lines for part in textwrap.wrap(line, int(width_px / LETTER_PX))]
 
 
 def bgr_of(figure: Figure) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8, as OpenCV has it."""
+    """The drawn figure, (H, W, 3) uint8 BGR."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     rgba = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]

@@ -1,4 +1,4 @@
-"""The page of `coec diagnose`: one check of an extrinsic, or how well wrong ones are seen."""
+"""The page of `coec diagnose`: one check of an extrinsic, or how well wrong ones are detected."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from coec.schemas.evaluation import DetectionReport
 from coec.schemas.replies import Reason
 
 OF_PAPER = frozenset({"mi", "f1", "f2"})
-"""Figures that are told for comparison, and decide nothing."""
+"""Figures that are shown for comparison and decide nothing."""
 
 
 def check_page(
@@ -35,15 +35,15 @@ def check_page(
     pictures: Sequence[Path],
     made: Made,
 ) -> Page:
-    """One check.
+    """The page of one check.
 
     Args:
         measured: by a solve of all pairs; None: there was none.
-        window: whose `T_camera_lidar_start` was checked.
-        pictures: files that were drawn of it.
+        window: its `T_camera_lidar_start` was checked.
+        pictures: files that show the check.
 
     Raises:
-        OutputError: a picture cannot be read any more.
+        OutputError: a picture can no longer be read.
     """
     offset, sigma = in_degrees(seen.offset), in_degrees(seen.sigma)
     slopes = {
@@ -87,7 +87,7 @@ def check_page(
 
 
 def detection_page(detection: DetectionReport, source: str, made: Made) -> Page:
-    """How well wrong extrinsics are seen on a recording."""
+    """How well wrong extrinsics are detected on a recording."""
     checks = sum(row.checks for row in detection.moves)
     sentence = f"{count(checks, 'check')} at the right extrinsic and at moved ones; see which of them are flagged."
     sections = (
@@ -124,7 +124,7 @@ def _verdict(seen: Observation, measured: Measured | None) -> Verdict:
 
 
 def _where(seen: Observation, measured: Measured | None) -> str:
-    """How far off, by what can tell it."""
+    """How far the extrinsic is off, by the solve if it can tell, else by the check."""
     near = f"The nearest place at which the edges fit is {turn_and_shift(in_degrees(np.nan_to_num(seen.offset)))}"
     if measured is None:
         return f"{near}."

@@ -1,4 +1,4 @@
-"""What `coec sim checks` says in tables."""
+"""The tables of `coec sim checks`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from coec.schemas.checks import ChecksReport, RigStatistics
 
 
 def show(report: ChecksReport) -> None:
-    """Shares of checks and drives by move, then false alarms by hours."""
+    """Prints shares of checks and drives by move, then false alarms in hours of driving."""
     for rigs in report.rigs:
         _show(rigs)
     for name, failure in report.failed.items():

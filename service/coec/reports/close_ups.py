@@ -1,8 +1,8 @@
-"""Two extrinsics side by side, enlarged where they differ most: which of them is right is seen at one glance.
+"""Two extrinsics side by side, enlarged where they differ most, so that a glance shows which of them is right.
 
-Over the grey image lie the range edges of the sweep, and lines where they make an outline: a few pixels beside the edge
-of a pole show, where ten thousand coloured points do not. Both colours are of Okabe and Ito's palette (2008): told
-apart with any colour vision, and neither occurs in a grey image.
+The range edges of the sweep are drawn over the grey image, joined by lines where they form an outline: this shows an
+offset of a few pixels from the edge of a pole, which ten thousand coloured points do not. Both colours are from Okabe
+and Ito's palette (2008), distinct in any colour vision, and neither occurs in a grey image.
 """
 
 from __future__ import annotations
@@ -30,41 +30,41 @@ from coec.reports.canvas import DPI, bgr_of, box, folded, scale_bar
 from coec.reports.instants import instant
 
 COLOURS = ("#E69F00", "#56B4E9")
-"""Of the two extrinsics: orange, sky blue."""
+"""Colours of the two extrinsics: orange, sky blue."""
 
 PLACES = 3
-"""Close-ups, at most."""
+"""Most close-ups."""
 
 NAMES = "ABC"
 
 PANEL_PX = (490, 350)
-"""Width and height of one."""
+"""Width and height of a panel."""
 
 SHOWN_PX = 20.0
-"""How far apart the two extrinsics are to be on the screen: several times the width of a line."""
+"""Wanted distance between the two extrinsics on the screen: several times the width of a line."""
 
 ENLARGED = (1.5, 10.0)
-"""At least and at most: a pixel of the image is not to fill the picture, nor the image to shrink."""
+"""Least and largest enlargement: the image must not shrink, and one pixel must not fill the picture."""
 
 OVERVIEW_PX = 340
-"""Height of the whole image, at most."""
+"""Largest height of the whole image."""
 
 GAP_PX, AXIS_PX, TITLE_PX, LINE_PX = 12, 44, 26, 20
-"""Between panels; left of and below a panel, for its axes; above it; a line of text."""
+"""Gap between panels; room left of and below a panel for its axes; room above it; height of a line of text."""
 
 SAME_PX = 0.05
 """Extrinsics that differ by less, everywhere in the image, look the same at any enlargement."""
 
 CONTRAST_SHARE = 0.3
-"""Greys of the image are kept off black and white by so much of their range, so that lines stand out on all of them."""
+"""Greys of the image keep this share of their range away from black and white, so that lines stand out on all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Caption:
-    """What the picture says of the two extrinsics.
+    """What the picture says about the two extrinsics.
 
     Attributes:
-        before, after: what they are called.
+        before, after: their names.
         sigma: (6,) standard deviations of the second one, radians and metres, NaN where there is none; None: not known.
         network: the depth network that took part; empty: none, or not known.
     """
@@ -87,10 +87,10 @@ def close_ups(
     caption: Caption = PLAIN,
     limits: LimitsConfig | None = None,
 ) -> NDArray[np.uint8]:
-    """The image of a pair, and the parts of it in which two extrinsics (4, 4) differ most, at the one and at the other.
+    """The image of a pair, and the parts of it in which two extrinsics (4, 4) differ most, drawn at each of them.
 
     Args:
-        window: with one pair at least; the most telling one is shown.
+        window: with at least one pair; the most telling pair is shown.
         compensated: whether sweeps are compensated for motion.
         limits: of images that are decoded; None: the usual ones.
 
@@ -176,8 +176,7 @@ def sentences(
 
 
 def _axes_text(apart: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> str:
-    """The shift by axis; each with its standard deviation where that is known. Translations only where there are
-    any."""
+    """The shift by axis, with its standard deviation where that is known; translations only where there are any."""
     spread = np.full(6, np.nan) if sigma is None else sigma
     told = []
     for axis, name in enumerate(("pitch", "yaw", "roll", "right", "down", "forward")):
@@ -189,7 +188,7 @@ def _axes_text(apart: NDArray[np.float64], sigma: NDArray[np.float64] | None) ->
 
 
 def _fitted(width: int, height: int, within: tuple[int, int]) -> tuple[int, int]:
-    """The largest size of this shape."""
+    """The largest size of this shape that fits `within`."""
     factor = min(within[0] / width, within[1] / height)
     return max(1, round(width * factor)), max(1, round(height * factor))
 

@@ -1,4 +1,4 @@
-"""A configuration as YAML in which every key says what it is: for templates, and for people who check one."""
+"""A configuration as YAML with a comment on every key: for templates, and for people who check a configuration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 INDENT = "  "
 COMMENT_COLUMN = 44
-"""Where the remark behind a value begins, if the value leaves room."""
+"""Column at which the comment behind a value begins, if the value leaves room."""
 
 WIDTH = 120
 
@@ -22,8 +22,8 @@ _RESERVED = {"true", "false", "null", "yes", "no", "on", "off", "y", "n"}
 
 
 def commented_yaml(model: BaseModel) -> str:
-    """Every field of the model with its value and, behind it, its description. Optional fields without a value stand
-    there as comments. `load_config` reads the text back to an equal model."""
+    """Every field of the model with its value, followed by its description. Optional fields without a value appear as
+    comments. `load_config` reads the text back to an equal model."""
     return "\n".join(_mapping(model, "")) + "\n"
 
 
@@ -56,7 +56,7 @@ def _mapping(model: BaseModel, indent: str) -> Iterator[str]:
 
 
 def _heading(value: BaseModel, remark: str, indent: str) -> Iterator[str]:
-    """What the block is for, and an empty line before the blocks at the top."""
+    """A comment on what the block is for, with an empty line before it at the top level."""
     if not indent:
         yield ""
     text = remark or " ".join((type(value).__doc__ or "").split())
@@ -86,6 +86,6 @@ def _scalar(value: Any) -> str:
         value = str(value)
     if isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _RESERVED:
         return value
-    # JSON is YAML: quoted strings, true and false, floats that read back to the same double. Only `1e+16` would read
-    # as text in YAML 1.1, and 1e16 does not occur.
+    # JSON is valid YAML: quoted strings, true and false, floats that read back to the same double. Only `1e+16` would
+    # be text in YAML 1.1, and 1e16 does not occur.
     return json.dumps(value, ensure_ascii=False)

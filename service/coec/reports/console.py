@@ -1,4 +1,4 @@
-"""How commands speak: documents and tables on standard output, progress and remarks on standard error."""
+"""How commands print: documents and tables on standard output, progress and remarks on standard error."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ STATE_STYLES = {
     "camera_moved": "bold red",
     "lidar_moved": "bold red",
 }
-"""What is not here is neither good nor bad."""
+"""A state that is not listed is neither good nor bad."""
 
 PIPE_WIDTH = 140
-"""Columns where standard output is no terminal: nothing is folded into the lines of a log."""
+"""Columns where standard output is no terminal, so that lines of a log are not folded."""
 
 
 def made(environment: Mapping[str, str], *, on_error: bool = False) -> Console:
-    """A console on standard output, or on standard error. One that is to be plain is no terminal to rich: no colours,
-    no bold, nothing that moves."""
+    """A console on standard output, or on standard error. A plain one is no terminal to rich: no colours, no bold,
+    nothing that moves."""
     width = PIPE_WIDTH if not on_error and not sys.stdout.isatty() else None
     if plain_text.wants_plain(environment):
         return Console(stderr=on_error, highlight=False, width=width, force_terminal=False, color_system=None)
@@ -60,31 +60,31 @@ def print_json(document: Any) -> None:
 
 
 def raw(text: str) -> None:
-    """What is to be a file, on standard output, as it is."""
+    """Prints text that is meant as a file to standard output, unchanged."""
     sys.stdout.write(text)
     sys.stdout.flush()
 
 
 def plain(text: str) -> str:
-    """The text, without what a terminal would obey: some of what is shown came over a network. With the signs that the
-    terminal has, so that columns stay in line."""
+    """The text without control characters that a terminal would obey, because some of it came over a network. Signs
+    that the terminal lacks are replaced here, so that columns stay in line."""
     obeyed = "".join(character if character.isprintable() or character in "\n\t" else "\ufffd" for character in text)
     return obeyed if plain_text.is_unicode(out.encoding) else plain_text.encodable(obeyed, out.encoding)
 
 
 def say(text: str) -> None:
-    """A remark, as it is, on standard error."""
+    """Prints a remark, as it is, on standard error."""
     err.print(Text(plain(text)), soft_wrap=True)
 
 
 def show(text: str, style: str = "") -> None:
-    """A line, as it is, on standard output."""
+    """Prints a line, as it is, on standard output."""
     out.print(Text(plain(text), style=style), soft_wrap=True)
 
 
 def progress(*, counted: bool = True) -> Bars:
-    """A progress display on standard error that disappears when it is done; where that is not a terminal, a line now
-    and then."""
+    """A progress display on standard error that disappears when it is done. Where standard error is not a terminal, a
+    line now and then."""
     return Bars(err, say, counted=counted)
 
 
@@ -98,19 +98,19 @@ def table(*columns: str, right: Iterable[int] = ()) -> Table:
 
 
 class _PlainTable(Table):
-    """Cells that are text are text, and no markup either."""
+    """A table whose text cells are shown as plain text, never as markup."""
 
     def add_row(self, *cells: RenderableType | None, **more: Any) -> None:
         super().add_row(*(Text(plain(cell)) if isinstance(cell, str) else cell for cell in cells), **more)
 
 
 def figure(value: float | None, digits: int = 3, sign: bool = False) -> str:
-    """A number for people; `-` where there is none, no exponent below a million."""
+    """A number for people: `-` where there is none, and no exponent below a million."""
     if value is None:
         return "-"
     if abs(value) >= 1e6:
         return f"{value:.1e}"
-    # Adding zero makes -0 of it 0.
+    # Adding zero turns -0 into 0.
     return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}"
 
 
@@ -120,7 +120,7 @@ def styled(state: str) -> Text:
 
 
 def show_verdict(result: replies.CalibrationResult) -> None:
-    """The decision, every figure beside its limit, and the reasons in words."""
+    """Prints the decision, the reasons in words, and every figure beside its limit."""
     out.print("verdict ", styled(result.verdict.decision), sep="")
     for reason in result.verdict.reasons:
         show(f"  {reason.code}: {reason.text}", "yellow")
@@ -128,7 +128,7 @@ def show_verdict(result: replies.CalibrationResult) -> None:
 
 
 def show_metrics(metrics: dict[str, replies.MetricReply]) -> None:
-    """Every figure beside the limit it was judged by."""
+    """Prints every figure beside the limit that judged it."""
     if not metrics:
         return
     figures = table("figure", "value", "limit", "", right=(1,))
@@ -138,7 +138,7 @@ def show_metrics(metrics: dict[str, replies.MetricReply]) -> None:
 
 
 def limit_of(metric: replies.MetricReply) -> tuple[str, Text]:
-    """The limit of a figure, and whether it keeps it; both empty where it has none, as before commissioning."""
+    """The limit of a figure, and whether the figure meets it; both empty without a limit, as before commissioning."""
     if metric.limit is None:
         return "", Text()
     limit = f"{'≥' if metric.at_least else '≤'} {figure(metric.limit)}"

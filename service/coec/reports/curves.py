@@ -18,11 +18,11 @@ AXIS_TITLES = ("rx pitch", "ry yaw", "rz roll", "tx right", "ty down", "tz forwa
 
 
 def landscape(curves: Mapping[str, Views], title: str) -> bytes:
-    """Each named objective along its axes about the reference: a column per axis; rotations from afar and from near,
+    """Each named objective along its axes about the reference, a column per axis: rotations from afar and from near,
     and below them translations, where they were scanned.
 
-    Units do not matter: 0 is the lowest and 1 the highest value that an objective has from afar, over all rotations, or
-    all translations.
+    Scores are scaled: 0 is the lowest and 1 the highest value of an objective from afar, over all rotations or all
+    translations.
     """
     axes_scanned = len(next(iter(curves.values())).wide)
     groups = [range(3), range(3, 6)] if axes_scanned == 6 else [range(3)]
@@ -46,8 +46,8 @@ def landscape(curves: Mapping[str, Views], title: str) -> bytes:
 
 
 def error_against_frames(points: Sequence[FramesPoint], with_translation: bool, title: str) -> bytes:
-    """Median and 95th percentile of the error over subsets, and what the solves claim, by the number of frames; the
-    share of hits below."""
+    """Median and 95th percentile of the error over subsets, and the σ that the solves claim, by the number of frames;
+    below, the share of hits."""
     frames = [float(point.frames) for point in points]
     return _errors(
         points, frames, [f"{point.frames}" for point in points], "frames in the window", with_translation, title
@@ -55,7 +55,7 @@ def error_against_frames(points: Sequence[FramesPoint], with_translation: bool, 
 
 
 def error_against_slice(points: Sequence[SlicePoint], with_translation: bool, title: str) -> bytes:
-    """The same by the length of the slice, with the number of frames in it."""
+    """Like `error_against_frames`, by the length of the slice, with the number of frames in it."""
     lengths_s = [point.length_s for point in points]
     labels = [f"{point.length_s:.3g} s\n{point.frames:g} fr." for point in points]
     return _errors(points, lengths_s, labels, "length of the slice and frames in it (median)", with_translation, title)
@@ -113,7 +113,7 @@ def _draw_errors(axes: Axes, at: Sequence[float], errors: Sequence[Spread], labe
 
 
 def _tick(axes: Axes) -> None:
-    """Plain numbers on a logarithmic axis."""
+    """Labels a logarithmic axis with plain numbers."""
     low, high = axes.get_ylim()
     ticks = [tick for tick in TICKS if low <= tick <= high]
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])

@@ -15,12 +15,12 @@ from coec.reports.curves import AXIS_TITLES
 from coec.reports.plots import png
 
 RESIDUAL_LIMIT = 0.5
-"""Ends of the colours of residual ranks: half of all points lie between the point and where the map puts it."""
+"""Residual rank at the ends of the colours: half of all points lie between a point's rank and the one by the map."""
 
 
 def joint(counts: NDArray[np.int64], title: str) -> bytes:
-    """The joint histogram (bins, bins) of the shares of a map and of the ranges. A perfect network fills the diagonal,
-    one that tells nothing fills it evenly."""
+    """The joint histogram (bins, bins) of the shares of a map and of the ranges. A perfect network fills the diagonal
+    alone; one that tells nothing fills the square evenly."""
     figure = Figure(figsize=(7.2, 6.4), layout="constrained")
     axes = figure.add_subplot()
     shown = axes.imshow(np.maximum(counts, 0.5), norm=LogNorm(), origin="lower", extent=(0, 100, 0, 100))

@@ -1,4 +1,4 @@
-"""What `coec diagnose` says of one check, in words: what is wrong, how far, what it cannot tell, and what to do."""
+"""What `coec diagnose` says about one check: what is wrong, by how much, what it cannot tell, and what to do."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from coec.calibration.monitor.change_detector import Observation
 from coec.reports import console
 
 TELLING = 2.0
-"""Standard deviations from which an axis is named as one that is off: on one axis in twenty chance does as much."""
+"""Standard deviations from which an axis is named as off: chance alone reaches this on one axis in twenty."""
 
 SEEN = 3.0
-"""Standard deviations of a check below which it would not notice that a mount has moved."""
+"""A check would not notice a move of the mount by fewer than so many of its standard deviations."""
 
 EXACT_DEG = 0.1
-"""A rotation whose standard deviation is smaller is told to a hundredth of a degree."""
+"""A rotation whose standard deviation is smaller is shown to a hundredth of a degree."""
 
 NAMES = ("pitch", "yaw", "roll", "right", "down", "forward")
-"""Of turns about, and shifts along, the axes of the camera."""
+"""Names of turns about, and shifts along, the axes of the camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What a solve of all pairs comes to, from the pose that was asked about.
+    """The result of a solve of all pairs, relative to the pose that was asked about.
 
     Attributes:
         offset, sigma: (6,) degrees and metres; σ is None on axes that were not solved.
-        accepted: whether its own figures of diagnosis let it pass, however large its σ.
-        reasons: why not, a sentence each.
-        pairs: that it saw.
+        accepted: whether its own figures of self-diagnosis let it pass, however large its σ.
+        reasons: why not, one sentence each.
+        pairs: how many it used.
     """
 
     offset: tuple[float, ...]
@@ -41,7 +41,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """`state`: right, moved, unclear, or bad_data. `sentence` says what is the case; `remarks` what it rests on, what
+    """`state`: right, moved, unclear, or bad_data. `sentence` says what was found; `remarks` say what it rests on, what
     it leaves open, and what to do."""
 
     state: str
@@ -55,9 +55,9 @@ STYLES = {"right": "bold green", "moved": "bold red", "unclear": "bold yellow", 
 def finding_of(
     seen: Observation, offset: Sequence[float], sigma: Sequence[float], measured: Measured | None = None
 ) -> Finding:
-    """Of one check; `offset` (6,) from the pose that was asked about to where the edges fit, and its standard
-    deviations, degrees and metres. A check is sure of how far a pose is off where that is little: what a solve has
-    `measured` beside a pose that it accuses comes first."""
+    """The finding of one check. `offset` (6,) leads from the pose that was asked about to where the edges fit; `sigma`
+    are its standard deviations, degrees and metres. A check knows how far a pose is off only if that is little, so for
+    a flagged pose the result that a solve has `measured` comes first."""
     if seen.causes:
         texts = tuple(f"{cause.code}: {cause.text}" for cause in seen.causes)
         advice = tuple(dict.fromkeys(cause.advice for cause in seen.causes))
@@ -91,8 +91,8 @@ def finding_of(
 
 
 def moved_text(offset: Sequence[float], sigma: Sequence[float], *, with_sigma: bool = True) -> str:
-    """The axes that are off by more than chance would have it, farthest first; if none is, the farthest. Axes without a
-    σ are not told."""
+    """The axes that are off by more than chance, farthest first; if none is, the farthest alone. Axes without a σ are
+    left out."""
     told = [
         (abs(value) / spread, axis)
         for axis, (value, spread) in enumerate(zip(offset, sigma, strict=True))
@@ -103,7 +103,7 @@ def moved_text(offset: Sequence[float], sigma: Sequence[float], *, with_sigma: b
 
 
 def _how_far(offset: Sequence[float], sigma: Sequence[float], measured: Measured | None) -> tuple[str, tuple[str, ...]]:
-    """Of a mount that moved: the sentence, and what the figures in it rest on."""
+    """For a mount that moved: the sentence, and what its figures rest on."""
     if measured is None:
         return f"mount moved: {moved_text(offset, sigma)}", (NEAREST,)
     if not measured.accepted:
@@ -133,7 +133,7 @@ NEAREST = (
 
 
 def show(finding: Finding) -> None:
-    """In its colour, the remarks below."""
+    """Prints the sentence in the colour of its state, with the remarks below."""
     console.show(finding.sentence, STYLES[finding.state])
     for remark in finding.remarks:
         console.show(f"  {remark}")

@@ -1,4 +1,4 @@
-"""Plots of the page of an evaluation: objectives about the reference, and errors over what was claimed for them."""
+"""Plots on the page of an evaluation: objectives about the reference, and errors over what was claimed for them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from coec.schemas.evaluation import NormalisedErrorsReport
 AS_IT_SHOULD_BE = "as it should be"
 
 AXES_OF = {"rotations": range(3), "translations": range(3, 6)}
-"""What shares a scale: units differ between the two."""
+"""Axes that share a scale; rotations and translations have different units."""
 
 
 def landscape(seen: Mapping[str, Views]) -> Charts:
-    """Each named objective along its axes about the reference, from afar and from near. Units do not matter: 0 is the
-    lowest and 1 the highest value that an objective has from afar, over all rotations, or all translations."""
+    """Each named objective along its axes about the reference, from afar and from near. Scores are scaled: 0 is the
+    lowest and 1 the highest value of an objective from afar, over all rotations or all translations."""
     scanned = len(next(iter(seen.values())).wide)
     return Charts(
         tuple(chart for group in AXES_OF.values() if group[0] < scanned for chart in _of_group(seen, group)), small=True
@@ -53,13 +53,13 @@ def _scans(title: str, scans: Mapping[str, Scan], scales: Mapping[str, tuple[flo
 
 
 def _unit(axis: int) -> tuple[float, str, int]:
-    """Factor from the unit within, unit and digits of what is shown."""
+    """Factor from the internal unit to the shown one, the shown unit, and its digits."""
     return (degrees(1.0), "°", 2) if axis < 3 else (100.0, "cm", 1)
 
 
 def normalised(found: NormalisedErrorsReport) -> Charts:
-    """Errors over claimed standard deviations as a histogram beside the normal distribution that they should follow,
-    and the share of errors in the intervals that should hold so many; rotations and translations apart."""
+    """A histogram of errors over claimed standard deviations beside the normal distribution that they should follow,
+    and the share of errors in intervals against the share that should lie there; rotations and translations apart."""
     told = {name: [axis for axis in group if sum(found.histogram[axis])] for name, group in AXES_OF.items()}
     return Charts(
         tuple(
@@ -103,5 +103,5 @@ def _held(found: NormalisedErrorsReport, name: str, axes: list[int]) -> Chart:
 
 
 def _steps(edges: tuple[float, ...], values: list[float]) -> list[tuple[float, float]]:
-    """A value from each edge to the next."""
+    """Points of a step line with one value from each edge to the next."""
     return [*zip(edges, values, strict=False), (edges[-1], values[-1])]

@@ -1,4 +1,4 @@
-"""The statistics of an evaluation to its wire model: degrees instead of radians, null instead of NaN."""
+"""Converts the statistics of an evaluation to wire models: degrees instead of radians, null instead of NaN."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def steps_of(tried: Sequence[TriedKnock]) -> tuple[wire.StepRow, ...]:
 
 
 def normalised_of(against: str, found: NormalisedErrors) -> wire.NormalisedErrorsReport:
-    """Normalised errors, counted from what `against` names."""
+    """Normalised errors, relative to what `against` names."""
     within = [cast("Maybe6", tuple(_numbers(row))) for row in found.coverage]
     low, high = found.nees_bounds
     return wire.NormalisedErrorsReport(
@@ -131,7 +131,7 @@ def closure_of(closure: Closure) -> wire.ClosureGroup:
 
 
 def in_degrees(rad_m: NDArray[np.float64]) -> Maybe6:
-    """(6,) radians and metres in degrees and metres, null where there is no figure."""
+    """(6,) radians and metres to degrees and metres, None where there is no figure."""
     return cast("Maybe6", tuple(_numbers(np.concatenate([np.degrees(rad_m[:3]), rad_m[3:]]))))
 
 
@@ -140,5 +140,5 @@ def _numbers(values: Iterable[float]) -> list[float | None]:
 
 
 def number(value: float) -> float | None:
-    """Null where there is no figure."""
+    """The value, or None where it is not finite."""
     return value if math.isfinite(value) else None

@@ -1,4 +1,5 @@
-"""The page of `coec evaluate`: solves from starts all around a known pose, how many came home, and how far off."""
+"""The page of `coec evaluate`: solves from starts all around a known pose, how many found it, and how far off they
+ended."""
 
 from __future__ import annotations
 
@@ -44,11 +45,11 @@ ERROR_MEANING = (
 
 
 def evaluation_page(report: EvaluationReport, ends: Sequence[Block], worst: Sequence[Block], made: Made) -> Page:
-    """One method.
+    """The page of one method.
 
     Args:
-        ends: what was drawn of where searches ended.
-        worst: likewise of the start that ended farthest from the reference.
+        ends: pictures of where searches ended.
+        worst: pictures of the start that ended farthest from the reference.
     """
     sections = [
         Section("Errors", (_spreads(report), _axes(report), Text((ERROR_MEANING,), quiet=True))),
@@ -64,8 +65,8 @@ def evaluation_page(report: EvaluationReport, ends: Sequence[Block], worst: Sequ
 
 
 def comparison_page(report: ComparisonReport, ends: Sequence[Block], made: Made) -> Page:
-    """Methods side by side, with what was drawn of where their searches ended; each has a page of its own in the folder
-    of its name."""
+    """The page of several methods side by side, with pictures of where their searches ended. Each method also has a
+    page of its own in the folder of its name."""
     rows: list[Sequence[str | Cell]] = [
         (
             Cell(name, href=f"{name}/report.html"),
@@ -100,7 +101,7 @@ def comparison_page(report: ComparisonReport, ends: Sequence[Block], made: Made)
 
 
 def detection_table(detection: DetectionReport) -> Table:
-    """Checks after moves of the extrinsic: how many of them each classifier flags."""
+    """Checks after moves of the extrinsic, and how many of them each classifier flags."""
     rows = [
         (
             row.name,
@@ -225,7 +226,7 @@ def _errors_chart(
 
 
 MOST_TICKS = 8
-"""Points of an axis that are all named; more run into each other."""
+"""Most points of an axis for which each gets a label; with more, labels would run into each other."""
 
 
 def _points(points: Sequence[FramesPoint | SlicePoint], at: Sequence[float], head: str) -> Table:

@@ -41,8 +41,7 @@ class Starts:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What a page shows of an evaluation: where searches ended, and the start that ended farthest from the
-    reference."""
+    """Blocks of an evaluation's page: where searches ended, and the start that ended farthest from the reference."""
 
     ends: tuple[Block, ...]
     worst: tuple[Block, ...]
@@ -57,8 +56,8 @@ def write(
     slices: Sequence[SlicePoint],
     heard: Callable[[int, str], None],
 ) -> Drawn:
-    """Bullseye, landscapes, errors against the amount of data where they were asked for, and the worst start beside
-    where it ended.
+    """Writes the bullseye, landscapes, errors against the amount of data where they were asked for, and the worst start
+    beside where it ended.
 
     Raises:
         OutputError: the folder or a file cannot be written.
@@ -89,7 +88,7 @@ def write(
 def write_comparison(
     folder: Path, window_id: str, of_starts: Starts, outcomes: Mapping[str, Sequence[Outcome]]
 ) -> tuple[Block, ...]:
-    """The bullseyes of all methods side by side.
+    """Writes the bullseyes of all methods side by side.
 
     Raises:
         OutputError: the folder or the file cannot be written.
@@ -101,7 +100,7 @@ def write_comparison(
 
 
 def write_normalised(folder: Path, name: str, found: Mapping[str, NormalisedErrors]) -> None:
-    """Errors over what was claimed for them, by what they are counted from: normalised.png.
+    """Writes normalised.png: errors over what was claimed for them, by what they are measured against.
 
     Raises:
         OutputError: the folder or the file cannot be written.
@@ -112,7 +111,7 @@ def write_normalised(folder: Path, name: str, found: Mapping[str, NormalisedErro
 def write_landscape(
     folder: Path, bench: Bench, title: str, heard: Callable[[int, str], None]
 ) -> Mapping[str, profiles.Views]:
-    """The fused objective and its witnesses about the reference, each by itself: profiles.png, and what is in it."""
+    """Writes profiles.png, the fused objective and its witnesses about the reference, and returns what it shows."""
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
     sight = sight_of(window, bench.depth, bench.images, bench.configuration, Silence())
     named = profiles.landscapes(sight, bench.configuration)

@@ -1,4 +1,4 @@
-"""What `coec evaluate` says in tables: for people, and starts.csv."""
+"""The tables of `coec evaluate`: for people, and starts.csv."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def verdict(outcome: Outcome) -> str:
 
 
 def csv_of(reference: Matrix4, outcomes: Sequence[Outcome]) -> str:
-    """A line per start: where it began and ended from the reference (4, 4), degrees and metres, camera axes."""
+    """A line per start: its begin and its end relative to the reference (4, 4), degrees and metres, camera axes."""
     axes = [f"{axis}_{unit}" for axis, unit in zip(console.AXES, console.UNITS, strict=True)]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -73,7 +73,7 @@ def csv_of(reference: Matrix4, outcomes: Sequence[Outcome]) -> str:
 
 
 def show_comparison(report: ComparisonReport) -> None:
-    """The methods side by side, and why some are missing."""
+    """Prints the methods side by side, and why some are missing."""
     first = next(iter(report.methods.values()))
     console.show(f"{first.window_id}: {first.pairs} pairs, {first.camera_model} camera, {first.dof} degrees of freedom")
     console.show(f"{first.starts} starts {setting(first.start_rotation_deg, first.start_translation_m)}")
@@ -93,7 +93,7 @@ def show_comparison(report: ComparisonReport) -> None:
 
 
 def show(report: EvaluationReport) -> None:
-    """The figures of one method."""
+    """Prints the figures of one method."""
     console.show(
         f"{report.window_id}: {report.pairs} pairs, {report.camera_model} camera, objective {report.objective}, "
         f"{report.dof} degrees of freedom"
@@ -128,7 +128,7 @@ def show(report: EvaluationReport) -> None:
 
 
 def _comparison(report: ComparisonReport) -> list[tuple[str, str, list[str]]]:
-    """Rows: name, unit, a figure per method."""
+    """Rows: name, unit, and one figure per method."""
     methods = list(report.methods.values())
     dof = methods[0].dof
 
@@ -193,7 +193,7 @@ def _show_experiments(report: EvaluationReport) -> None:
 
 
 def show_closure(report: ClosureReport) -> None:
-    """How two calibrations close."""
+    """Prints how two calibrations close."""
     console.show(f"A {report.source_a}\nB {report.source_b}")
     known = ", ".join(
         f"{console.figure(value)} {unit}" for value, unit in zip(report.known, console.UNITS, strict=True)
@@ -217,7 +217,7 @@ def show_closure(report: ClosureReport) -> None:
 
 
 def _show_normalised(found: NormalisedErrorsReport) -> None:
-    """Errors beside what was claimed for them."""
+    """Prints errors beside what was claimed for them."""
     console.show(f"errors against {found.against}: {found.judged} accepted, {found.refused} refused")
     columns = ("error", "rms", "largest", "σ claimed", "σ / rms", "within 1 σ", "2 σ", "3 σ")
     table = console.table(*columns, "unit", right=range(1, len(columns)))
@@ -244,7 +244,7 @@ def _show_normalised(found: NormalisedErrorsReport) -> None:
 
 
 def show_detection(detection: DetectionReport) -> None:
-    """Checks of moved extrinsics: how many of them each classifier flags."""
+    """Prints checks of moved extrinsics, and how many of them each classifier flags."""
     table = console.table("extrinsic", "checks", "flagged", "95 %", "undecided", "by equation (2)", right=range(1, 6))
     for row in detection.moves:
         between = f"{100 * row.flagged_low:.1f} to {100 * row.flagged_high:.1f} %"

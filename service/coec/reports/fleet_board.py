@@ -1,4 +1,4 @@
-"""A fleet on one screen: the most urgent pairs, and what is known of one of them."""
+"""A fleet on one screen: the most urgent pairs, and the details of one of them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from coec.reports import console
 from coec.schemas.fleet_now import FleetNow, PairNow
 
 KEYS = "↑↓ choose   r reasons   h history   o overlay   f filter   q quit"
-"""What can be pressed."""
+"""The keys that can be pressed."""
 
 
 def board(fleet: FleetNow, chosen: int, first: int, rows: int, filtered: str) -> RenderableType:
-    """Head, and `rows` of the pairs from `first` on; the one at `chosen` is marked (-1: none)."""
+    """The head, and `rows` of the pairs from `first` on; the one at `chosen` is marked (-1: none)."""
     shown = fleet.pairs[first : first + rows]
     table = console.table(
         "", "vehicle", "pair", "state", "said", "looked", "drift", "± σ", "why", "event", right=(4, 5, 6, 7)
@@ -29,7 +29,7 @@ def board(fleet: FleetNow, chosen: int, first: int, rows: int, filtered: str) ->
 
 
 def head(fleet: FleetNow, filtered: str) -> Text:
-    """The whole in a line."""
+    """The fleet in a line."""
     line = Text(f"{fleet.vehicles} vehicles, {fleet.known} pairs: ")
     for index, (state, count) in enumerate(fleet.states.items()):
         line.append(", " if index else "")
@@ -43,7 +43,7 @@ def head(fleet: FleetNow, filtered: str) -> Text:
 
 
 def detail(pair: PairNow) -> RenderableType:
-    """Everything that a last word holds."""
+    """Everything that the last word of a pair holds."""
     word = pair.word
     lines: list[RenderableType] = [
         Text.assemble(
@@ -80,7 +80,7 @@ def detail(pair: PairNow) -> RenderableType:
 
 
 def told(pair: PairNow) -> Text:
-    """The state; of who says nothing now, that it was so."""
+    """The state of a pair; for one that is silent now, its last state in brackets."""
     if pair.standing == "live":
         return console.styled(pair.word.state)
     style = console.STATE_STYLES["miscalibrated"] if pair.word.state == "miscalibrated" else "bold dim"
@@ -88,7 +88,7 @@ def told(pair: PairNow) -> Text:
 
 
 def duration(seconds: float) -> str:
-    """In the unit that people would take."""
+    """A duration in the unit that people would use."""
     for least, divisor, unit in ((172_800.0, 86_400.0, "d"), (7200.0, 3600.0, "h"), (120.0, 60.0, "min")):
         if seconds >= least:
             return f"{seconds / divisor:.0f} {unit}"

@@ -15,32 +15,32 @@ from coec.schemas.fleet import AXES, FalseAlarms, FleetChanges, FleetReport, Pai
 
 NAMES = dict(zip(AXES, ("pitch", "yaw", "roll", "right", "down", "forward"), strict=True))
 LEAST = {"deg": 0.1, "m": 0.02}
-"""Half of the least height of a plot: what is smaller is no drift, and shall not look like one."""
+"""A plot reaches at least this far to each side, so that what is too small to be a drift does not look like one."""
 
 WHERE_ALL_IS = (
     "`report.json` beside this page has them all; `coec fleet report RESULTS --sql` prints queries that ask for more."
 )
 
 DRIFTED = 1.0
-"""Urgency from which on a drift is one that a monitor has to see."""
+"""From this urgency on, a drift is large enough that a monitor has to notice it."""
 
 
 DRAWN, LISTED = 100, 1000
-"""Pairs with a plot, and pairs after them with a row: the page stays below 3 MB whatever the fleet. Others are told
-together."""
+"""Pairs with a plot, and pairs after them with a row, so that the page stays below 3 MB whatever the fleet. All others
+are summarised."""
 
 ROWS = 200
-"""Of the other tables, at most, for the same reason."""
+"""Most rows of the other tables, for the same reason."""
 
 PLOTTED_DAYS = 120
-"""Points of a plot that is 180 px wide, at most."""
+"""Most points of a plot, which is 180 px wide."""
 
 BANDS = (1.0, 0.5, 0.25, 0.1, 0.0)
-"""Urgencies from which on pairs that are not listed are counted together."""
+"""Lower ends of the bands of urgency in which pairs that are not listed are counted."""
 
 
 def page(report: FleetReport, title: str, made: Made) -> Page:
-    """The page; what vehicles call themselves is text in it."""
+    """The page; names of vehicles are text in it, never markup."""
     sections = []
     if report.changes is not None:
         sections.append(Section("Against the earlier batch", _changes(report.changes)))
@@ -69,7 +69,7 @@ def _verdict(report: FleetReport) -> Verdict:
 
 
 def sentence(report: FleetReport) -> str:
-    """The whole in a sentence or two."""
+    """The fleet in a sentence or two."""
     if report.first_ns is None or report.last_ns is None:
         return f"{report.windows} windows, none with a result."
     drifted = sum(pair.urgency >= 1.0 for pair in report.pairs)
@@ -122,7 +122,7 @@ def _changes(changes: FleetChanges) -> tuple[Block, ...]:
 
 
 def _vehicles(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
-    """The worst with a plot, more without one, and all others together."""
+    """The most urgent pairs with a plot, the next ones without, and all others summarised."""
     drift, counted = ("Urgency", "Worst axis", "Drift", "Per 30 days"), ("Windows", "Accepted", "Last window")
     drawn, listed, others = pairs[:DRAWN], pairs[DRAWN : DRAWN + LISTED], pairs[DRAWN + LISTED :]
     told = (
@@ -161,7 +161,7 @@ def _together(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
 
 
 def _left_out(total: int) -> str:
-    """What a table says of rows that it has no room for; begins with a space, or is empty."""
+    """What a table says about rows that do not fit; begins with a space, or is empty."""
     return "" if total <= ROWS else f" {ROWS} of {total} rows. {WHERE_ALL_IS}"
 
 
@@ -185,7 +185,7 @@ def _counts(pair: PairOfFleet) -> tuple[str, str, str]:
 
 
 def _plot(pair: PairOfFleet) -> str | Cell:
-    """Median and band of the worst axis over the days, about the first of them; of many days every second, third, ...
+    """Median and band of the worst axis over the days, about the first day; of many days only every second, third, ...
     and the last."""
     if pair.worst is None:
         return NONE

@@ -1,4 +1,4 @@
-"""A picture in a terminal: two pixels in a character, the upper half block and what is behind it."""
+"""A picture in a terminal: each character shows two pixels, an upper half block and its background."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from coec.adapters.images.codec import decode_bgr, probe
 from coec.config import LimitsConfig
 
 LIMITS = LimitsConfig(max_message_bytes=16 * 2**20, max_image_pixels=33_000_000)
-"""Of a picture that came over a network."""
+"""Limits of a picture that came over a network."""
 
 
 def drawn(jpeg: bytes, columns: int, rows: int) -> Text:
-    """The picture in at most so many characters, its proportions kept.
+    """The picture in at most so many characters, with its proportions kept.
 
     Raises:
-        DecodeError: it is none, or larger than a picture may be.
+        DecodeError: it cannot be decoded, or is larger than a picture may be.
     """
     pixels = decode_bgr(probe(jpeg, LIMITS), LIMITS)
     height, width = pixels.shape[:2]

@@ -1,4 +1,4 @@
-"""Who holds an extrinsic, in words: for `health` of the service, and for who asks it."""
+"""Who holds an extrinsic, in words: for `health` of the service, and for clients that ask."""
 
 from __future__ import annotations
 

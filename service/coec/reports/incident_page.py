@@ -1,5 +1,5 @@
-"""The page of a red event: what happened, what was seen, what was decided and why. Whatever a vehicle says is text in
-it."""
+"""The page of a red event: what happened, what was seen, what was decided and why. Whatever a vehicle says is shown as
+text, never as markup."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from coec.schemas.replies import (
 )
 
 MAX_PLOTS = 16
-"""Figures that are drawn; a vehicle says how many it has."""
+"""Most figures that are drawn, because a vehicle decides how many it sends."""
 
 PICTURED = {
     "before.jpg": (
@@ -62,7 +62,7 @@ PICTURED = {
 
 @dataclass(frozen=True, slots=True)
 class Story:
-    """What came; None where it did not."""
+    """What was fetched; None for what could not be."""
 
     event: EvidenceEvent
     history: HistoryReply | None
@@ -79,7 +79,7 @@ SAW = "What the camera saw: at the calibration that was served, and at the true 
 
 
 def page(story: Story, pictures: Mapping[str, bytes], made: Made) -> Page:
-    """The page; `pictures` are files beside it, by their names."""
+    """The page; `pictures` are the files beside it, by name."""
     event = story.event
     codes = ", ".join(reason.code for reason in event.reasons) or "red event"
     results = () if story.history is None else story.history.results
@@ -105,7 +105,7 @@ def page(story: Story, pictures: Mapping[str, bytes], made: Made) -> Page:
 
 
 def sentences(story: Story) -> Iterable[str]:
-    """The story in a few sentences, each of which a document in the folder bears out."""
+    """The story in a few sentences, each backed by a document in the folder."""
     event = story.event
     began = f"At {second(event.stamp_ns)} of sensor time the pair {event.pair} of {event.vehicle} turned red"
     yield f"{began} (by the vehicle's clock {second(event.wall_ns)}). {_said(event.reasons)}"
@@ -128,7 +128,7 @@ def sentences(story: Story) -> Iterable[str]:
 
 
 def sentence(report: IncidentReport) -> str:
-    """What came, in one line."""
+    """What was fetched, in one line."""
     size = sum(file.size_bytes for file in report.files) / 1e6
     verified = sum(window.in_history is True for window in report.windows)
     return (
@@ -138,7 +138,7 @@ def sentence(report: IncidentReport) -> str:
 
 
 def _verdict(story: Story) -> Verdict:
-    """What happened in its first sentence, and what to do now, which depends on whether it has ended."""
+    """What happened, by the first of `sentences`, and what to do; the tone depends on whether the event has ended."""
     ended = story.event.resolution is not None
     tone: Tone = "unsure" if ended else "bad"
     return Verdict(tone, "Over." if ended else "Red.", next(iter(sentences(story))), advice_of(story.event.reasons))
@@ -165,7 +165,7 @@ def _pictures(pictures: Mapping[str, bytes]) -> tuple[Block, ...]:
 
 
 def _timeline(event: EvidenceEvent) -> Iterable[Block]:
-    """Each figure on the same axis of time, the states as its ground; the event is a line through all."""
+    """All figures over the same time axis, with the states of health as background and the event as a line."""
     points = event.metrics
     if not points:
         yield Text(("No figures are kept of it.",), quiet=True)
@@ -240,7 +240,7 @@ def _results(results: Sequence[CalibrationResult], event: EvidenceEvent) -> Tabl
 
 
 def _refusals(results: Sequence[CalibrationResult]) -> Iterable[Text]:
-    """Why windows were refused, and the figures that did not keep their limits."""
+    """Why windows were refused, and which figures missed their limits."""
     for result in results:
         if result.verdict.decision == "accepted":
             continue

@@ -1,4 +1,4 @@
-"""Stamps as people read them: UTC, and seconds where the stamp is no date."""
+"""Stamps as people read them: in UTC, or in seconds where a stamp is no date."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ END_NS = 253_402_300_800 * NS_PER_S
 
 
 def instant(stamp_ns: int) -> str:
-    """To the millisecond: of a frame."""
+    """The stamp of a frame, to the millisecond."""
     if not _is_date(stamp_ns):
         return _bare(stamp_ns)
     beyond_ms = stamp_ns // NS_PER_MS % 1000
@@ -22,12 +22,12 @@ def instant(stamp_ns: int) -> str:
 
 
 def second(stamp_ns: int) -> str:
-    """To the second: of what happened."""
+    """The stamp of an event, to the second."""
     return f"{_date(stamp_ns):%Y-%m-%d %H:%M:%S}Z" if _is_date(stamp_ns) else _bare(stamp_ns)
 
 
 def day(stamp_ns: int) -> str:
-    """To the day."""
+    """The day of a stamp."""
     return f"{_date(stamp_ns):%Y-%m-%d}" if _is_date(stamp_ns) else _bare(stamp_ns)
 
 

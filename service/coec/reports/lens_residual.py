@@ -1,4 +1,4 @@
-"""What a camera model that was fitted to another misses of it, over the image."""
+"""How far a fitted camera model is from the model it was fitted to, over the image."""
 
 from __future__ import annotations
 
@@ -13,35 +13,34 @@ from coec.geometry.projection import project, unproject
 from coec.reports.canvas import DPI, bgr_of, box
 
 SAMPLES = 200
-"""Along the longer side of the image: a lens is a smooth function."""
+"""Samples along the longer side of the image; so few suffice because a lens is a smooth function."""
 
 ARROWS = 14
-"""Along the longer side."""
+"""Arrows along the longer side."""
 
 PICTURE_PX = (800, 620)
-"""Width and height of the image, at most."""
+"""Largest width and height of the image."""
 
 MARGIN_PX, LINE_PX, AXIS_PX, BAR_PX = 12, 20, 56, 16
-"""About the picture; a line of text; figures of an axis; the bar of colours."""
+"""Margin about the picture, height of a line of text, room for the figures of an axis, height of the colour bar."""
 
 COLOURS = "viridis_r"
 
 DECADES, LEAST_PX = 1000.0, 1e-6
-"""The scale of colours is logarithmic and ends at so much less than the largest residual; below the other one all is
-rounding."""
+"""The logarithmic colour scale spans this factor below the largest residual; below `LEAST_PX` all is rounding."""
 
 
 def residuals_px(camera: Camera, fitted: Camera, uv_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 2) by how much further right and down `fitted` puts what `camera` has at pixels (N, 2); NaN where either has
-    no pixel for it."""
+    """(N, 2) how much further right and down `fitted` puts what `camera` has at pixels (N, 2); NaN where either model
+    has no pixel for it."""
     rays, seen = unproject(camera, uv_px)
     at, has_pixel = project(fitted, rays)
     return np.where((seen & has_pixel)[:, None], at - uv_px, np.nan)
 
 
 def lens_residual(camera: Camera, fitted: Camera) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 BGR on white: the distance in pixels, and arrows in the direction from where the lens has a point
-    to where the fitted model has it."""
+    """(H, W, 3) uint8 BGR on white: the distance in pixels, and arrows from where the lens puts a point towards where
+    the fitted model puts it."""
     step = max(camera.width, camera.height) / SAMPLES
     columns, rows = (max(2, round(length / step)) for length in (camera.width, camera.height))
     u = np.linspace(0.0, camera.width - 1.0, columns)

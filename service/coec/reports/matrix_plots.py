@@ -1,4 +1,4 @@
-"""The picture of `coec sim matrix`: what errors are in the sigmas that were claimed."""
+"""The picture of `coec sim matrix`: errors in units of the claimed sigmas."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from coec.reports.plots import png
 from coec.schemas.matrix import MatrixReport, SolveStatistics
 
 REACH = 6.0
-"""Errors of more sigmas than this are drawn at the rim."""
+"""Errors beyond so many sigmas are drawn at the rim."""
 BINS = 24
 SIGMAS = np.linspace(0.0, REACH, 121)
 
 
 def normalised(report: MatrixReport) -> bytes:
-    """A row of panels per number of degrees of freedom, of its accepted windows: for each axis the histogram of errors
-    over sigmas beside the normal distribution that they should follow; last, the share within so many sigmas."""
+    """A row of panels per number of degrees of freedom, from its accepted windows: for each axis a histogram of errors
+    over sigmas beside the normal distribution that they should follow; last, the share of errors by sigmas."""
     shown = [solves for solves in report.solves if solves.accepted] or list(report.solves)
     figure = Figure(figsize=(3.3 * 7, 3.4 * max(len(shown), 1)), layout="constrained")
     figure.suptitle("error over claimed sigma, accepted windows; grey: as it should be")

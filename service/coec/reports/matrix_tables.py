@@ -1,4 +1,4 @@
-"""What `coec sim matrix` says in tables."""
+"""The tables of `coec sim matrix`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from coec.schemas.matrix import MatrixReport, SolvedWindow, SolveStatistics, Wat
 
 
 def show(report: MatrixReport) -> None:
-    """The drives one by one, then the figures over all of them."""
+    """Prints the drives one by one, then the figures over all of them."""
     for solves in report.solves:
         _show_drives(report, solves)
     for solves in report.solves:

@@ -15,10 +15,10 @@ from coec.reports.plots import png
 
 
 def normalised(found: Mapping[str, NormalisedErrors], title: str) -> bytes:
-    """A row for each, by name: left, errors over claimed standard deviations per axis; right, the share of errors in
-    the intervals that should hold so many, up to 1, 2 and 3 standard deviations.
+    """A row for each, by name: left, errors over claimed standard deviations per axis; right, the share of errors that
+    lie in an interval against the share that should, up to 1, 2 and 3 standard deviations.
 
-    Above the diagonal claims are wider than errors, below it they are too narrow.
+    Above the diagonal claims are wider than errors; below it they are too narrow.
     """
     figure = Figure(figsize=(14.0, 5.0 * len(found)), layout="constrained")
     figure.suptitle(title)

@@ -15,7 +15,7 @@ MIN_WIDTH_PX = 960
 """Narrower images are enlarged by a whole factor, so that the title is legible."""
 
 LINES = 2
-"""Of a title, at most."""
+"""Most lines of a title."""
 
 POINT_SHARE = 1 / 1200
 """Radius of a point as a share of the width: 1.2 px on 1408, so that neighbouring rings stay apart."""
@@ -46,7 +46,7 @@ def draw(
         scale: of the colours; None: that of the points in view.
 
     Returns:
-        (height', width', 3) uint8: picture, bar of ranges. Small images are enlarged by a whole factor.
+        (height', width', 3) uint8: the picture above a bar of ranges. Small images are enlarged by a whole factor.
     """
     factor = max(1, -(-MIN_WIDTH_PX // image_bgr.shape[1]))
     picture = np.asarray(np.repeat(np.repeat(image_bgr, factor, axis=0), factor, axis=1), dtype=np.uint8)
@@ -59,8 +59,8 @@ def draw(
 
 
 def titled(picture: Pixels, title: str) -> Pixels:
-    """The picture with a line above it, or two; cut off where they are too long. For one that goes out alone: on a page
-    its caption says the same."""
+    """The picture with one or two title lines above it, cut off where they are too long. For a picture that stands
+    alone; on a page its caption says the same."""
     return np.vstack([_title(picture.shape[1], title), picture])
 
 
@@ -71,7 +71,7 @@ def _stamp(
     scale: RangeScale,
     radius_px: float,
 ) -> None:
-    """A disc of its colour for every point. All pixels of all discs are written at once, far to near."""
+    """Draws a coloured disc for every point. All pixels of all discs are written at once, far to near."""
     reach = int(radius_px)
     offsets = [
         (u, v)
@@ -84,14 +84,14 @@ def _stamp(
     inside = (at[:, 0] >= 0) & (at[:, 0] < width) & (at[:, 1] >= 0) & (at[:, 1] < height)
     point = np.repeat(np.arange(len(centres)), len(offsets))[inside]
     at = at[inside]
-    # Of equal indices NumPy keeps the last value assigned.
+    # Where indices are equal, NumPy keeps the last value assigned.
     order = np.argsort(-range_m[point], kind="stable")
     picture[at[order, 1], at[order, 0]] = scale.colours_bgr(range_m)[point[order]]
 
 
 def _title(width: int, title: str) -> Pixels:
     height = round(width * LINE_SHARE)
-    # The letters are those of ASCII.
+    # The font has ASCII letters only.
     lines = title.replace("\u00b0", " deg").split("\n")[:LINES]
     strip = np.full((height * len(lines) + height // 4, width, 3), PAPER, dtype=np.uint8)
     for number, line in enumerate(lines):
@@ -100,7 +100,7 @@ def _title(width: int, title: str) -> Pixels:
 
 
 def _bar(width: int, scale: RangeScale) -> Pixels:
-    """The colours of the ranges, with a figure at each round one. What lies beyond an end has its colour."""
+    """A bar of the colours of ranges, labelled at round ranges. What lies beyond an end has the end's colour."""
     height, left, right = round(width * BAR_SHARE), round(0.02 * width), round(0.96 * width)
     strip = np.full((height, width, 3), PAPER, dtype=np.uint8)
     ramp = scale.colours_bgr(scale.range_at(np.linspace(0.0, 1.0, right - left)))

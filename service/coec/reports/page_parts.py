@@ -1,4 +1,4 @@
-"""Parts that pages of several commands have in common, from wire models to blocks."""
+"""Parts that the pages of several commands share: they make blocks from wire models."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ TONES: Mapping[str, Tone] = {
     "camera_moved": "bad",
     "lidar_moved": "bad",
 }
-"""Of states and decisions; what is not here says neither good nor bad."""
+"""Tones of states and decisions; one that is not listed is neither good nor bad."""
 
 DIGITS = {"deg": 3, "m": 4}
-"""After the point: a thousandth of a degree, a tenth of a millimetre, which is below any σ."""
+"""Digits after the point: a thousandth of a degree and a tenth of a millimetre are below any σ."""
 
 SHOWN_UNITS = {"deg": "°", "m": "m"}
 
 PLENTY = 4.0
-"""Times its limit a figure is kept by, to stand at the end of its margin; a quarter of it, to stand at the other."""
+"""A figure this factor better than its limit stands at one end of its margin, one this factor worse at the other."""
 
 CAPTIONS: Mapping[str, tuple[str, str]] = {
     "overlay": (
@@ -77,20 +77,20 @@ CAPTIONS: Mapping[str, tuple[str, str]] = {
 
 
 def file_picture(path: Path) -> Picture:
-    """A picture that lies on the disk, with what `CAPTIONS` says of it.
+    """A picture file with its texts from `CAPTIONS`.
 
     Raises:
-        OutputError: it cannot be read any more.
+        OutputError: it can no longer be read.
     """
     alt, caption = CAPTIONS[path.stem]
     return Picture(read(path), alt, caption)
 
 
 def read(path: Path) -> bytes:
-    """A file that was just written.
+    """The bytes of a file that was just written.
 
     Raises:
-        OutputError: it cannot be read any more.
+        OutputError: it can no longer be read.
     """
     try:
         return path.read_bytes()
@@ -99,7 +99,7 @@ def read(path: Path) -> bytes:
 
 
 def axis_value(value: float | None, axis: int, sign: bool = True) -> str:
-    """A rotation or translation, with the digits of its unit."""
+    """The value of an axis, with the digits of its unit."""
     return number(value, DIGITS[UNITS[axis]], sign)
 
 
@@ -111,7 +111,8 @@ def axes_table(
     words: Mapping[int, str] | None = None,
     more: Mapping[str, Sequence[str]] | None = None,
 ) -> AxesTable:
-    """Six axes, deg and m; `words` stand where there is no value, `more` are further columns by their heads."""
+    """A table of six axes, deg and m. `words` replace the values of axes that have none; `more` are further columns by
+    head."""
     words, more = words or {}, more or {}
     widest = {
         unit: max(
@@ -173,14 +174,14 @@ def copies_of(transform: Transform, camera: str, lidar: str) -> Copies:
 def figures_block(
     caption: str, metrics: Mapping[str, MetricReply], *, compared: frozenset[str] = frozenset()
 ) -> Figures:
-    """Every figure with its limit, its meaning and, where it fails, what to do; those that fail first. Of `compared`
-    nothing follows: no advice."""
+    """Every figure with its limit, its meaning and, where it fails, what to do; failing ones first. Figures in
+    `compared` decide nothing and get no advice."""
     lines = [_figure(name, metric, name in compared) for name, metric in metrics.items()]
     return Figures(caption, tuple(sorted(lines, key=lambda line: line.met is not False)))
 
 
 def title_of(name: str) -> str:
-    """What a figure is called, with its name in documents."""
+    """The title of a figure, with its name in documents."""
     known = FIGURES.get(name)
     if known is None:
         return name
@@ -188,7 +189,7 @@ def title_of(name: str) -> str:
 
 
 def advice_of(reasons: Sequence[Reason]) -> tuple[str, ...]:
-    """What to do about reasons, each thing once."""
+    """What to do about some reasons, each advice once."""
     return tuple(dict.fromkeys(text for reason in reasons if (text := _advice(reason.code))))
 
 
@@ -240,6 +241,6 @@ def _matrix(rows: Sequence[Sequence[float]]) -> str:
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> str:
-    """Rows as lines, their numbers one under the other."""
+    """Rows as lines, with aligned columns."""
     widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=False)) for row in rows)

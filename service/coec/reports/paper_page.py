@@ -20,7 +20,7 @@ PUBLISHED = (
 
 @dataclass(frozen=True, slots=True)
 class Plots:
-    """Of the failure metrics, of the far starts, and of the drive."""
+    """Plots of the failure metrics, of the far starts, and of the drive."""
 
     metrics: Block
     bullseye: Block
@@ -28,7 +28,7 @@ class Plots:
 
 
 def paper_page(document: Mapping[str, Any], plots: Plots, made: Made) -> Page:
-    """The page of what `coec paper --json` prints."""
+    """The page of a `document` as `coec paper --json` prints it."""
     far = document["bullseye"]
     sentence = (
         f"From {far['start_deg']:g}° away {far['hits']} of {far['runs']} runs come home (published: "

@@ -1,4 +1,4 @@
-"""Pictures of a window for people: points on the image before and after, close-ups, what is left at the result."""
+"""Pictures of a window for people: points on the image before and after, close-ups, residuals at the result."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from coec.reports.page_parts import file_picture
 from coec.reports.residual_map import residual_map
 
 PAGE_JPEG_QUALITY = 95
-"""Of pictures that a page takes: it makes large ones smaller once more."""
+"""JPEG quality of pictures for a page, which shrinks large ones again."""
 
 SLID_ALTS = ("LiDAR points on the camera image, before", "The same LiDAR points on the same image, after")
-"""What is seen on two pictures in one place, for who does not see it."""
+"""Alternative texts of two pictures that a slider compares."""
 
 
 def middle(window: Window) -> FramePair:
@@ -39,7 +39,7 @@ def middle(window: Window) -> FramePair:
 
 
 def write_overlay(folder: Path, name: str, picture: NDArray[np.uint8], title: str) -> Path:
-    """`<name>.png`: a picture of `overlays` with its title.
+    """Writes `<name>.png`: a picture of `overlays` with a title.
 
     Raises:
         OutputError: the folder or the file cannot be written.
@@ -48,8 +48,8 @@ def write_overlay(folder: Path, name: str, picture: NDArray[np.uint8], title: st
 
 
 def overlays(window: Window, poses: Sequence[Matrix4], compensated: bool) -> list[NDArray[np.uint8]]:
-    """(height, width, 3) BGR for each pose (4, 4): points on the image of the middle pair; all in the colours of what
-    is seen at the first.
+    """(height, width, 3) BGR for each pose (4, 4): points on the image of the middle pair. The points in view at the
+    first pose set the colour scale of all pictures.
 
     Raises:
         DecodeError: the image cannot be decoded.
@@ -63,7 +63,7 @@ def overlays(window: Window, poses: Sequence[Matrix4], compensated: bool) -> lis
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What was drawn of two extrinsics: the files, the blocks of a page that show it, and what was left out, a sentence
+    """Pictures of two extrinsics: the files, the blocks of a page that show them, and what was left out, one sentence
     each."""
 
     files: tuple[Path, ...]
@@ -80,9 +80,9 @@ def write_comparison(
     compensated: bool,
     looks: float | None,
 ) -> Comparison:
-    """Two extrinsics (4, 4) of a window: overlay_before.png, overlay_after.png, close_ups.png, and residuals.png at the
-    second one, unless it cannot be trusted: the pairs are worth so many independent `looks`, None where that is not
-    known.
+    """Draws two extrinsics (4, 4) of a window: overlay_before.png, overlay_after.png, close_ups.png, and residuals.png
+    at the second. The residuals are left out if they could not be trusted, because the pairs are worth too few
+    independent `looks` (None: not known).
 
     Raises:
         OutputError: the folder or a file cannot be written.
@@ -117,8 +117,8 @@ def write_comparison(
 
 
 def slid_pictures(pictures: tuple[NDArray[np.uint8], NDArray[np.uint8]], captions: tuple[str, str]) -> Compare:
-    """Two pictures (height, width, 3) BGR of one size in one place, the words beside them: what a slider moves over has
-    none in it."""
+    """Two pictures (height, width, 3) BGR of one size for a slider. The words stand beside them, so that the slider
+    moves over no text."""
     before, after = (
         Picture(encode_jpeg(picture, PAGE_JPEG_QUALITY), alt, caption)
         for picture, alt, caption in zip(pictures, SLID_ALTS, captions, strict=True)
@@ -127,7 +127,7 @@ def slid_pictures(pictures: tuple[NDArray[np.uint8], NDArray[np.uint8]], caption
 
 
 def write_lens(folder: Path, camera: Camera, fitted: Camera) -> Path:
-    """lens_residual.png: what a fitted camera model misses of the one that it stands for.
+    """Writes lens_residual.png: how far a fitted camera model is from the one that it stands for.
 
     Raises:
         OutputError: the folder or the file cannot be written.
@@ -136,6 +136,5 @@ def write_lens(folder: Path, camera: Camera, fitted: Camera) -> Path:
 
 
 def network_text(model: str, identity: str) -> str:
-    """A depth network for people: its name without the folder, and the beginning of its identity; `identity` is what an
-    estimate says of it."""
+    """A depth network for people: its name without the folder, and the beginning of its `identity`."""
     return f"{Path(model).name} ({identity[:12]})"

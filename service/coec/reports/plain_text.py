@@ -1,4 +1,4 @@
-"""Text for terminals that can do less: without colours, or without the signs that ASCII does not have."""
+"""Text for limited terminals: without colours, or without signs outside ASCII."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ SIGNS: Mapping[str, str] = {
     "∞": "inf", "▁": "_", "▂": "_", "▃": "-", "▄": "-", "▅": "=", "▆": "=", "▇": "#", "█": "#", "▀": "#", "─": "-",
     "│": "|", "━": "-", "╸": "-", "╺": "-", "•": "*", "Δ": "d", "θ": "theta", "¼": "1/4", "½": "1/2", "\ufffd": "?",
 }  # fmt: skip
-"""By the sign that this project's texts use, what stands for it."""
+"""ASCII replacement of each sign that this project's texts use."""
 
 HANDLER = "coec.signs"
-"""Name under which `codecs` knows what to do with a sign that an encoding lacks."""
+"""Name of the `codecs` error handler that replaces signs that an encoding lacks."""
 
 
 def encodable(text: str, encoding: str) -> str:
-    """The text with signs that the encoding has."""
+    """The text with only signs that the encoding has."""
     return text.encode(encoding, HANDLER).decode(encoding)
 
 
 def is_unicode(encoding: str | None) -> bool:
-    """Whether it has all signs."""
+    """Whether an encoding has all signs."""
     return (encoding or "").lower().replace("-", "").replace("_", "").startswith("utf")
 
 
 def never_fail() -> None:
-    """No text that is printed from now on fails for want of a sign in the locale's encoding."""
+    """From now on, printing never fails because the locale's encoding lacks a sign."""
     for stream in (sys.stdout, sys.stderr):
         reconfigure = getattr(stream, "reconfigure", None)
-        # Whoever captures output brings a stream of his own.
+        # A stream that captures output may have no `reconfigure`.
         if reconfigure is not None and not is_unicode(stream.encoding):
             reconfigure(errors=HANDLER)
 
 
 def wants_plain(environment: Mapping[str, str]) -> bool:
-    """Whether a terminal is to be sent nothing but text: https://no-color.org, and terminals that obey nothing."""
+    """Whether to send the terminal nothing but text: with NO_COLOR (https://no-color.org), or for a dumb terminal."""
     return bool(environment.get("NO_COLOR")) or environment.get("TERM", "").lower() in ("dumb", "unknown")
 
 

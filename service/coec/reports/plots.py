@@ -23,10 +23,10 @@ from coec.reports.bullseye import HIT_DEG, LATITUDES_DEG, Places, end_places, la
 DPI = 110
 
 ERROR_RANGE_DEG = (0.02, 20.0)
-"""Ends of the colours: what a good search scatters by, and what is lost altogether."""
+"""Ends of the colour scale: the scatter of a good search, and an error that is lost altogether."""
 
 TICKS = tuple(step * 10.0**decade for decade in range(-4, 3) for step in (1.0, 2.0, 3.0, 5.0, 7.0))
-"""Of logarithmic axes."""
+"""Ticks of logarithmic axes."""
 
 COLOURS = "plasma"
 
@@ -35,7 +35,7 @@ def bullseye(outcomes: Sequence[Outcome], directions: Mapping[str, NDArray[np.fl
     """Left, for each of `directions` (title, (n, 3) unit vectors in camera axes): the start directions, coloured by
     where their solves ended. Right: where they ended, as seen from the reference.
 
-    How the sphere of directions is flattened is told by `bullseye.start_places`.
+    `bullseye.start_places` says how the sphere of directions is flattened.
     """
     figure = Figure(figsize=(6.2 * (len(directions) + 1), 7.0), layout="constrained")
     figure.suptitle(title)
@@ -145,6 +145,6 @@ def _polar(figure: Figure, rows: int, columns: int, index: int) -> PolarAxes:
 def png(figure: Figure) -> bytes:
     """The figure as a file; equal figures give equal bytes."""
     stream = io.BytesIO()
-    # Without the name of the software and its version.
+    # Without the software's name and version, which would differ.
     figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
     return stream.getvalue()

@@ -1,4 +1,4 @@
-"""Progress on standard error: bars in a terminal, and elsewhere a line now and then, so that no wait is silent."""
+"""Progress on standard error: bars in a terminal, elsewhere a line now and then, so that no wait is silent."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from coec.geometry import compile_news
 
 LINE_S = 30.0
-"""Between two lines where there is no terminal: a log of an hour has a hundred."""
+"""Time between two lines without a terminal: the log of an hour has about a hundred."""
 
 COMPILING_S = 2.0
-"""A shorter wait for a compiler needs no word."""
+"""A shorter wait for the compiler is not reported."""
 
 COMPILING = "compiling the kernels, once on this machine, for about a minute"
 
 
 class CompilingNews:
-    """What is known of a compilation that goes on. `kernels`: how many were begun; `lasted_s`: since the first."""
+    """A compilation in progress: how many `kernels` were begun, and how long ago the first was (`lasted_s`)."""
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
@@ -30,25 +30,25 @@ class CompilingNews:
         self._names: set[str] = set()
 
     def hear(self, kernel: str) -> None:
-        """As `compile_news` tells it."""
+        """Called by `compile_news` when a kernel is begun."""
         if self._began_s is None:
             self._began_s = self._now_s()
         self._names.add(kernel)
 
     @property
     def kernels(self) -> int:
-        """Begun up to now."""
+        """How many were begun up to now."""
         return len(self._names)
 
     @property
     def lasted_s(self) -> float:
-        """Since the first began; 0 before it."""
+        """Seconds since the first began; 0 before that."""
         return 0.0 if self._began_s is None else self._now_s() - self._began_s
 
 
 class Bars(Progress):
-    """A bar for each task, gone when all is done; where the console is no terminal, lines of the task that goes on:
-    one every half minute, none of what is quicker."""
+    """A bar for each task that disappears when all is done. Where the console is no terminal, a line on the current
+    task every half minute; quicker work gets none."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Bars(Progress):
         counted: bool,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`say` puts a line; `counted` shows how many parts of how many are done."""
+        """`say` prints a line; `counted` shows how many of how many parts are done."""
         self._say = say
         self._now_s = now_s
         self._told_s = now_s()
@@ -88,7 +88,7 @@ class Bars(Progress):
         self._listening.__exit__(None, None, None)
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
-        """As rich has it."""
+        """Updates a task as in rich, and prints a line when it is time."""
         super().update(task_id, **changes)
         if self.disable and self._is_time():
             task = self._tasks[task_id]

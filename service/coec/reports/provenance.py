@@ -1,4 +1,4 @@
-"""Where a result comes from: what it was made of, by what, when and how, so that anybody can make it again."""
+"""Where a result comes from: its inputs, the software, the time and the command, so that anybody can repeat it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from coec.reports.instants import second
 from coec.reports.page import Facts, Section
 
 CALCULATING = ("numpy", "numba", "nlopt", "onnxruntime")
-"""Packages that a decision is made with: it is theirs as well."""
+"""Packages whose code takes part in a decision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Made:
     machine: str
 
     def items(self) -> tuple[tuple[str, str], ...]:
-        """For people."""
+        """Names and values for people."""
         versions = ", ".join(f"{package} {number}" for package, number in self.versions.items())
         return (
             ("Command", self.command),
@@ -51,15 +51,15 @@ class Made:
         )
 
     def section(self, of: Sequence[tuple[str, str]] = ()) -> Section:
-        """The last section of a page: what it is made `of` (names and values; those that name a hash are read letter by
-        letter), and this."""
+        """The last section of a page: what the page is made `of` (names and values; hashes are shown as code), followed
+        by these items."""
         items = (*of, *self.items())
         codes = {name for name, _ in items if "sha256" in name or "hash" in name}
         return Section("Provenance", (Facts(items, frozenset({*codes, "Command"})),))
 
 
 def here() -> Made:
-    """By this process, now."""
+    """Provenance of a document that this process makes now."""
     command = shlex.join(["coec", *sys.argv[1:]])
     return Made(
         command,
@@ -70,7 +70,7 @@ def here() -> Made:
 
 
 def depth_items(identity: str) -> tuple[tuple[str, str], ...]:
-    """What depth comes from, by the `depth_identity` of a result: name and sha256 of the network."""
+    """Where depth comes from, by the `depth_identity` of a result: name and sha256 of the network."""
     if identity == PRECOMPUTED:
         return (("Depth", "precomputed: the maps of the source"),)
     name = next((card.name for card in built_in_cards().values() if card.sha256 == identity), "a network of your own")
@@ -78,8 +78,8 @@ def depth_items(identity: str) -> tuple[tuple[str, str], ...]:
 
 
 def content_hash(window: Window) -> str:
-    """sha256 (hexadecimal) of what a window saw: every image, every point, every stamp, in their order; the same
-    wherever the window was read from."""
+    """sha256 (hexadecimal) of the content of a window: every image, every point, every stamp, in their order. It is the
+    same wherever the window was read from."""
     digest = hashlib.sha256()
     for pair in window.pairs:
         for part in _parts(pair):
@@ -94,5 +94,5 @@ def _parts(pair: FramePair) -> tuple[bytes, ...]:
 
 @cache
 def versions() -> dict[str, str]:
-    """Of everything that a decision is made with, by package, `coec` first."""
+    """Versions of everything that takes part in a decision, by package, `coec` first."""
     return {"coec": __version__, **{package: version(package) for package in CALCULATING}}

@@ -1,4 +1,4 @@
-"""Replies in words and tables."""
+"""Prints replies of the service in words and tables."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def history(payload: bytes) -> None:
 
 
 def entry_text(entry: replies.HistoryEntry) -> str:
-    """What happened, and for a command the reason that was given for it."""
+    """What happened, and for a command the reason that its sender gave."""
     return entry.text if entry.reason is None else f"{entry.text} Reason: {entry.reason}"
 
 
@@ -202,7 +202,7 @@ def rig(payload: bytes) -> None:
 
 
 def _lidars(reply: rig_state.RigReply) -> None:
-    """Where LiDARs sit to one another, and how old that is, in sensor time."""
+    """Prints where LiDARs sit relative to each other, and the age of that in sensor time."""
     table = console.table(
         "LiDARs", "state", "age, s", "looks", *(f"{name} ± σ" for name in console.AXES), right=range(2, 10)
     )
@@ -224,7 +224,7 @@ def _lidars(reply: rig_state.RigReply) -> None:
 
 
 def _joint(joint: rig_state.JointReply) -> None:
-    """Where everything is, and how well the pairs fit each other."""
+    """Prints where all pairs are by the joint estimate, and how well they fit each other."""
     table = console.table("pair", *(f"{name} ± σ" for name in console.AXES), right=range(1, 7))
     for pair in joint.pairs:
         steps = [f"{step:+.3f} ± {sigma:.3f}" for step, sigma in zip(pair.step, pair.sigma, strict=True)]
@@ -260,7 +260,7 @@ BY_KIND: Final[Mapping[str, Callable[[bytes], None]]] = {
     "rig": rig,
     "command": command,
 }
-"""What shows a reply, by the name of its key. The others are shown as they come."""
+"""The function that prints a reply, by the name of its key. Other replies are printed as they come."""
 
 
 def _axes(axes: replies.Axes) -> None:

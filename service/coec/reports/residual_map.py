@@ -1,8 +1,7 @@
-"""Where in the picture range edges and image edges agree at an extrinsic, and in which direction they do not.
+"""Where in the picture range edges and image edges agree at an extrinsic, and in which direction they are apart.
 
-Arrows that all point one way are an extrinsic; arrows at the rim alone are a lens; arrows on near things alone a
-translation. Colours go from pale to dark with one hue's lightness (reversed viridis), so that they are read in grey,
-too.
+If all arrows point one way, the extrinsic is wrong; arrows only at the rim mean a wrong lens, arrows only on near
+objects a wrong translation. Colours go from pale to dark (reversed viridis), so that they can be read in grey, too.
 """
 
 from __future__ import annotations
@@ -27,27 +26,27 @@ from coec.reports.canvas import DPI, bgr_of, box, folded
 from coec.reports.instants import instant
 
 PICTURE_PX = (1060, 900)
-"""Width and height of the image, at most: a cell of twelve has room for its figures."""
+"""Largest width and height of the image: with twelve cells in a row, each has room for its figures."""
 
 MARGIN_PX, LINE_PX, BAR_PX, BAR_AXIS_PX = 12, 20, 16, 46
-"""About the picture; a line of text; the bar of colours, and its figures."""
+"""Margin about the picture, height of a line of text, height of the colour bar, room for its figures."""
 
 COLOURS = "viridis_r"
 
 FADED = 0.45
-"""How much of the image is left beside white."""
+"""How much of the image's contrast is left as it fades to white."""
 
 COVER = 0.6
-"""Of the colour of a cell over the image."""
+"""Opacity of a cell's colour over the image."""
 
 MOST = 0.9
-"""Of the parts that tell, so many are within the scale of colours."""
+"""This share of the cells that tell lies within the colour scale."""
 
 LEAST_END_PX = 3.0
-"""Of the scale of colours, at least: less is what range edges scatter by."""
+"""Least end of the colour scale: smaller shifts are the scatter of range edges."""
 
 QUIET = "#444444"
-"""Of the figure of a cell that does not tell."""
+"""Colour of the figure in a cell that does not tell."""
 
 ARROW_SHARE = 0.42
 """The longest arrow, as a share of a cell's shorter side."""
@@ -56,11 +55,11 @@ ARROW_SHARE = 0.42
 def residual_map(
     window: Window, T_camera_lidar: Matrix4, *, compensated: bool = True, name: str = ""
 ) -> NDArray[np.uint8]:
-    """Of a window at an extrinsic (4, 4), which is called `name`.
+    """The map of a window at an extrinsic (4, 4), which is called `name`.
 
     Returns:
-        (H, W, 3) uint8 BGR on white: in each cell the pixels by which its range edges lie beside edges of the image,
-        and how many there are.
+        (H, W, 3) uint8 BGR on white: in each cell how many pixels its range edges are off the edges of the image, and
+        how many range edges there are.
 
     Raises:
         DecodeError: an image cannot be decoded.
@@ -114,7 +113,7 @@ def _drawn(grey: NDArray[np.uint8], shifts: LocalShifts, lines: list[str]) -> ND
     axes.imshow(pale, cmap="gray", vmin=0, vmax=255, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axes.set_axis_off()
-    # A part that is taken in by a rival does not pale all others.
+    # A quantile, so that a cell that matches a wrong edge does not pale all others.
     large = float(np.quantile(shifts.size_px[shifts.told], MOST)) if shifts.told.any() else 0.0
     end_px = max(LEAST_END_PX, large)
     colours = ScalarMappable(Normalize(0.0, end_px), COLOURS)
@@ -134,7 +133,7 @@ def _cell(
     colours: ScalarMappable,
     end_px: float,
 ) -> None:
-    """Nothing where there is no range edge."""
+    """Draws a cell; nothing where it has no range edge."""
     row, column = place
     if shifts.edges[row, column] == 0:
         return

@@ -1,4 +1,4 @@
-"""A rig from above, as PNG bytes: where its sensors sit and look, what the pairs of them say, and who has moved."""
+"""A rig from above, as PNG bytes: where its sensors sit and look, what its pairs say, and which sensor has moved."""
 
 from __future__ import annotations
 
@@ -32,30 +32,30 @@ STATE_COLOURS: Mapping[str, str] = MappingProxyType(
 MOVED = ("camera_moved", "lidar_moved")
 
 CERTAIN_SIGMAS = 6.0
-"""Colours of edges end here: a pair that far from its nominal, in its own standard deviations, has moved."""
+"""Colours of edges end here: a pair so many of its standard deviations from its nominal has surely moved."""
 EDGES = "coolwarm"
 LENGTH_M, WIDTH_M, BEHIND_M = 4.6, 1.9, 0.95
-"""Of the outline of the vehicle, and how far it reaches behind the rear axle, where its frame is."""
+"""Length and width of the vehicle's outline, and how far it reaches behind the rear axle, its frame's origin."""
 MARGIN_M = 1.3
 FAN_M = {"camera": 1.1, "lidar": 0.75}
 """Radius of the fan of a field of view: it shows the direction, not the reach."""
 LABEL_M, LABEL_APART_M, LINE_M = 0.42, 0.62, 0.26
-"""How far from its sensor a name stands, how far names keep from each other, and the height of a line of text."""
+"""Distance of a name from its sensor, least distance between names, and height of a line of text."""
 TRIES = 16
-"""Directions in which a name is tried, around its sensor."""
+"""Directions around its sensor that are tried for a name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorSeen:
-    """A sensor of the picture.
+    """A sensor in the picture.
 
     Attributes:
         kind: `camera` or `lidar`.
         T_ego_sensor: (4, 4) pose in the vehicle (x forward, y left); a camera looks along its z, a LiDAR along its x.
-        view_deg: width of its field of view, 360 of a LiDAR that turns.
-        state: of its health, see `STATE_COLOURS`.
-        probability: that it has moved; None where nobody can tell.
-        moved_deg: by how much, if it has.
+        view_deg: width of its field of view; 360 for a turning LiDAR.
+        state: its health, see `STATE_COLOURS`.
+        probability: that it has moved; None where that is unknown.
+        moved_deg: by how much it has moved, if it has.
     """
 
     name: str
@@ -69,7 +69,7 @@ class SensorSeen:
 
 @dataclass(frozen=True, slots=True)
 class EdgeSeen:
-    """What a pair of sensors says: it is `deg` from where it was, give or take `sigma_deg`."""
+    """What a pair of sensors says: it is `deg` ± `sigma_deg` from where it was."""
 
     a: str
     b: str
@@ -84,10 +84,11 @@ class EdgeSeen:
 
 
 def rig_from_above(sensors: Sequence[SensorSeen], edges: Sequence[EdgeSeen], title: str) -> bytes:
-    """Ahead is up. An edge is the redder the surer its pair is that something has moved; the sensor that did is marked.
+    """The picture; ahead is up. An edge is the redder, the surer its pair is that something has moved. A sensor that
+    has moved is marked.
 
     Raises:
-        ValueError: an edge to a sensor that is not there; names it.
+        ValueError: an edge names a sensor that is missing; the message says which.
     """
     places = {sensor.name: _place(sensor) for sensor in sensors}
     if unknown := sorted({name for edge in edges for name in (edge.a, edge.b)} - set(places)):
@@ -100,7 +101,7 @@ def rig_from_above(sensors: Sequence[SensorSeen], edges: Sequence[EdgeSeen], tit
     scale = ScalarMappable(colours, EDGES)
     for sensor in sensors:
         _draw_view(axes, sensor)
-    for edge in sorted(edges, key=lambda edge: edge.sigmas):  # what is sure of a movement lies on top
+    for edge in sorted(edges, key=lambda edge: edge.sigmas):  # the surest edges lie on top
         (x, y), (x2, y2) = places[edge.a], places[edge.b]
         colour = colormaps[EDGES](float(colours(edge.sigmas)))
         axes.plot([x, x2], [y, y2], color=colour, linewidth=2.6, zorder=3, solid_capstyle="round")
@@ -116,7 +117,7 @@ def rig_from_above(sensors: Sequence[SensorSeen], edges: Sequence[EdgeSeen], tit
 
 
 def words_of(sensor: SensorSeen) -> str:
-    """What stands beside a sensor."""
+    """The label beside a sensor."""
     lines = [sensor.name]
     if sensor.state in MOVED:
         by = "" if sensor.moved_deg is None else f" by {sensor.moved_deg:.2g}°"
@@ -129,24 +130,24 @@ def words_of(sensor: SensorSeen) -> str:
 
 
 def state_words(state: str) -> str:
-    """The state of a sensor as people write it."""
+    """The state of a sensor in words."""
     return state.replace("_", " ").replace("lidar", "LiDAR")
 
 
 def percent(probability: float) -> str:
-    """Never 100 % or 0 % of what is not certain."""
+    """A probability in percent, never as 100 % or 0 %, because it is not certain."""
     if probability > 0.99:
         return "> 99 %"
     return "< 1 %" if probability < 0.01 else f"{100.0 * probability:.0f} %"
 
 
 def _place(sensor: SensorSeen) -> tuple[float, float]:
-    """On the page: ahead (x of the vehicle) is up, left (y) is left."""
+    """Place on the page: ahead (x of the vehicle) is up, left (y) is left."""
     return -float(sensor.T_ego_sensor[1, 3]), float(sensor.T_ego_sensor[0, 3])
 
 
 def _heading_rad(sensor: SensorSeen) -> float:
-    """On the page, from its right."""
+    """Direction on the page, counter-clockwise from the right."""
     ahead = sensor.T_ego_sensor[:3, 2 if sensor.kind == "camera" else 0]
     return atan2(float(ahead[0]), -float(ahead[1]))
 
@@ -156,7 +157,7 @@ def _state(sensor: SensorSeen) -> str:
 
 
 def _frame(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
-    """The outline of the vehicle, and room for all."""
+    """Draws the outline of the vehicle, and makes room for all sensors."""
     outline = FancyBboxPatch(
         (-WIDTH_M / 2 + 0.3, -BEHIND_M + 0.3), WIDTH_M - 0.6, LENGTH_M - 0.6, boxstyle="round,pad=0.3",
         facecolor="whitesmoke", edgecolor="grey", linewidth=1.2, zorder=0,
@@ -187,7 +188,7 @@ def _draw_sensor(axes: Axes, sensor: SensorSeen) -> None:
     x, y = _place(sensor)
     if sensor.state in MOVED:
         axes.add_patch(Circle((x, y), 0.21, fill=False, edgecolor=STATE_COLOURS[sensor.state], linewidth=2.5, zorder=5))
-    # A triangle that points to where the camera looks; `None` leaves it to matplotlib to turn it.
+    # A triangle that points to where the camera looks.
     marker = (3, 0, degrees(_heading_rad(sensor)) - 90.0) if sensor.kind == "camera" else "o"
     axes.plot(
         [x], [y], marker=marker, markersize=13.0, color=STATE_COLOURS[_state(sensor)], markeredgecolor="black", zorder=6
@@ -195,7 +196,7 @@ def _draw_sensor(axes: Axes, sensor: SensorSeen) -> None:
 
 
 def _draw_labels(axes: Axes, sensors: Sequence[SensorSeen], places: Sequence[tuple[float, float]]) -> None:
-    """Names beside their sensors, where nothing else stands; those that have most to say choose first."""
+    """Draws names beside their sensors, in free places; the longest labels choose first."""
     taken = list(places)
     for number in sorted(range(len(sensors)), key=lambda number: -words_of(sensors[number]).count("\n")):
         words = words_of(sensors[number])
@@ -206,7 +207,7 @@ def _draw_labels(axes: Axes, sensors: Sequence[SensorSeen], places: Sequence[tup
 
 
 def _free(place: tuple[float, float], words: str, taken: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """The direction around a sensor in which its words are furthest from all others', outwards if it is all one."""
+    """The place around a sensor at which its words are far enough from all others, outwards if possible."""
     distance = LABEL_M + LINE_M * words.count("\n") / 2
     best, room = place, -1.0
     outwards = atan2(place[1] - (LENGTH_M / 2 - BEHIND_M), place[0]) if place[0] else 0.0

@@ -1,4 +1,4 @@
-"""What `coec sim rig-moves` and `coec sim rig-drives` say in tables."""
+"""The tables of `coec sim rig-moves` and `coec sim rig-drives`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from coec.schemas.rig import RigDrivesReport, RigMovesReport
 
 
 def show(report: RigMovesReport) -> None:
-    """Who moved, by fault; then what the rig knows of its pairs, and what right after a LiDAR of it was knocked."""
+    """Prints which sensors were named, by fault; then how well the rig knows its pairs, in general and right after one
+    of its LiDARs was knocked."""
     table = console.table(
         "rig", "fault", "drives", f"right in {report.allowed_s:g} s", "undecided", "wrong", "median", "latest",
         right=range(2, 8),
@@ -53,7 +54,7 @@ def show(report: RigMovesReport) -> None:
 
 
 def show_drives(report: RigDrivesReport) -> None:
-    """Who moved on rendered drives, by fault; then each drive that did not end right."""
+    """Prints which sensors were named on rendered drives, by fault; then each drive that did not end right."""
     table = console.table(
         "rendered", "drives", f"right in {report.allowed_s:g} s", "undecided", "wrong", "named: median", "latest",
         "a pair alarmed: drives", "median", "latest", right=range(1, 10),

@@ -1,4 +1,4 @@
-"""What a service says of itself, for people: one with 24 pairs of eleven sensors on a screen, too."""
+"""What a service says about itself, for people; even 24 pairs of eleven sensors fit on a screen."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from coec.schemas import replies
 from coec.schemas.base import from_json
 
 NAMED = 3
-"""Pairs that are named where a line is about several; of the rest it is told how many they are."""
+"""Pairs that are named in a line about several; of the rest only the number is given."""
 
 PLACES = ("camera", "lidar", "ego", "pairs not chosen", "windows")
-"""Where a pair loses something, in the order of a frame's way."""
+"""Where a pair can lose data, in the order of a frame's way."""
 
 
 def status(payload: bytes) -> None:
-    """The daemon."""
+    """Prints the status of the daemon."""
     reply = from_json(replies.StatusReply, payload)
     worker, storage = reply.worker, reply.storage
     console.show(
@@ -53,7 +53,7 @@ def status(payload: bytes) -> None:
 
 
 def losses(by_place: Mapping[str, Mapping[str, int]]) -> None:
-    """A line for each place at which something was lost, with the causes."""
+    """Prints a line for each place at which something was lost, with the causes."""
     for place, causes in by_place.items():
         if causes:
             told = ", ".join(f"{count} {cause}" for cause, count in sorted(causes.items()))
@@ -61,7 +61,7 @@ def losses(by_place: Mapping[str, Mapping[str, int]]) -> None:
 
 
 def _looked(share: replies.BudgetShare | None) -> tuple[str, Text]:
-    """How long ago the worker looked at a pair, and what is to be said of its turn."""
+    """How long ago the worker looked at a pair, and a remark on its turn."""
     if share is None:
         return "-", Text()
     ago = "-" if share.unseen_s is None else f"{share.unseen_s:.0f}"
@@ -84,8 +84,8 @@ def _budget(budget: replies.BudgetStatus) -> None:
 
 
 def _lost(pairs: Sequence[replies.PairStatus]) -> list[str]:
-    """A line for each place and cause, whatever number of pairs it is of. A stream that several pairs share has one
-    count, which all of them tell."""
+    """A line for each place and cause, however many pairs it concerns. Pairs that share a stream all report its one
+    count."""
     lines = []
     for place in PLACES:
         by_cause: dict[str, dict[str, int]] = {}
@@ -106,13 +106,13 @@ def _causes(pair: replies.PairStatus) -> Mapping[str, Mapping[str, int]]:
 
 
 def _named(names: Sequence[str]) -> str:
-    """Some of them by name, the first ones."""
+    """The first few by name, and the number of the rest."""
     beyond = len(names) - NAMED
     return ", ".join(names) if beyond <= 1 else f"{', '.join(names[:NAMED])} and {beyond} more"
 
 
 def duration(seconds: float) -> str:
-    """In the unit that people would take."""
+    """A duration in the unit that people would use."""
     if seconds < 120:
         return f"{seconds:.1f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

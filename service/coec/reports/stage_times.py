@@ -1,4 +1,4 @@
-"""How far a calibration has come, for people who wait, and how long its stages took."""
+"""Progress of a calibration for people who wait, and how long its stages took."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class StageTimes:
         self._elapsed_s: dict[str, float] = {}
 
     def step(self, stage: str, done: int, total: int) -> None:
-        """See `ports.Progress`. The number of evaluations of a search is not known before it ends."""
+        """See `ports.Progress`. A search has no total: its number of evaluations is unknown until it ends."""
         now_s = time.perf_counter()
         self._elapsed_s[stage] = self._elapsed_s.get(stage, 0.0) + now_s - self._mark_s
         self._mark_s = now_s
@@ -28,5 +28,5 @@ class StageTimes:
         self._bars.update(self._tasks[stage], completed=done, note=note)
 
     def elapsed_s(self) -> dict[str, float]:
-        """By stage, and `total`."""
+        """Seconds by stage, and in `total`."""
         return {**self._elapsed_s, "total": time.perf_counter() - self._start_s}

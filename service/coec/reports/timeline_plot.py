@@ -23,12 +23,13 @@ STATE_COLOURS = {
 def timeline(
     series: Sequence[tuple[float, float, str]], marks: Sequence[tuple[float, str]], limit_deg: float, title: str
 ) -> bytes:
-    """The error of what is served against the truth, on a ground in the colour of what the service says of it.
+    """The error of the served extrinsic against the truth, over a background coloured by the state that the service
+    reports.
 
     Args:
         series: (second of the drive, error in degrees, state of health), ascending in time.
         marks: (second, what happened).
-        limit_deg: that a good error stays below.
+        limit_deg: a good error stays below this.
     """
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     figure.suptitle(title)
@@ -36,7 +37,7 @@ def timeline(
     for (begin, _, state), (end, *_) in pairwise(series):
         axes.axvspan(begin, end, color=STATE_COLOURS.get(state, "white"), alpha=0.3, linewidth=0)
     seconds, errors_deg = [point[0] for point in series], [point[1] for point in series]
-    # What is served changes at once, and so does the truth.
+    # Both the served extrinsic and the truth change in steps.
     curve = axes.plot(seconds, errors_deg, color="black", linewidth=1.8, drawstyle="steps-post", label="error")
     limit = axes.axhline(limit_deg, color="grey", linestyle=":", linewidth=1.0, label=f"{limit_deg:g}°: a good error")
     axes.set_ylim(0.0, max(errors_deg) * 1.25 + 0.1)

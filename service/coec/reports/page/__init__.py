@@ -1,9 +1,9 @@
-"""Every page that coec leaves, made of one small vocabulary of blocks: a command says what it has to tell as a `Page`,
-`write` makes one HTML file of it that needs no other.
+"""Every page that coec writes is made of one small vocabulary of blocks: a command describes its content as a `Page`,
+and `write` makes one self-contained HTML file of it.
 
-`blocks` is the vocabulary, `charts`, `ticks` and `discs` draw plots as SVG, `embedding` fits pictures into the page,
-`rendering` puts all of it through the templates beside it. What is told stands with who tells it: `calibration_page`
-and the like.
+`blocks` is the vocabulary; `charts`, `ticks` and `discs` draw plots as SVG; `embedding` fits pictures into the page;
+`rendering` fills the templates beside it. The content of each page is in a module of its own, such as
+`calibration_page`.
 """
 
 from coec.reports.page.blocks import (

@@ -1,5 +1,5 @@
-"""What a page may be made of. Every text is text: what looks like markup is shown as it is written. In sentences, what
-stands between two backticks is code."""
+"""What a page may be made of. No text is ever markup: what looks like markup is shown as written. In sentences, text
+between two backticks is shown as code."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from coec.reports.page.charts import Chart
 from coec.reports.page.discs import Disc, DotKind
 
 Tone = Literal["good", "unsure", "poor", "bad", "none"]
-"""How something is meant, from what may be used to what must not; `none` says neither. It is a colour beside a word,
-never a colour alone."""
+"""How good something is, from what may be used to what must not be; `none` says nothing. It adds a colour to a word and
+never stands as a colour alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """Paragraphs. `quiet`: a remark that helps to read what follows."""
+    """Paragraphs. `quiet` marks a remark that helps to read what follows."""
 
     template: ClassVar = "text"
     paragraphs: tuple[str, ...]
@@ -26,11 +26,11 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The whole in a sentence.
+    """The outcome in a sentence.
 
     Attributes:
         word: one or two words on the badge: Accepted, Refused.
-        todo: what to do now, a sentence each.
+        todo: what to do now, one sentence each.
     """
 
     template: ClassVar = "verdict"
@@ -45,9 +45,9 @@ class AxisLine:
     """One degree of freedom.
 
     Attributes:
-        value: with its sign, or in words why there is none; `sigma` is empty then.
-        share: of the widest bar of the table, -1 to 1: value and σ as lengths; None without a value.
-        sigma_share: likewise of σ.
+        value: with its sign, or the reason in words why there is none; then `sigma` is empty.
+        share: length of the value's bar over the widest bar of the table, -1 to 1; None without a value.
+        sigma_share: likewise for σ.
     """
 
     name: str
@@ -65,7 +65,7 @@ class AxesTable:
 
     Attributes:
         value_name: what the values are: correction, offset, bias.
-        more: heads of further columns of numbers.
+        more: heads of further number columns.
     """
 
     template: ClassVar = "axes"
@@ -77,7 +77,7 @@ class AxesTable:
 
 @dataclass(frozen=True, slots=True)
 class Copy:
-    """Something to be taken into another program.
+    """Something to copy into another program.
 
     Attributes:
         shown: for people, lines of equal width.
@@ -92,7 +92,7 @@ class Copy:
 
 @dataclass(frozen=True, slots=True)
 class Copies:
-    """Several of them."""
+    """Several things to copy."""
 
     template: ClassVar = "copies"
     items: tuple[Copy, ...]
@@ -104,8 +104,8 @@ class Picture:
 
     Attributes:
         data: bytes of a PNG or JPEG file.
-        alt: what is seen, for who does not see it.
-        href: file beside the page that it leads to; empty for none.
+        alt: what it shows, for readers who cannot see it.
+        href: file beside the page that it links to; empty for none.
     """
 
     data: bytes
@@ -116,7 +116,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """One under the other, as wide as the page."""
+    """Pictures one under the other, as wide as the page."""
 
     template: ClassVar = "pictures"
     items: tuple[Picture, ...]
@@ -124,8 +124,8 @@ class Pictures:
 
 @dataclass(frozen=True, slots=True)
 class Compare:
-    """Two pictures of one size in one place, of which a slider shows more of the one or of the other; side by side
-    where there is no script, and on paper."""
+    """Two pictures of one size in one place, with a slider that shows more of the one or of the other. Without script,
+    and on paper, they stand side by side."""
 
     template: ClassVar = "compare"
     before: Picture
@@ -144,7 +144,7 @@ class Charts:
 
 @dataclass(frozen=True, slots=True)
 class Discs:
-    """Discs beside each other where there is room; `legend` says of each kind of dot what it stands for."""
+    """Discs beside each other where there is room; `legend` says what each kind of dot stands for."""
 
     template: ClassVar = "discs"
     items: tuple[Disc, ...]
@@ -156,9 +156,9 @@ class FigureLine:
     """A figure against its limit.
 
     Attributes:
-        limit: with its sign, empty where there is none; `met` is None then.
-        margin: where it stands between failing (0), its limit (½) and plenty (1); None where that cannot be said.
-        advice: what to do; empty where it is met.
+        limit: with its sign; empty where there is none, and then `met` is None.
+        margin: where the figure stands between failing (0), its limit (½) and plenty (1); None where that is unknown.
+        advice: what to do; empty where the limit is met.
     """
 
     code: str
@@ -174,7 +174,7 @@ class FigureLine:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """All that a verdict rests on."""
+    """All figures that a verdict rests on."""
 
     template: ClassVar = "figures"
     caption: str
@@ -183,8 +183,8 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """A plot as small as a word: a line and its band (x, low, middle, high), about `zero`, of at least `least` to each
-    side."""
+    """A plot as small as a word: a line and its band (x, low, middle, high) about `zero`; its scale reaches at least
+    `least` to each side."""
 
     title: str
     points: tuple[tuple[float, float, float, float], ...]
@@ -194,7 +194,7 @@ class Trend:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Of a table, where it is more than text.
+    """A cell of a table that is more than text.
 
     Attributes:
         href: file beside the page, or `#place` on it.
@@ -209,8 +209,8 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells; the columns whose index is in `numbers` are numbers, in `prose` sentences, which are folded. Wide
-    ones scroll in a region of their own, which the keyboard reaches."""
+    """Rows of cells. Columns whose index is in `numbers` hold numbers; in `prose`, sentences, which are folded. Wide
+    tables scroll in a region of their own that the keyboard reaches."""
 
     template: ClassVar = "table"
     caption: str
@@ -222,8 +222,8 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Names and values: where something comes from, how it was found. `codes` are names whose value is to be read
-    letter by letter: hashes, a command."""
+    """Names and values: where something comes from, how it was found. `codes` are the names whose value is read letter
+    by letter: hashes, a command."""
 
     template: ClassVar = "facts"
     items: tuple[tuple[str, str], ...]
@@ -231,12 +231,12 @@ class Facts:
 
 
 Block = Text | Verdict | AxesTable | Copies | Pictures | Compare | Charts | Discs | Figures | Table | Facts
-"""`template` of each names its file in `templates/blocks`."""
+"""The `template` of a block names its file in `templates/blocks`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A headline, and what stands under it. `level` 3 belongs to the section before it."""
+    """A headline and the blocks under it. A section of `level` 3 belongs to the last one of level 2."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -248,9 +248,9 @@ class Page:
     """A document.
 
     Attributes:
-        kind: what sort of page it is, above the title.
-        title: of the document and its headline.
-        opening: blocks before the first section; a verdict first.
+        kind: what sort of page it is, shown above the title.
+        title: of the document and of its headline.
+        opening: blocks before the first section, a verdict first.
     """
 
     kind: str

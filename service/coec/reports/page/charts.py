@@ -1,6 +1,6 @@
-"""Plots as SVG: a few lines of our own, so that their colours follow the page and equal figures give equal bytes.
+"""Plots as SVG, drawn by coec itself so that their colours follow the page and equal figures give equal bytes.
 
-A chart is drawn twice, for a wide and for a narrow page, each at the size at which its letters are legible; the style
+A chart is drawn twice, for a wide and for a narrow page, each at a size at which its letters are legible. The style
 sheet shows the one that fits.
 """
 
@@ -18,10 +18,10 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Points in the order of x; where y is not finite the line is broken.
+    """Points in the order of x; the line is broken where y is not finite.
 
     Attributes:
-        shape: `steps` holds a value until the next, `points` are not joined, `dotted` is a line that is not measured.
+        shape: `steps` hold a value until the next, `points` are not joined, `dotted` is a line that is not measured.
         band: (x, low, high) on the same axes, drawn under the line; empty for none.
     """
 
@@ -33,7 +33,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """What holds from one x to another, as the colour of the ground; `tone` as in `blocks.Tone`."""
+    """A state that holds from one x to another, shown as the background colour; `tone` as in `blocks.Tone`."""
 
     begin: float
     end: float
@@ -51,7 +51,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A y that something has to keep."""
+    """A limit on y."""
 
     at: float
     name: str
@@ -62,9 +62,9 @@ class Chart:
     """A plot with its axes.
 
     Attributes:
-        told: what is to be seen, in a sentence, for who does not see it.
-        log_y: values at or below zero are not drawn then.
-        x_ticks: where others than round numbers are wanted, with their labels.
+        told: what the plot shows, in a sentence, for readers who cannot see it.
+        log_y: whether y is logarithmic; then values at or below zero are not drawn.
+        x_ticks: ticks with their labels, to replace round numbers.
         from_zero: y begins at zero.
     """
 
@@ -84,7 +84,7 @@ class Chart:
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Of a drawing, px. `letter`: width of one, about."""
+    """Size of a drawing, px, and its most ticks per axis."""
 
     name: str
     width: int
@@ -102,7 +102,7 @@ ROW_PX = 15.0
 """Height of a line of labels."""
 
 LETTER_PX = 6.5
-"""Width of a letter of a label, about: 12 px sans-serif."""
+"""Approximate width of a letter of a label: 12 px sans-serif."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """`d` of an SVG path; `points` are circles (x, y). `number` chooses the colour."""
+    """`d` of an SVG path, or `dots`, which are circles (x, y). `number` chooses the colour."""
 
     d: str
     shape: str
@@ -162,8 +162,8 @@ class Drawing:
 
 
 def legend(charts: Sequence[Chart]) -> list[tuple[str, str]]:
-    """(class, name) of what has to be named beside some plots, each once: series where a plot has several, limits,
-    grounds."""
+    """(class, name) of everything that a legend of some plots must name, each once: series where a plot has several,
+    limits, grounds."""
     named: dict[tuple[str, str], None] = {}
     for chart in charts:
         if len(chart.series) > 1:
@@ -223,7 +223,7 @@ def _shown(y: float, chart: Chart) -> bool:
 
 
 def _ends(values: list[float], log: bool, margin: float, from_zero: bool) -> tuple[float, float]:
-    """Of an axis, with a share of its length as margin; an axis of one value, or none, has a length all the same."""
+    """Ends of an axis, with a share of its length as margin. Even with one value, or none, an axis has a length."""
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
     if log:
         low, high = (low, high) if values and low > 0 else (0.1, 1.0)
@@ -249,7 +249,7 @@ def _round(low: float, high: float, log: bool, most: int) -> list[float]:
 
 
 def _apart(every: list[Tick]) -> tuple[Tick, ...]:
-    """Those whose labels do not run into each other."""
+    """The ticks whose labels do not run into each other."""
     kept: list[Tick] = []
     for tick in every:
         room = LETTER_PX * (len(tick.label) + len(kept[-1].label)) / 2 + 6 if kept else 0.0
@@ -259,7 +259,7 @@ def _apart(every: list[Tick]) -> tuple[Tick, ...]:
 
 
 def _marks(every: Sequence[tuple[float, str]], right: float) -> tuple[Line, ...]:
-    """(x, name) of each above the plot, in as many rows as keep names from running into each other."""
+    """Marks (x, name) with their names above the plot, in as many rows as names need not to run into each other."""
     ends: list[float] = []
     lines = []
     for at, name in sorted(every):
@@ -272,7 +272,7 @@ def _marks(every: Sequence[tuple[float, str]], right: float) -> tuple[Line, ...]
 
 
 def _joined(points: Sequence[Point | None], steps: bool) -> str:
-    """The line through the points, broken where there is none."""
+    """The line through the points, broken where a point is None."""
     parts: list[str] = []
     before: Point | None = None
     for point in points:

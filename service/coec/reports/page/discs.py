@@ -1,5 +1,5 @@
-"""Plots in polar coordinates as SVG: discs on which directions lie, or errors with their directions. As with `charts`,
-their colours follow the page and equal figures give equal bytes."""
+"""Plots in polar coordinates as SVG: discs that show directions, or errors with their directions. As with `charts`,
+colours follow the page, and equal figures give equal bytes."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 SIDE = 344
-"""Width and height of a drawing, px: what a phone shows without making it smaller."""
+"""Width and height of a drawing, px: a phone shows it without shrinking it."""
 
 RADIUS = 132.0
-"""Of the disc, px: labels stand around it."""
+"""Radius of the disc, px; labels stand around it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +19,8 @@ class DotKind:
 
     Attributes:
         tone: its colour, as in `blocks.Tone`.
-        shape: told without the colour, too.
-        full: or hollow.
+        shape: its shape, which tells kinds apart without colour.
+        full: whether it is filled or hollow.
     """
 
     name: str
@@ -31,7 +31,7 @@ class DotKind:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """Right and up of the centre, as shares of the radius; `told` is shown by who points at it."""
+    """A dot right of and above the centre, as shares of the radius; `told` is shown when a reader points at it."""
 
     right: float
     up: float
@@ -41,7 +41,7 @@ class Dot:
 
 @dataclass(frozen=True, slots=True)
 class Ring:
-    """About the centre, at a share of the radius. `goal`: what lies within is good."""
+    """A ring about the centre, at a share of the radius. `goal`: what lies within is good."""
 
     share: float
     label: str
@@ -53,10 +53,10 @@ class Disc:
     """A plot.
 
     Attributes:
-        told: what is to be seen, in a sentence, for who does not see it.
-        compass: what stands at the right, above, at the left and below.
-        rings: inside of the rim, which has no label.
-        dots: the last ones lie on top.
+        told: what the plot shows, in a sentence, for readers who cannot see it.
+        compass: labels at the right, at the top, at the left and at the bottom.
+        rings: inside the rim; the rim itself has no label.
+        dots: later ones lie on top.
     """
 
     title: str
@@ -67,5 +67,5 @@ class Disc:
 
 
 def place(dot: Dot) -> tuple[float, float]:
-    """Of a dot in the drawing, px from its upper left corner."""
+    """Place of a dot in the drawing, px from its upper left corner."""
     return round(SIDE / 2 + RADIUS * dot.right, 1), round(SIDE / 2 - RADIUS * dot.up, 1)

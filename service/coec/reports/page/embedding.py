@@ -1,4 +1,4 @@
-"""Pictures within a page: as they are where they are small, else made smaller until all of them fit."""
+"""Pictures within a page: small ones as they are, the others shrunk until all of them fit."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from coec.config import LimitsConfig
 from coec.errors import DecodeError
 
 BUDGET_BYTES = 2_000_000
-"""Of all pictures of a page: base64 makes 2.7 MB of them, and a page shall not be larger than 3 MB."""
+"""Limit for all pictures of a page: base64 makes 2.7 MB of it, and a page shall not be larger than 3 MB."""
 
 LADDER = ((1920, 90), (1600, 84), (1400, 80), (1200, 76), (1000, 72), (800, 66), (640, 60), (480, 50))
-"""Largest side (px) and quality (WebP) of all pictures that are too large as they are; the first with which they fit is
-taken. A page is at most 1040 px wide, a screen may have two pixels for each of those."""
+"""Largest side (px) and WebP quality of all pictures that are too large as they are; the first step with which they fit
+is taken. A page is at most 1040 px wide, and a screen may have two pixels for each of those."""
 
 SMALL_SHARE = 1 / 8
-"""Of the budget: what is no larger stays as it is, to the byte."""
+"""A picture of at most this share of the budget stays as it is, to the byte."""
 
 LIMITS = LimitsConfig()
-"""Of a picture: some come from a vehicle."""
+"""Limits of a picture, because some come from a vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +39,10 @@ class Embedded:
 
 
 def embedded(pictures: Sequence[bytes], budget_bytes: int = BUDGET_BYTES) -> list[Embedded]:
-    """All pictures of a page (bytes of PNG or JPEG files), in their order, together within the budget.
+    """All pictures of a page (bytes of PNG or JPEG files) in their order, together within the budget.
 
     Raises:
-        DecodeError: one is no such picture, or there are so many that not even the smallest form fits.
+        DecodeError: one is no such picture, or there are so many that they do not fit even in the smallest form.
     """
     probed = [probe(data, LIMITS) for data in pictures]
     small = [len(data) <= SMALL_SHARE * budget_bytes for data in pictures]

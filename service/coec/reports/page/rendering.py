@@ -1,7 +1,7 @@
 """From a `Page` to one HTML file that loads nothing from anywhere.
 
-Names that came over a network are text in it twice over: templates escape whatever they are given, and the policy in
-the head of the page lets no script run but the one that comes with it.
+Names that came over a network can only ever be text, for two reasons: templates escape whatever they are given, and the
+content policy in the head of the page lets no script run but the page's own.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from coec.reports.page.blocks import Compare, Page, Picture, Pictures, Section, 
 from coec.reports.page.embedding import Embedded, embedded
 
 TREND_WIDTH, TREND_HEIGHT, TREND_MARGIN = 180, 40, 3
-"""Of a plot within a table, px."""
+"""Size of a plot within a table, px."""
 
 LEAST_CONTENTS = 3
-"""Sections from which on a page has a list of them."""
+"""A page with at least so many sections has a list of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """A section, and what it is called in an address."""
+    """A section and its anchor in an address."""
 
     section: Section
     anchor: str
 
 
 def write(path: Path, page: Page) -> Path:
-    """The page as a file.
+    """Writes the page to a file.
 
     Raises:
-        OutputError: it cannot be written.
-        DecodeError: a picture of it is none.
+        OutputError: the file cannot be written.
+        DecodeError: one of its pictures cannot be decoded.
     """
     return output.write(path, render(page).encode())
 
 
 def render(page: Page) -> str:
-    """The document.
+    """The page as an HTML document.
 
     Raises:
-        DecodeError: a picture of it is none.
+        DecodeError: one of its pictures cannot be decoded.
     """
     pictures = list(_pictures(page))
     shown = embedded([picture.data for picture in pictures])
@@ -83,7 +83,7 @@ def _pictures(page: Page) -> Iterator[Picture]:
 
 
 def _placed(sections: tuple[Section, ...]) -> list[_Placed]:
-    """With anchors that occur once each, whatever the titles are."""
+    """The sections with unique anchors, whatever the titles are."""
     taken: set[str] = set()
     placed = []
     for section in sections:
@@ -116,7 +116,7 @@ def _environment() -> Environment:
 
 
 def _prose(text: str) -> Markup:
-    """A sentence as HTML, with what stands between two backticks as code; one without a partner is a backtick."""
+    """A sentence as HTML. Text between two backticks is code; with an odd number of backticks none is."""
     parts = text.split("`")
     if len(parts) % 2 == 0:
         return escape(text)

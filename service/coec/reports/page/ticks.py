@@ -5,17 +5,17 @@ from __future__ import annotations
 from math import ceil, floor, isfinite, log10
 
 STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
-"""Between two ticks of a linear axis, times a power of ten."""
+"""Distance between two ticks of a linear axis, times a power of ten."""
 
 LOG_STEPS = ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0))
-"""Of a decade of a logarithmic axis, the sparsest first."""
+"""Ticks within a decade of a logarithmic axis, the sparsest choice first."""
 
 LOG_ENOUGH = 3
-"""Ticks that a logarithmic axis has at least, if its decades allow."""
+"""Fewest ticks of a logarithmic axis, if its decades allow."""
 
 
 def linear(low: float, high: float, most: int) -> list[float]:
-    """Round numbers within both ends, at most so many (2 or more), as many as possible."""
+    """Round numbers between the two ends: as many as possible, but at most `most` (2 or more)."""
     if not (isfinite(low) and isfinite(high)) or high <= low:
         return [low]
     rough = (high - low) / most
@@ -28,7 +28,7 @@ def linear(low: float, high: float, most: int) -> list[float]:
 
 
 def logarithmic(low: float, high: float) -> list[float]:
-    """Round numbers within both ends, which are above zero."""
+    """Round numbers between the two ends, which must be above zero."""
     found: list[float] = []
     for steps in LOG_STEPS:
         found = [
@@ -43,5 +43,5 @@ def logarithmic(low: float, high: float) -> list[float]:
 
 
 def label(value: float) -> str:
-    """As short as it can be, with a true minus."""
+    """A number in its shortest form, with a true minus."""
     return f"{value:g}".replace("-", "−")

@@ -13,15 +13,15 @@ GROUPED_FROM = 10_000
 
 
 def number(value: float | None, digits: int = 3, sign: bool = False) -> str:
-    """With so many digits after the point."""
+    """A number with so many digits after the point."""
     if value is None or not isfinite(value):
         return NONE
-    # Adding zero makes -0 of it 0.
+    # Adding zero turns -0 into 0.
     return _true_minus(f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}")
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """With so many digits that tell, none of them lost before the point."""
+    """A number with so many significant digits; all digits before the point are kept."""
     if value is None or not isfinite(value):
         return NONE
     if value == 0.0:
@@ -39,7 +39,7 @@ def count(value: int, one: str, several: str | None = None) -> str:
 
 
 def percent(share: float | None, digits: int = 1) -> str:
-    """A share of 1."""
+    """A share of 1 in percent."""
     return NONE if share is None or not isfinite(share) else f"{100.0 * share:.{digits}f}\N{NARROW NO-BREAK SPACE}%"
 
 
