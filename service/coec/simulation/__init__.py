@@ -1,4 +1,4 @@
-"""A vehicle that does not exist: a procedural street, cameras and LiDARs cast by rays in it, faults, and the truth.
+"""A simulated vehicle: a procedural street, cameras and LiDARs rendered in it by ray casting, faults, and the truth.
 
 Needs the optional extra `sim` (embreex: Intel's Embree). World frame: x, y horizontal, z up, metres. Everything follows
 from a seed: the same seed gives the same bytes.

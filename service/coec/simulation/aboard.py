@@ -1,4 +1,4 @@
-"""The sensors aboard: each makes a frame by its number alone, of the scene around it and of what is wrong with it."""
+"""The sensors aboard: each makes a frame from its number alone, given the scene around it and the sensor's faults."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from coec.simulation.weather import CLEAR, SHOWER_S, rained_lens, rainy_air
 
 Doubles = NDArray[np.float64]
 Mount = Callable[[float], Matrix4]
-"""Pose (4, 4) of a sensor in the ego frame, by the time: it may be knocked."""
+"""Pose (4, 4) of a sensor in the ego frame as a function of time, because it may be knocked."""
 Frame = CameraFrame | LidarFrame | EgoMotion
 
 ROW_PARTS = 24
-"""Parts in which a rolling shutter takes its rows: at 10 m/s and 30 ms the camera moves 1.3 cm from one to the next,
-less than a pixel of anything beyond 3 m."""
+"""Parts in which a rolling shutter takes its rows: at 10 m/s and 30 ms the camera moves 1.3 cm from one part to the
+next, less than a pixel of anything beyond 3 m."""
 BODY = np.float32(0.05)
-"""Share of the light of the horizon that the black body of the vehicle sends back."""
+"""Share of the horizon's light that the black body of the vehicle reflects."""
 NEAREST_M = 1.0
 """Range whose inverse has the largest depth code, 65535."""
 _LOSS, _EXPOSURE, _BEAMS, _SWEEP = 130, 131, 132, 133
-"""Purposes of random numbers."""
+"""Keys of random numbers, by purpose."""
 
 
 class Aboard(Protocol):
-    """What sends frames."""
+    """A sensor that sends frames."""
 
     @property
     def hz(self) -> float:
@@ -54,7 +54,7 @@ class Aboard(Protocol):
         ...
 
     def late_s(self, time_s: float) -> float:
-        """By how much the stamp of a frame that is made at a time is late."""
+        """How late the stamp of a frame is that is made at a time, seconds."""
         ...
 
     def is_lost(self, index: int, time_s: float) -> bool:
@@ -68,13 +68,13 @@ class Aboard(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """On which a sensor's frames go, some of them lost.
+    """The connection that carries a sensor's frames and may lose some.
 
     Attributes:
-        name: of the frame of coordinates in which the sensor speaks.
+        name: of the sensor's coordinate frame.
         hz: frames a second.
         number: of the stream, in the order of messages with equal stamps.
-        key: begins that of the sensor's random numbers; empty where there is one sensor of its kind.
+        key: prefix of the keys of the sensor's random numbers; empty if it is the only sensor of its kind.
         faults: of the sensor.
     """
 
@@ -91,7 +91,7 @@ class Wire:
 
 
 class OdometerAboard:
-    """Tells ego-motion."""
+    """The odometer, which sends ego-motion."""
 
     def __init__(self, journey: Journey, wire: Wire) -> None:
         self._journey = journey
@@ -116,10 +116,10 @@ class OdometerAboard:
 
 
 class LidarAboard:
-    """Turns.
+    """A LiDAR, which sends sweeps.
 
     Attributes:
-        T_ego_lidar: where it is.
+        T_ego_lidar: its pose over time.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class LidarAboard:
         delay_s: float = 0.0,
         own_body: Solid | None = None,
     ) -> None:
-        """`own_body`: of the vehicle, what the driver takes out of its clouds and what stands before the rest."""
+        """`own_body`: the vehicle itself, which hides what lies behind it and whose points the driver removes."""
         self.T_ego_lidar = T_ego_lidar
         self.hz = wire.hz
         self._journey, self._wire, self._model = journey, wire, model
@@ -173,7 +173,7 @@ class LidarAboard:
 
 
 def _past(own_body: Solid, T_ego_lidar: Matrix4, found: Sweep) -> Sweep:
-    """The points that the vehicle does not hide."""
+    """The points that the vehicle itself does not hide."""
     rays = np.einsum("ij,nj->ni", T_ego_lidar[:3, :3], found.xyz_m).astype(np.float32)
     origins = np.empty_like(rays)
     origins[:] = T_ego_lidar[:3, 3]
@@ -187,7 +187,7 @@ class Optics:
     """How a camera takes its pictures: see `drive.DriveConfig`.
 
     Attributes:
-        rows: shares of the height between which there is a picture; beyond, as where the lens shows nothing.
+        rows: shares of the height between which the picture is drawn; the rest is black as outside the lens.
     """
 
     camera: Camera
@@ -200,20 +200,20 @@ class Optics:
 
     @property
     def first_row(self) -> int:
-        """Of the picture."""
+        """First row that is drawn."""
         return round(self.rows[0] * self.camera.height)
 
     @property
     def end_row(self) -> int:
-        """After its last one."""
+        """Row after the last one that is drawn."""
         return round(self.rows[1] * self.camera.height)
 
 
 class CameraAboard:
-    """Exposes.
+    """A camera, which sends pictures.
 
     Attributes:
-        T_ego_camera: where it is.
+        T_ego_camera: its pose over time.
     """
 
     def __init__(self, journey: Journey, wire: Wire, optics: Optics, T_ego_camera: Mount, own_body: Solid) -> None:
@@ -232,7 +232,7 @@ class CameraAboard:
         self._repeated: tuple[int, CameraFrame] | None = None
 
     def mask_at(self, T_ego_camera: Matrix4) -> NDArray[np.bool_]:
-        """(height, width): pixels that show the world, with a margin, from where the workshop mounted the camera."""
+        """(height, width): pixels that show the world, less a margin, from where the workshop mounted the camera."""
         usable = self._seen & ~self._own_body(T_ego_camera)
         return np.asarray(cv2.erode(np.pad(usable.astype(np.uint8), 2), np.ones((5, 5), np.uint8))[2:-2, 2:-2] > 0)
 
@@ -284,7 +284,7 @@ class CameraAboard:
         return CameraFrame(stamp_ns, self._wire.name, image, sequence=index, depth=depth)
 
     def _rows(self, time_s: float, T_ego_camera: Matrix4) -> list[Exposure]:
-        """Where the camera is while it takes its rows."""
+        """The parts of a picture's rows, each with the pose of the camera at its time."""
         optics = self._optics
         height, readout_s = optics.camera.height, optics.rolling_shutter_s
         parts = min(ROW_PARTS, height) if readout_s else 1
@@ -309,7 +309,7 @@ class CameraAboard:
         return np.maximum.reduce(covers) if covers else None
 
     def _own_body(self, T_ego_camera: Matrix4) -> NDArray[np.bool_]:
-        """(h, w): pixels that show the vehicle itself; depends on how the camera is mounted."""
+        """(h, w): pixels that show the vehicle itself, which depend on the mount of the camera."""
         key = T_ego_camera.tobytes()
         if self._hidden is None or self._hidden[0] != key:
             rays = np.einsum("ij,nj->ni", T_ego_camera[:3, :3], self._rays.directions).astype(np.float32)
@@ -322,6 +322,6 @@ class CameraAboard:
 
 
 def product(a: Matrix4, b: Matrix4) -> Matrix4:
-    """A·B (4, 4), with the same bits whatever BLAS does."""
+    """A·B (4, 4), computed without BLAS so that the bits are always the same."""
     result: Matrix4 = np.einsum("ij,jk->ik", a, b)
     return result

@@ -16,9 +16,9 @@ Doubles = NDArray[np.float64]
 Floating = NDArray[np.floating]
 
 FOOT_M = -2.5
-"""Walls go this far down: no gap opens where the ground falls away beside the road."""
+"""Walls reach this far down, so that no gap opens where the ground falls away beside the road."""
 REVEAL_M = 0.16
-"""How far a pane is set back."""
+"""How far a pane is set back in the wall."""
 WALL_COLOURS: tuple[Colour, ...] = (
     (0.55, 0.65, 0.72), (0.40, 0.55, 0.66), (0.70, 0.72, 0.74), (0.28, 0.36, 0.52), (0.20, 0.26, 0.42),
     (0.62, 0.62, 0.58), (0.45, 0.58, 0.72), (0.35, 0.38, 0.40), (0.62, 0.58, 0.45), (0.80, 0.82, 0.84),
@@ -45,7 +45,7 @@ class Plan:
 
 
 def house(rng: np.random.Generator, plan: Plan) -> Mesh:
-    """A house in colours of its own."""
+    """A house of a plan, in random colours."""
     colour = np.asarray(WALL_COLOURS[rng.integers(len(WALL_COLOURS))]) * rng.uniform(0.75, 1.1)
     wall = Material.BRICK if rng.random() < 0.4 else Material.PLASTER
     frame = np.full(3, rng.choice([0.75, 0.6, 0.12, 0.25])) * np.array([0.95, 1.0, 1.0])

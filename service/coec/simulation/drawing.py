@@ -1,4 +1,4 @@
-"""Single frames of some drives, drawn by several processes ahead of whoever sends them."""
+"""Single frames of several drives, drawn by several processes before they have to be sent."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class Drawers:
         self._executor = executor
 
     def draw(self, drive: int, entry: Arrival) -> Future[Message]:
-        """An entry of the plan of a drive, by the number of its configuration."""
+        """Draws an entry of the plan of a drive; `drive` is the index of its configuration."""
         return self._executor.submit(_drawn, drive, entry)
 
 
 @contextmanager
 def drawing(configs: Sequence[RigConfig], processes: int) -> Iterator[Drawers]:
-    """Drawers of the drives of these configurations; each process has a street of its own for every drive of which it
+    """Drawers for the drives of these configurations. Each process builds its own street for every drive of which it
     draws a frame."""
     with spawned(processes, begin, tuple(configs)) as pool:
         yield Drawers(pool)
@@ -36,7 +36,7 @@ _drives: dict[int, RigDrive] = {}
 
 
 def begin(configs: tuple[RigConfig, ...]) -> None:
-    """Draw frames of these drives, in this process."""
+    """Prepares this process to draw frames of these drives."""
     global _configs  # one set of drives per process, as the pool's initializer gives it
     _configs = configs
     _drives.clear()

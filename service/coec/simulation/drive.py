@@ -1,7 +1,7 @@
-"""A drive that never was: frames of a camera, a LiDAR and an odometer on one vehicle, with faults, and the truth.
+"""A simulated drive: frames of a camera, a LiDAR and an odometer on one vehicle, with faults, and the truth.
 
-A `sources.recording.Recording`: every frame follows from the seed and its number alone, and is made when it is asked
-for, so a drive of any length needs the memory of one place in the street.
+It is a `sources.recording.Recording`. Every frame follows from the seed and its number alone and is made on request, so
+a drive of any length needs only the memory of one place in the street.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from coec.simulation.vehicle import T_ego_lidar, body, workshop_T_camera_lidar
 from coec.sources.recording import MOTION_REACH_NS, Message, chosen_indices
 
 XI, ALPHA = -0.2, 0.6
-"""Of the double sphere fisheye: near those of common lenses."""
+"""Parameters of the double sphere fisheye, close to those of common lenses."""
 WIDE_DEG, PINHOLE_DEG = 90, (10, 120)
-"""Width of a pinhole camera unless told otherwise, and the least and greatest."""
+"""Default field of view of a pinhole camera, and the least and greatest."""
 _EGO, _LIDAR, _CAMERA = 0, 1, 2
 """Streams in the order of messages with equal stamps."""
 
@@ -49,14 +49,14 @@ class DriveConfig:
             camera.
         half_view_deg: the lens sees this far off its axis: 92.5 for 185°.
         lidar: a name in `LIDARS`, or any model.
-        camera_hz, lidar_hz, ego_hz: frames per second; a sweep always takes the turn of its model.
+        camera_hz, lidar_hz, ego_hz: frames per second; a sweep always lasts one period of its model.
         camera_delay_s: the camera exposes this long after the stamp of its sweep.
-        speed_mps: mean speed, 0 stands; None = as usual in the scene.
+        speed_mps: mean speed, 0 for a standing vehicle; None = as usual in the scene.
         traffic: whether anything else moves.
         start_m: where along the road the drive begins.
-        rolling_shutter_s: from the first row of a picture to the last; its stamp is that of the middle row.
-        intrinsics_off: (3,) percent by which the focal length of the rig (of itself) and its principal point (of width
-            and height) differ from those of the camera that takes the pictures.
+        rolling_shutter_s: time from the first row of a picture to the last; the stamp is that of the middle row.
+        intrinsics_off: (3,) by how many percent the rig's focal length (of itself) and principal point (of width and
+            height) differ from those of the camera that takes the pictures.
         faults: see `faults`.
         workshop: (6,) ξ, degrees and metres about the camera axes, by which the calibration of the rig is wrong.
         depth: attach the exact depth of each picture.
@@ -83,7 +83,7 @@ class DriveConfig:
     lens: Lens = field(default_factory=Lens)
 
     def drive(self) -> SimulatedDrive:
-        """Which it describes."""
+        """The drive that it describes."""
         return SimulatedDrive(self)
 
 
@@ -92,13 +92,13 @@ class SimulatedDrive:
 
     Attributes:
         config: as given.
-        rig: with the workshop's calibration as nominal, the intrinsics that the workshop believes in, and a mask of
-            lens and body.
-        camera: that takes the pictures.
+        rig: with the workshop's calibration as nominal, the intrinsics that the workshop assumes, and a mask of lens
+            and body.
+        camera: the true camera that takes the pictures.
         configuration: None, as for every recording that is not a window.
 
     Raises:
-        UsageError: a camera or a LiDAR that is not known, or figures out of range; names them.
+        UsageError: an unknown camera or LiDAR, or figures out of range; the message names them.
     """
 
     configuration = None
@@ -118,7 +118,7 @@ class SimulatedDrive:
         self._mount()
 
     def _mount(self) -> None:
-        """The camera of the configuration, beside the other sensors."""
+        """Mounts the camera of the configuration beside the other sensors."""
         config = self.config
         self.camera = camera_of(config.camera, config.half_view_deg)
         optics = Optics(
@@ -141,10 +141,10 @@ class SimulatedDrive:
         self.rig = Rig("sim", told, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask)
 
     def through(self, camera: str | Camera, half_view_deg: float) -> SimulatedDrive:
-        """The same drive with another lens: its surroundings are shared, so it is best drawn in step with this one.
+        """The same drive with another lens. Both share their surroundings, so they are best drawn in step.
 
         Raises:
-            UsageError: a camera that is not known.
+            UsageError: an unknown camera.
         """
         other = copy(self)
         other.config = replace(self.config, camera=camera, half_view_deg=half_view_deg)
@@ -153,12 +153,12 @@ class SimulatedDrive:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name for people."""
         return f"simulated drive, seed {self.config.seed}"
 
     @property
     def T_camera_lidar_start(self) -> Matrix4:
-        """(4, 4) the workshop's."""
+        """(4, 4) the workshop's calibration."""
         return self.rig.T_camera_lidar_nominal
 
     @cached_property
@@ -190,7 +190,7 @@ class SimulatedDrive:
             yield self._message(entry)
 
     def part(self, begin: int, end: int) -> list[Message]:
-        """Messages `begin` to `end` (excluded) of all, by their place in `messages()`: for several processes."""
+        """Messages `begin` to `end` (excluded) of `messages()`, so that several processes can share the work."""
         return [self._message(entry) for entry in self._plan[begin:end]]
 
     @property
@@ -214,7 +214,7 @@ class Rated(Protocol):
 
     @property
     def seconds(self) -> float:
-        """Of the drive."""
+        """Length of the drive."""
         ...
 
     @property
@@ -234,23 +234,24 @@ class Rated(Protocol):
 
 
 def check_rates(config: Rated) -> None:
-    """Raises UsageError where the length of a drive or a rate is none."""
+    """Raises UsageError where the length of a drive or a rate is not above 0."""
     for name in ("seconds", "camera_hz", "lidar_hz", "ego_hz"):
         if not 0 < getattr(config, name) < 1e6:
             raise UsageError(f"{name} of a simulated drive must be above 0, not {getattr(config, name)}")
 
 
 def stamps_of(plan: Iterable[Arrival], stream: int) -> tuple[int, ...]:
-    """Of one stream, ascending."""
+    """Stamps of one stream, ascending."""
     return tuple(entry.stamp_ns for entry in plan if entry.stream == stream)
 
 
 def needed(plan: list[Arrival], cameras: Collection[int], camera: int, lidar: int, ego: int) -> Iterator[Arrival]:
-    """The part of a plan that the chosen frames of a camera need: the sweep nearest to each, motion around it.
+    """The part of a plan that chosen frames of a camera need: these frames, the sweep nearest to each, and the motion
+    around them.
 
     Args:
         cameras: indices into the arrivals of the stream `camera`.
-        camera, lidar, ego: streams.
+        camera, lidar, ego: numbers of the streams.
 
     Raises:
         UsageError: an index out of range.
@@ -269,7 +270,7 @@ def needed(plan: list[Arrival], cameras: Collection[int], camera: int, lidar: in
 
 
 def lidar_of(choice: str | LidarModel) -> LidarModel:
-    """The model of a name. Raises UsageError, which names those that there are."""
+    """The model of a name. Raises UsageError, which lists the known names."""
     if isinstance(choice, LidarModel):
         return choice
     if choice not in LIDARS:
@@ -278,7 +279,7 @@ def lidar_of(choice: str | LidarModel) -> LidarModel:
 
 
 def camera_of(choice: str | Camera, half_view_deg: float) -> Camera:
-    """The camera of a name, see `DriveConfig`. Raises UsageError, which says what may be written."""
+    """The camera of a name, see `DriveConfig`. Raises UsageError, which lists the allowed forms."""
     if not isinstance(choice, str):
         return choice
     if found := re.fullmatch(r"fisheye(\d{2,4})", choice):
@@ -297,7 +298,7 @@ def camera_of(choice: str | Camera, half_view_deg: float) -> Camera:
 
 
 def _told(camera: Camera, off_percent: tuple[float, float, float]) -> Camera:
-    """The camera as the workshop believes it to be."""
+    """The camera as the workshop assumes it to be."""
     focal, across, down = (value / 100.0 for value in off_percent)
     told = {
         "fx": camera.fx * (1.0 + focal),
@@ -309,7 +310,7 @@ def _told(camera: Camera, off_percent: tuple[float, float, float]) -> Camera:
 
 
 def fisheye(width_px: int, half_view_deg: float) -> Camera:
-    """A square double sphere camera whose circle of this half angle just fits."""
+    """A square double sphere camera into which the circle of this half angle just fits."""
     half = math.radians(half_view_deg)
     sine, cosine = math.sin(half), math.cos(half)
     shifted_z = XI + cosine

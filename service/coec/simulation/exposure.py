@@ -15,14 +15,14 @@ from coec.simulation.render import tone
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """What a camera adds to a picture.
+    """How a camera degrades a picture.
 
     Attributes:
         blur_px: standard deviation of the point spread at full sharpness, pixels.
         vignetting: share of the light that is lost at the rim.
-        full_well: electrons at full exposure: shot noise is its square root.
-        read_noise: standard deviation, share of full exposure.
-        target: mean level to which the exposure is driven, linear, 0 to 1.
+        full_well: electrons at full exposure; shot noise is its square root.
+        read_noise: standard deviation as a share of full exposure.
+        target: mean level to which the exposure is controlled, linear, 0 to 1.
         gain: least and greatest factor on the light.
         jpeg_quality: 1 to 100.
         flare: share of the light that the glass scatters over the whole picture.
@@ -39,18 +39,18 @@ class Lens:
 
 
 NIGHT_BLUR_PX, NIGHT_NOISE, NIGHT_FULL_WELL = 1.5, 1.5, 0.25
-"""At night: point spread of an exposure of 30 ms on the way, pixels; factors on the read noise and on the electrons of
-full exposure, as of a sensor at 4 times its usual sensitivity."""
+"""At night: point spread of an exposure of 30 ms while driving, pixels; factors on the read noise and on the electrons
+of full exposure, as for a sensor at 4 times its usual sensitivity."""
 LOW_SUN_FLARE, FLARE_LIGHT, FLARE_SPREAD = 0.15, 30.0, 0.12
-"""Of a lens that the sun shines into: the scattered share, the light above which a source scatters no more (the sun's
-disc in the units of `Sky`), and the standard deviation of where it goes, as a share of the height of the picture."""
+"""For a lens with the sun in it: the scattered share of the light, the light at which scattering saturates (the sun's
+disc in the units of `Sky`), and the standard deviation of the scatter as a share of the height of the picture."""
 NIGHT_GAIN = 12.0
 NIGHT_TARGET = 0.08
-"""Mean level: cameras leave the night dark."""
+"""Mean level of pictures at night, which cameras leave dark."""
 
 
 def at_night(lens: Lens) -> Lens:
-    """What the camera does when it is dark: exposes for longer and amplifies more."""
+    """The camera in the dark: it exposes longer and amplifies more."""
     return replace(
         lens,
         blur_px=max(lens.blur_px, NIGHT_BLUR_PX),
@@ -69,11 +69,11 @@ def against_the_sun(lens: Lens) -> Lens:
 def expose(
     linear: Floats, seen: NDArray[np.bool_], lens: Lens, rng: np.random.Generator, *, light: float, dirt: Floats | None
 ) -> NDArray[np.uint8]:
-    """(h, w, 3) uint8 BGR of (h, w, 3) radiance.
+    """(h, w, 3) uint8 BGR picture of (h, w, 3) radiance.
 
     Args:
-        seen: (h, w), false outside the lens's circle: black.
-        light: share of the scene's light that is there.
+        seen: (h, w), false outside the lens's circle, where the picture is black.
+        light: share of the scene's light that is left.
         dirt: (h, w) cover of the lens, 0 clean to 1 opaque.
     """
     light_in = np.minimum(linear, np.float32(4.0)) * np.float32(light)  # the sun's disc blooms, but not over everything
@@ -89,7 +89,7 @@ def expose(
     level = float(np.minimum(picture[seen], 1.0).mean(dtype=np.float64)) if seen.any() else lens.target
     gain = float(np.clip(lens.target / max(level, 1e-6), *lens.gain))
     picture *= np.float32(gain)
-    # A gain multiplies the noise with the light: fewer electrons stand for full exposure.
+    # A gain amplifies the noise with the light: fewer electrons make full exposure.
     spread = np.sqrt(
         np.maximum(picture, 0) * np.float32(gain / lens.full_well) + np.float32((lens.read_noise * gain) ** 2)
     )
@@ -99,7 +99,7 @@ def expose(
 
 
 def dirt_cover(shape: tuple[int, int], share: float, seed: int) -> Floats:
-    """(h, w): blotches of all sizes over about this share of the picture."""
+    """(h, w) cover of the lens by blotches of all sizes, over about this share of the picture."""
     rng = np.random.default_rng([seed, 120])
     cover = np.zeros(shape, np.float32)
     for cells, weight in ((5, 1.0), (11, 0.6), (29, 0.35)):

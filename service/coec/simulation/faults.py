@@ -1,4 +1,4 @@
-"""What goes wrong on a drive, and when: one value per fault, and the words by which it is ordered.
+"""What goes wrong on a drive, and when: one class per kind of fault, and the words that order a fault.
 
 `KIND:BEGIN[-END][:KEY=VALUE,...]`, seconds from the start of the drive; without an end, to the end of the drive.
 """
@@ -19,13 +19,13 @@ from coec.geometry.se3 import perturb
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something that is so from `begin_s` until `end_s`, seconds from the start of the drive."""
+    """Something that is wrong from `begin_s` until `end_s`, seconds from the start of the drive."""
 
     begin_s: float
     end_s: float
 
     def active(self, time_s: float) -> bool:
-        """Whether it is so at this time."""
+        """Whether the fault is present at this time."""
         return self.begin_s <= time_s < self.end_s
 
 
@@ -50,12 +50,12 @@ class _Shift(Fault):
 
 @dataclass(frozen=True, slots=True)
 class Step(_Shift):
-    """The mount is knocked at once, and back again at the end."""
+    """The mount is knocked at once, and returns at the end."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drift(_Shift):
-    """The mount creeps evenly from begin to end, and stays where it then is."""
+    """The mount creeps evenly from begin to end, and then stays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class Dirt(Fault):
 
 @dataclass(frozen=True, slots=True)
 class Dark(Fault):
-    """This share of the light is left, with the gain of the camera at its end."""
+    """Only this share of the light is left, and the gain of the camera is at its limit."""
 
     light: float = 0.02
 
@@ -115,25 +115,25 @@ class OpenRoad(Fault):
 
 @dataclass(frozen=True, slots=True)
 class Night(Fault):
-    """No light but the vehicle's headlights; the camera exposes for longer and amplifies: blur and noise."""
+    """The headlights are the only light; the camera exposes longer and amplifies more, which adds blur and noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rain(Fault):
-    """It rains so much: hazy air, drops on the lens and before the LiDAR, weaker echoes."""
+    """Rain, millimetres an hour: hazy air, drops on the lens and before the LiDAR, weaker echoes."""
 
     mmph: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class LowSun(Fault):
-    """The sun stands low before the vehicle, and scatters in the lens."""
+    """The sun stands low ahead of the vehicle, and scatters in the lens."""
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetDrift(Fault):
-    """The clock of the camera creeps: its stamps are evenly later and later from begin to end, by so many seconds in
-    the end, and stay so."""
+    """The clock of the camera creeps: from begin to end its stamps get evenly later, up to so many seconds, and then
+    stay so."""
 
     seconds: float = 0.05
 
@@ -156,14 +156,14 @@ KINDS: dict[str, type[Fault]] = {
     "offset_drift": OffsetDrift,
 }
 CREEPING = ("drift", "offset_drift")
-"""What grows from begin to end."""
+"""Kinds that grow from begin to end."""
 FORMS = (
     "step:30:rx=3,tz=0.1 | drift:30-90:ry=2 | dirt:30-60:share=0.3 | dark:30-60:light=0.02 | frozen:30-60 | "
     "beams:30-60:share=0.5 | no-ego:30-60 | offset:30-60:seconds=0.05 | loss:30-60:share=0.3 | "
     "offset_drift:10-60:seconds=0.05 | tunnel:20-35 | open_road:20-50 | night:20-60 | rain:20-60:mmph=20 | "
     "low_sun:20-60"
 )
-"""One of each, for help and errors."""
+"""An example of each kind, for help and errors."""
 
 
 HARDEST_RAIN_MMPH = 150.0
@@ -174,7 +174,7 @@ def parse_fault(text: str) -> Fault:
     """A fault from its words.
 
     Raises:
-        UsageError: says what does not fit, and what to write.
+        UsageError: the words are wrong; the message says how, and what to write.
     """
     kind, _, rest = text.partition(":")
     span, _, settings = rest.partition(":")
@@ -205,7 +205,7 @@ def parse_fault(text: str) -> Fault:
 
 @dataclass(frozen=True, slots=True)
 class SensorFault:
-    """A fault of one sensor of a rig; `sensor` None: of the surroundings, or of all sensors alike."""
+    """A fault of one sensor of a rig; with `sensor` None, of the surroundings or of all sensors alike."""
 
     sensor: str | None
     fault: Fault
@@ -218,10 +218,11 @@ OF_LIDARS: tuple[type[Fault], ...] = (Step, Drift, Beams, Loss)
 
 
 def parse_sensor_fault(text: str, cameras: Collection[str], lidars: Collection[str]) -> SensorFault:
-    """`[SENSOR:]KIND:BEGIN...`. A step of a sensor turns it about, and shifts it along, its own axes.
+    """A fault of a rig from its words, `[SENSOR:]KIND:BEGIN...`. A step turns a sensor about, and shifts it along, the
+    sensor's own axes.
 
     Raises:
-        UsageError: says what does not fit, and what to write.
+        UsageError: the words are wrong; the message says how, and what to write.
     """
     first, _, rest = text.partition(":")
     if first in cameras or first in lidars:
@@ -253,7 +254,7 @@ def _number(text: str, name: str, value: str) -> float:
 
 
 def now(faults: Iterable[Fault], kind: type[F], time_s: float) -> Iterator[F]:
-    """The faults of a kind that are so at a time."""
+    """The faults of a kind that are present at a time."""
     return (fault for fault in faults if isinstance(fault, kind) and fault.active(time_s))
 
 
@@ -270,7 +271,7 @@ def shifted(T_camera_lidar: NDArray[np.float64], faults: tuple[Fault, ...], time
 
 
 def late_s(faults: tuple[Fault, ...], time_s: float) -> float:
-    """By how much the stamp of a camera frame that is taken at a time is late."""
+    """How late the stamp of a camera frame is that is taken at a time, seconds."""
     total = 0.0
     for fault in faults:
         if isinstance(fault, Offset) and fault.active(time_s):
@@ -281,5 +282,5 @@ def late_s(faults: tuple[Fault, ...], time_s: float) -> float:
 
 
 def _share(fault: Fault, time_s: float) -> float:
-    """How much of a creeping fault there is, 0 to 1."""
+    """How far a creeping fault has grown, 0 to 1."""
     return min(max((time_s - fault.begin_s) / (fault.end_s - fault.begin_s), 0.0), 1.0)

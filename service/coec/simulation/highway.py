@@ -20,7 +20,7 @@ DELINEATORS_M = 50.0
 
 
 def highway(rng: np.random.Generator, site: Site, length_m: float) -> None:
-    """A stretch of it."""
+    """Adds a stretch of highway."""
     s = np.arange(0.0, length_m + 1e-6, STEP_M)
     grey, white = np.array([0.19, 0.19, 0.19]) * rng.uniform(0.9, 1.1), (0.72, 0.74, 0.74)
     site.meshes.append(quads(site.strip(s, (-OUTER_M, OUTER_M), (0.0, 0.0)), grey, Material.ASPHALT))

@@ -16,11 +16,11 @@ Doubles = NDArray[np.float64]
 STEP_M = 3.0
 GARAGE_HALF_M, GARAGE_HIGH_M, BAY_M, BAY_FRONT_M, PILLARS_M = 8.6, 2.9, 2.6, 3.3, 7.8
 """Half the width of a deck with an aisle and a row of bays on either side, its height, the width of a bay, where bays
-begin, and the distance of its pillars: common sizes of parking decks."""
+begin, and the spacing of pillars: common sizes of parking decks."""
 ROOM_M, ROOM_HIGH_M, DOORWAY_M, DOORWAY_HIGH_M, AISLE_M = 12.0, 3.3, 2.6, 2.5, 1.7
-"""Length and height of a room, the doorway through which the vehicle goes, and half the aisle that furniture leaves."""
+"""Length and height of a room, width and height of the doorways, and half the aisle that furniture leaves free."""
 GARAGE_LIGHT, ROOM_LIGHT = 3.0, 6.0
-"""Of their lamps, in that of a tunnel's: a deck with lamps over its bays, too, and a room to work in."""
+"""Light of their lamps relative to a tunnel's: a deck has lamps over its bays, too, and people work in a room."""
 
 
 def room_half_m(seed: int) -> float:
@@ -29,17 +29,17 @@ def room_half_m(seed: int) -> float:
 
 
 def garage_bore(road: Road, begin_m: float, end_m: float) -> Bore:
-    """The air of a garage between two places."""
+    """The space of a garage between two places."""
     return bore_of(road, begin_m, end_m, GARAGE_HALF_M, GARAGE_HIGH_M, GARAGE_LIGHT)
 
 
 def room_bore(road: Road, begin_m: float, end_m: float, half_m: float) -> Bore:
-    """The air of the rooms between two places."""
+    """The space of the rooms between two places."""
     return bore_of(road, begin_m, end_m, half_m, ROOM_HIGH_M, ROOM_LIGHT)
 
 
 def garage(rng: np.random.Generator, site: Site, length_m: float) -> None:
-    """Walls, pillars, beams, ducts and parked cars of a stretch."""
+    """Adds walls, pillars, beams, ducts and parked cars of a stretch of garage."""
     s = np.arange(0.0, length_m + 1e-6, STEP_M)
     half, high = GARAGE_HALF_M, GARAGE_HIGH_M
     _shell(rng, site, s, half, high)
@@ -71,7 +71,7 @@ def garage(rng: np.random.Generator, site: Site, length_m: float) -> None:
 
 
 def rooms(rng: np.random.Generator, site: Site, length_m: float, half_m: float) -> None:
-    """Rooms of a stretch with their furniture."""
+    """Adds the rooms of a stretch with their furniture."""
     s = np.arange(0.0, length_m + 1e-6, STEP_M)
     _shell(rng, site, s, half_m, ROOM_HIGH_M)
     for begin in np.arange(0.0, length_m - 1e-6, ROOM_M):
@@ -117,7 +117,7 @@ def _shell(rng: np.random.Generator, site: Site, s: Doubles, half_m: float, high
 def _cross_wall(
     rng: np.random.Generator, site: Site, at_m: float, half_m: float, high_m: float, gap_m: float, gap_high_m: float
 ) -> None:
-    """A wall across the way with an opening of ± `gap_m` in it, and a frame around that."""
+    """A wall across the way, with an opening of ± `gap_m` and a frame around the opening."""
     colour, frame, thick = rng.uniform(0.3, 0.75, 3), rng.uniform(0.05, 0.5, 3), 0.1
     parts = [
         box([-thick, low, 0.0], [thick, up, high_m], colour, Material.PLASTER)
@@ -221,6 +221,6 @@ def _stand(rng: np.random.Generator) -> Mesh:
 
 
 def _closed_below(mesh: Mesh, x_m: float, y_m: float, z_m: float) -> Mesh:
-    """A box with its underside, which `box` leaves open."""
+    """A mesh of `box` with an underside, which `box` leaves open."""
     under = [[-x_m, -y_m, z_m], [x_m, -y_m, z_m], [x_m, y_m, z_m], [-x_m, y_m, z_m]]
     return join([mesh, quads([under], mesh.colour[0], Material(int(mesh.material[0])))])

@@ -1,5 +1,5 @@
-"""The way of a vehicle through a place that does not exist: where it is, what stands and drives around it, the weather,
-and what its odometer says of it. What a sensor is makes no difference here."""
+"""The way of a vehicle through a simulated place: where it is, what stands and drives around it, the weather, and what
+its odometer reports. It does not depend on the sensors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DAYLIGHT = np.empty((0, 4, 3))
 """No headlights."""
 SPEED_SCALE_SIGMA, SPEED_SIGMA_MPS = 0.004, 0.02
 TURN_BIAS_SIGMA_RADPS, TURN_SIGMA_RADPS = 0.0005, 0.002
-"""Errors of odometry and gyroscope, as of series sensors: constant over a drive, and of each sample."""
+"""Errors of odometry and gyroscope, as in series sensors: one constant over a drive, and one of each sample."""
 
 
 class Journey:
@@ -45,10 +45,10 @@ class Journey:
         self, seed: int, scene: str, seconds: float, *, speed_mps: float | None, start_m: float, traffic: bool,
         faults: tuple[Fault, ...],
     ) -> None:  # fmt: skip
-        """See `drive.DriveConfig`; of the faults, those of the surroundings and of the odometer are taken.
+        """See `drive.DriveConfig`; only faults of the surroundings and of the odometer have an effect here.
 
         Raises:
-            UsageError: a scene that is not known, or a fault that it cannot have.
+            UsageError: an unknown scene, or a fault that the scene cannot have.
         """
         self.seconds = seconds
         self._seed = seed
@@ -60,11 +60,11 @@ class Journey:
         self.trip: Trip = build_trip(seed, self._town.road, self._town.lane_left_m(), pace)
 
     def rng(self, *key: int) -> np.random.Generator:
-        """Of a purpose: the same key gives the same numbers."""
+        """Random numbers for a purpose: the same key gives the same numbers."""
         return np.random.default_rng([self._seed, *key])
 
     def seed_of(self, *key: int) -> int:
-        """A seed for what takes one: that of the drive, or of a key another."""
+        """A seed for functions that take one: that of the drive, or with a key another."""
         return int(self.rng(136, *key).integers(2**31)) if key else self._seed
 
     def pose(self, time_s: float) -> Matrix4:
@@ -72,7 +72,7 @@ class Journey:
         return np.asarray(self.trip.poses(np.array([time_s]))[0], np.float64)
 
     def scene(self, time_s: float) -> Scene:
-        """What is around the vehicle."""
+        """The surroundings of the vehicle at a time."""
         at_m = float(self.trip.pace.progress(np.array([time_s]))[0])
         scene = self._town.scene(at_m, time_s, self.trip.pace.progress)
         sky = self._weather(time_s)
@@ -82,15 +82,15 @@ class Journey:
         return scene
 
     def is_night(self, time_s: float) -> bool:
-        """Whether there is no light but that of lamps."""
+        """Whether lamps are the only light."""
         return any(self._now(wrong.Night, time_s))
 
     def is_against_the_sun(self, time_s: float) -> bool:
-        """Whether the sun stands low before the vehicle."""
+        """Whether the sun stands low ahead of the vehicle."""
         return any(self._now(wrong.LowSun, time_s))
 
     def rain(self, time_s: float) -> float:
-        """Millimetres an hour."""
+        """Rain in millimetres an hour."""
         return max((fault.mmph for fault in self._now(wrong.Rain, time_s)), default=0.0)
 
     def is_odometer_silent(self, time_s: float) -> bool:
@@ -98,7 +98,7 @@ class Journey:
         return any(self._now(wrong.NoEgo, time_s))
 
     def motion(self, index: int, time_s: float, stamp_ns: int) -> EgoMotion:
-        """The sample of this number, with the errors of odometer and gyroscope."""
+        """The sample of this number, with errors of odometer and gyroscope."""
         linear, angular = self.trip.twist(time_s)
         constant, sample = self.rng(134), self.rng(135, index)
         linear = linear * (1 + constant.normal(0, SPEED_SCALE_SIGMA)) + sample.normal(0, SPEED_SIGMA_MPS, 3)

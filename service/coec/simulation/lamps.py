@@ -1,4 +1,4 @@
-"""Light that is not the sky's: lamps in tunnels, headlights at night. And how little of the sky reaches a tunnel."""
+"""Light of lamps in tunnels and of headlights at night, and how little of the sky's light reaches into a tunnel."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from coec.simulation.tunnel import SPINE_M
 
 Doubles = NDArray[np.float64]
 
-# Light is in units of the sun's on a white wall, as in `Sky`.
+# Unit of light: that of the sun on a white wall, as in `Sky`.
 MOUTH_SHARE, MOUTH_DEPTH_M = 0.5, 7.0
-"""Share of the sky's light just inside a tunnel, and the depth after which 1/e of that is left: its width."""
+"""Share of the sky's light just inside a tunnel, and the depth after which 1/e of it is left: the tunnel's width."""
 STRIP_LIGHT, STRIP_BOUNCE = 0.05, 0.006
-"""Of the strip of lamps: times metres over distance, and what walls and road send to everywhere. Some 1 % of daylight:
-lit tunnels have 50 to 300 lx beyond the zone at their mouths, an overcast day 10,000 (CIE 88)."""
+"""Direct light of the strip of lamps, times metres over distance, and what walls and road scatter everywhere. Some
+1 % of daylight: lit tunnels have 50 to 300 lx beyond the zone at their mouths, an overcast day 10,000 (CIE 88)."""
 HEADLIGHTS_M = ((3.45, 0.65, 0.65), (3.45, -0.65, 0.65))
-"""Where they are in the ego frame."""
+"""Places of the headlights in the ego frame."""
 BEAM_LIGHT_M2, BEAM_SPILL = 12.0, 0.02
-"""Of a dipped beam: light on its axis times the square of the distance, and the share that goes everywhere ahead."""
+"""A dipped beam: light on its axis times the square of the distance, and the share that goes everywhere ahead."""
 BEAM_DOWN_RAD, BEAM_WIDE_RAD, BEAM_HIGH_RAD, BEAM_CUT_RAD = 0.02, 0.45, 0.14, 0.015
-"""Its axis below the horizon; its width to the sides, below and above the axis, where 1/e of the light is left."""
+"""How far its axis points below the horizon; its width to the sides, below and above the axis, to 1/e of the light."""
 NIGHT = 0.002
-"""Light of the sky at night over a town, in that of the day; the eye of a camera sees no colour in it."""
+"""Light of the sky at night over a town, as a share of daylight; a camera sees no colour in it."""
 
 
 class Incident(NamedTuple):
-    """Light at points. `sky_share` (N,): of the sky's light, 0 to 1; `lamps` (N,): of lamps, white. float32."""
+    """Light at points, float32: `sky_share` (N,) of the sky's light, 0 to 1, and `lamps` (N,), white light of lamps."""
 
     sky_share: Floats
     lamps: Floats
 
 
 def incident(scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits) -> Incident:
-    """What lamps and tunnels make of the light where rays (from `origin_m`, world) have met something."""
+    """The light, by lamps and tunnels, at the points where rays from `origin_m` (world) hit something."""
     share, lamps = np.ones(len(directions), np.float32), np.zeros(len(directions), np.float32)
     origin = np.asarray(origin_m, np.float64)
     for room in scene.bores:
@@ -54,20 +54,20 @@ def incident(scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits) ->
 
 
 def around(scene: Scene, place_m: Doubles) -> tuple[float, float]:
-    """Share of the sky's light, and light of lamps, on something at a place (3,), world, that faces down."""
+    """Share of the sky's light, and light of lamps, on a surface at a place (3,), world, that faces down."""
     still = Hits(np.zeros(1, np.float32), np.zeros(1, np.int32), np.array([[0.0, 0.0, -1.0]], np.float32))
     light = incident(scene, place_m, np.array([[0.0, 0.0, 1.0]], np.float32), still)
     return float(light.sky_share[0]), float(light.lamps[0])
 
 
 def night_sky(sky: Sky) -> Sky:
-    """The same place at night: no sun, hardly any sky, clear air."""
+    """The sky of the same place at night: no sun, hardly any light, the same air."""
     zenith, horizon = (NIGHT * sum(colour) / 3 for colour in (sky.zenith, sky.horizon))
     return replace(sky, sun=(0.0, 0.0, 0.0), zenith=(zenith,) * 3, horizon=(horizon,) * 3)
 
 
 def headlights(T_world_ego: Matrix4) -> Doubles:
-    """(2, 4, 3): of each dipped beam the place and the axes forward, left and up, world."""
+    """(2, 4, 3): for each dipped beam its place and its axes forward, left and up, world."""
     axes = T_world_ego[:3, :3].T
     return np.array(
         [[np.einsum("ij,j->i", T_world_ego[:3, :3], place) + T_world_ego[:3, 3], *axes] for place in HEADLIGHTS_M]
@@ -85,7 +85,7 @@ def _in_bore(
         if not r < 1e6:
             continue
         x, y, z = origin[0] + r * directions[i, 0], origin[1] + r * directions[i, 1], origin[2] + r * directions[i, 2]
-        # The place along the road whose cross-section holds the point: Newton's steps; the road always goes on in x.
+        # Newton's steps find the place on the road whose cross-section holds the point; the road always goes on in x.
         place = (x - spine[0, 0]) / (spine[last, 0] - spine[0, 0]) * last
         j = 0
         for _ in range(6):
@@ -94,7 +94,7 @@ def _in_bore(
             place = j + along / SPINE_M
         left = (y - spine[j, 1]) * spine[j, 3] - (x - spine[j, 0]) * spine[j, 4]
         up = z - spine[j, 2]
-        # A wall is straight between the points of its mesh, the spine is not.
+        # With a margin, because walls are straight between the points of their mesh, and the spine is not.
         if place < 0.0 or place > last or abs(left) > half_m + 0.1 or up > high_m + 0.05:
             continue
         deep_m = SPINE_M * min(place, last - place)

@@ -1,4 +1,4 @@
-"""A LiDAR: every ray of a sweep is measured from where the vehicle is at that instant, through the air as it is."""
+"""A LiDAR: every ray of a sweep is cast from where the vehicle is at that instant, through clear air or rain."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Doubles = NDArray[np.float64]
 WEAKEST = 4.0e-6
 """Returns below this (reflectance · cosine / range², 1/m²) are not detected: a tenth reflectance at 110 m, head on."""
 CLUSTER_M = 0.35
-"""Echoes nearer to each other than the pulse is long come back as one, at their mean range."""
+"""Length of the pulse: echoes nearer to each other than this come back as one, at their mean range."""
 SPREAD: tuple[tuple[float, float], ...] = ((1.0, 0.0), (-0.5, 0.866), (-0.5, -0.866))
 """Directions of the outer rays of a beam, in units of its half angle."""
 JUMP = 0.03
-"""A beam is looked at as a cone where its neighbours' ranges differ by more than this share."""
+"""A beam is treated as a cone where the ranges of its neighbours differ by more than this share."""
 
 REFLECTANCE = np.full(len(Material), np.nan)
-"""Of each material at the laser's 905 nm; NaN: as bright as it looks."""
+"""Reflectance of each material at the laser's 905 nm; NaN: as bright as its visible colour."""
 REFLECTANCE[[Material.ASPHALT, Material.GRASS, Material.FOLIAGE, Material.RUBBER]] = [0.17, 0.45, 0.5, 0.06]
 REFLECTANCE[[Material.MARKING, Material.SIGN, Material.GLASS, Material.LAMP]] = [0.75, 1.0, 0.03, 0.3]
 
@@ -52,9 +52,9 @@ LIDARS: dict[str, LidarModel] = {
     "raster": LidarModel(Raster(np.radians(120.0), even_deg(-12.5, 12.5, 126), columns=600)),
     "rosette": LidarModel(Rosette()),
 }
-"""By number of beams, angles as those of HDL-64E, a common 32-beam sensor, VLP-16 and a common 128-beam sensor. And two
-that do not turn and number no rings: a mirror's raster of 120° x 25° at 0.2°, as of long-range automotive sensors, and
-the rosette of two turning prisms."""
+"""By number of beams, with angles of HDL-64E, a common 32-beam sensor, VLP-16 and a common 128-beam sensor. Two more do
+not turn and number no rings: a mirror's raster of 120° x 25° at 0.2°, as in long-range automotive sensors, and the
+rosette of two turning prisms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +64,7 @@ class Sweep:
     Attributes:
         xyz_m: (N, 3) float32.
         intensity: (N,) float32, 0 to 1.
-        ring: (N,) uint16, 0 the lowest beam; None of a sensor that numbers none.
+        ring: (N,) uint16, 0 the lowest beam; None for a sensor that does not number its beams.
         time_offset_s: (N,) float32, from the stamp of the turn.
     """
 
@@ -88,7 +88,7 @@ def sweep(
     Args:
         poses: (N, 4, 4) from the LiDAR to the world at times (N,).
         dead: (beams,) beams that measure nothing.
-        air: what the light goes through.
+        air: between the LiDAR and what it hits.
     """
     beams = model.pattern.beams
     fired = model.pattern.fired(time_s, model.period_s)
@@ -130,7 +130,7 @@ def sweep(
 def _rained(
     air: Air, model: LidarModel, range_m: Doubles, strength: Doubles, seen: NDArray[np.bool_], rng: np.random.Generator
 ) -> None:
-    """Puts drops in the way of some of the rays, in place: they answer instead of what lies behind them."""
+    """Puts drops in the way of some rays, in place; these rays return from the drop instead of what lies behind it."""
     drop_m = model.nearest_m + rng.exponential(DROP_M, len(range_m))
     hit = (rng.random(len(range_m)) < air.drops) & (drop_m < range_m)
     range_m[hit], strength[hit] = drop_m[hit], DROP_REFLECTANCE
@@ -150,13 +150,13 @@ def _cosine(hits: Hits, flat: Doubles, pose: Doubles, beams: int) -> Doubles:
 
 
 def _jumps(range_m: Doubles) -> NDArray[np.bool_]:
-    """(columns, beams): whether a neighbour's range differs."""
+    """(columns, beams): whether the range of a neighbour differs."""
     result = np.zeros(range_m.shape, dtype=bool)
     held = np.where(np.isfinite(range_m), range_m, 1e4)
     across = np.abs(np.diff(held, axis=0, append=held[:1])) > JUMP * np.minimum(held, np.roll(held, -1, axis=0))
     result |= across | np.roll(across, 1, axis=0)
     apart = np.abs(np.diff(held, axis=1))
-    # Neighbouring beams on a slanted floor differ, too: only what is far beyond that is an edge.
+    # Neighbouring beams also differ on level ground: only a much larger difference is an edge.
     up = apart > 0.12 * np.minimum(held[:, 1:], held[:, :-1])
     result[:, 1:] |= up
     result[:, :-1] |= up
@@ -167,7 +167,7 @@ def _cones(
     model: LidarModel, flat: Doubles, chosen: NDArray[np.int64], middle_m: Doubles, middle: Doubles,
     cast: Callable[[Doubles, NDArray[np.int64]], Hits], scene: Scene,
 ) -> tuple[Doubles, Doubles]:  # fmt: skip
-    """Range and strength of beams that are cones: the strongest echo, mixed with those within a pulse's length."""
+    """Range and strength of beams as cones: the strongest echo, mixed with the echoes within a pulse's length of it."""
     if not len(chosen):
         return middle_m, middle
     ranges, strengths = [middle_m], [middle]

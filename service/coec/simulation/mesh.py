@@ -1,4 +1,4 @@
-"""Triangles with a colour and a material each, and the simple solids that a street is made of."""
+"""Triangles, each with a colour and a material, and the simple solids of which a street is made."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Colour = tuple[float, float, float]
 
 
 class Material(IntEnum):
-    """What a surface is: its texture (`shading`) and how it answers a laser (`lidar`)."""
+    """Kind of surface: decides its texture (`shading`) and how it reflects a laser (`lidar`)."""
 
     PAINT = 0
     ASPHALT = 1
@@ -38,7 +38,7 @@ class Material(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Triangles without order or winding: what is hit is turned towards who looks.
+    """Triangles without order or winding: normals are turned towards the viewer when a ray hits.
 
     Attributes:
         corners_m: (T, 3, 3) float32, triangle by corner by coordinate.
@@ -68,14 +68,14 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def triangles(corners_m: ArrayLike, colour: ArrayLike, material: Material) -> Mesh:
-    """corners_m: (T, 3, 3) or one (3, 3); colour: one, or (T, 3)."""
+    """A mesh of triangles. corners_m: (T, 3, 3) or one (3, 3); colour: one, or (T, 3)."""
     shape = np.asarray(corners_m, dtype=np.float32).reshape(-1, 3, 3)
     paint = np.broadcast_to(np.asarray(colour, dtype=np.float32), (len(shape), 3)).copy()
     return Mesh(shape, paint, np.full(len(shape), int(material), dtype=np.int8))
 
 
 def quads(corners_m: ArrayLike, colour: ArrayLike, material: Material) -> Mesh:
-    """corners_m: (Q, 4, 3) around each, or one (4, 3); colour: one, or (Q, 3)."""
+    """A mesh of quads. corners_m: (Q, 4, 3) around each, or one (4, 3); colour: one, or (Q, 3)."""
     four = np.asarray(corners_m, dtype=np.float32).reshape(-1, 4, 3)
     paint = np.broadcast_to(np.asarray(colour, dtype=np.float32), (len(four), 3))
     return triangles(four[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3), np.repeat(paint, 2, axis=0), material)
@@ -102,7 +102,7 @@ def prism(
 
 
 def circle(radius_m: float, sides: int, centre_m: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
-    """(sides, 2) outline."""
+    """(sides, 2) outline of a circle."""
     angle = 2 * np.pi * np.arange(sides) / sides
     return np.asarray(centre_m) + radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
 

@@ -1,4 +1,4 @@
-"""A drive made by several processes: Embree's binding holds Python's lock, so threads would not share the work."""
+"""Makes a drive with several processes: Embree's binding holds Python's lock, so threads would not share the work."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import Any, Protocol
 from coec.sources.recording import Message
 
 PART = 128
-"""Messages per piece of work: about 2 s of a drive at the usual rates, some 45 MB of sweeps on their way."""
+"""Messages per piece of work: about 2 s of a drive at the usual rates, some 45 MB of sweeps to transfer."""
 
 
 class Drive(Protocol):
-    """What can be made in parts."""
+    """A drive that can be made in parts."""
 
     @property
     def message_count(self) -> int:
@@ -26,19 +26,19 @@ class Drive(Protocol):
         ...
 
     def messages(self) -> Iterator[Message]:
-        """In the order of their stamps."""
+        """All messages in the order of their stamps."""
         ...
 
     def part(self, begin: int, end: int) -> list[Message]:
-        """Messages `begin` to `end` (excluded) of all."""
+        """Messages `begin` to `end` (excluded) of `messages()`."""
         ...
 
 
 class Driven(Protocol):
-    """A configuration, which travels to other processes."""
+    """A configuration of a drive that can be sent to other processes."""
 
     def drive(self) -> Drive:
-        """Which it describes."""
+        """The drive that it describes."""
         ...
 
 
@@ -46,13 +46,13 @@ SPAWN = multiprocessing.get_context("spawn")
 
 _drive: Drive | None = None
 _left: Event | None = None
-"""Set when nobody waits for what is being made any more."""
+"""Set when nobody waits any more for what is being made."""
 
 
 def messages_by(config: Driven, processes: int) -> Iterator[Message]:
-    """The messages of the drive, the same to the byte and in the same order as from its own `messages`.
+    """The messages of the drive, in the same order and the same to the byte as from its own `messages`.
 
-    At most two pieces of work per process are under way or wait, whatever the length of the drive.
+    At most two pieces of work per process are in progress or waiting, whatever the length of the drive.
     """
     whole = config.drive()
     count = whole.message_count
@@ -69,15 +69,15 @@ def messages_by(config: Driven, processes: int) -> Iterator[Message]:
                     yield from waiting.popleft().result()
             while waiting:
                 yield from waiting.popleft().result()
-        finally:  # also where the reader has gone before the end
+        finally:  # also if the reader stops before the end
             left.set()
 
 
 @contextmanager
 def spawned(processes: int, begin: Callable[..., None], *given: Any) -> Iterator[ProcessPoolExecutor]:
-    """Processes that each begin with a call of `begin`. What waits for them at the end is given up: whoever wanted it
-    has gone."""
-    # A compiled loop of one process must not take the cores of the other; read when numba is imported there.
+    """Processes that each begin with a call of `begin`. At the end, work that still waits is cancelled, because nobody
+    wants it any more."""
+    # A compiled loop of one process must not take the cores of another. Numba reads this when it is imported there.
     before = os.environ.get("NUMBA_NUM_THREADS")
     os.environ["NUMBA_NUM_THREADS"] = "1"
     try:

@@ -1,4 +1,4 @@
-"""Poor stretches of a road as places: where its tunnels are, and where nothing stands beside it."""
+"""The poor stretches of a road, as places: its tunnels, and where nothing stands beside it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from coec.simulation.vehicle import Pace
 F = TypeVar("F", bound=Fault)
 
 CLEAR_M = 120.0
-"""Nothing stands within this of a vehicle on an open road: the reach of the longest LiDAR of `lidar.LIDARS`."""
+"""Nothing stands within this distance of a vehicle on an open road: the longest reach in `lidar.LIDARS`."""
 BESIDE_M = 3.0
-"""What stands by the road is up to so much longer along it than its middle tells: half a parked car, and a little."""
+"""An object reaches up to this far along the road from its middle: half a parked car, and a little more."""
 LONGEST_BEYOND_S = 30.0
-"""Passages reach at most this far beyond the end of the drive: the road goes on for longer."""
+"""Passages reach at most this far beyond the end of the drive; the road goes on for longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,16 +29,16 @@ class Span:
     end_m: float
 
     def holds(self, s_m: float) -> bool:
-        """Whether a place lies in it."""
+        """Whether a place lies in the span."""
         return self.begin_m <= s_m < self.end_m
 
     def part(self, begin_m: float, end_m: float) -> Span | None:
-        """What lies between two places; None if nothing does."""
+        """The part of the span between two places; None if there is none."""
         low, high = max(self.begin_m, begin_m), min(self.end_m, end_m)
         return Span(low, high) if low < high else None
 
     def widened(self, by_m: float) -> Span:
-        """By so much at both ends."""
+        """The span extended by so much at both ends."""
         return Span(self.begin_m - by_m, self.end_m + by_m)
 
 
@@ -47,15 +47,15 @@ class Passages:
     """The poor stretches of a road.
 
     Attributes:
-        tunnels: between their mouths.
-        open: where the vehicle is while it has nothing but ground around it.
+        tunnels: from mouth to mouth.
+        open: where the vehicle is while there is nothing but ground around it.
     """
 
     tunnels: tuple[Span, ...] = ()
     open: tuple[Span, ...] = ()
 
     def cleared(self) -> tuple[Span, ...]:
-        """Where nothing stands or drives for the sake of an open road."""
+        """Where nothing stands or drives, so that the road is open."""
         return tuple(span.widened(CLEAR_M) for span in self.open)
 
     def empty(self) -> tuple[Span, ...]:

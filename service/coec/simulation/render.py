@@ -1,4 +1,4 @@
-"""Pictures of a scene, with their exact range: one ray per pixel, more where neighbouring pixels differ."""
+"""Pictures of a scene with their exact range: one ray per pixel, and more where neighbouring pixels differ."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from coec.simulation.shading import shade
 Doubles = NDArray[np.float64]
 
 SHADOW_LIFT_M = 0.02
-"""Rays to the sun start this far off the surface: it must not shade itself."""
+"""Rays to the sun start this far off a surface, so that it does not shade itself."""
 EDGE_SAMPLES: tuple[tuple[float, float], ...] = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
-"""Further samples (u, v) of a pixel on an edge, pixels: the rotated grid of four."""
+"""Additional samples (u, v) of a pixel on an edge, pixels: the rotated grid of four."""
 EDGE_RANGE = 0.06
 """Neighbours whose ranges differ by more than this share are on an edge."""
 GAMMA = 1 / 2.2
@@ -56,7 +56,7 @@ class View(NamedTuple):
 
 
 class Radiance(NamedTuple):
-    """What reaches the lens, before exposure. `linear`: (height, width, 3) float32 BGR; `range_m` as in `View`."""
+    """Light at the lens, before exposure. `linear`: (height, width, 3) float32 BGR; `range_m` as in `View`."""
 
     linear: Floats
     range_m: Floats
@@ -86,9 +86,9 @@ def render_view(
 
     Args:
         T_world_camera: (4, 4) maps camera coordinates (x right, y down, z forward) to the world (z up).
-        time_s: where the moving cars are.
+        time_s: instant that decides where the moving cars are.
         half_view_rad: pixels further off the axis stay black (the lens's circle).
-        smooth_edges: further rays where neighbouring pixels differ.
+        smooth_edges: whether to cast more rays where neighbouring pixels differ.
         exposure: factor on the light before the gamma curve.
     """
     radiance = render_radiance(
@@ -133,8 +133,8 @@ def render_rows(
     half_view_rad: float = np.pi,
     smooth_edges: bool = True,
 ) -> Radiance:
-    """A picture whose rows are taken one after the other, as by a rolling shutter: each part from where the camera is
-    at its own time. `exposures` cover the rows once."""
+    """A picture whose rows are taken one after the other, as by a rolling shutter: each part is seen from where the
+    camera is at the part's own time. `exposures` must cover each row once."""
     rays = pixel_rays(camera, half_view_rad)
     size, shape = camera.height * camera.width, (camera.height, camera.width)
     linear = np.zeros((size, 3), np.float32)
@@ -160,7 +160,7 @@ def render_rows(
 
 
 def _rows(pixels: NDArray[np.int64], part: Exposure, camera: Camera) -> slice:
-    """Which of some pixels, ascending, lie in the rows of a part."""
+    """Slice of the ascending `pixels` that lie in the rows of a part."""
     first, last = np.searchsorted(pixels, (part.first * camera.width, part.last * camera.width))
     return slice(int(first), int(last))
 
@@ -183,7 +183,7 @@ def _supersampled(
     scene: Scene, camera: Camera, rotation: Doubles, origin: Doubles, pixels: NDArray[np.int64], first: Floats,
     time_s: float, pixel_rad: float,
 ) -> Floats:  # fmt: skip
-    """Mean radiance of the pixels over the middle and `EDGE_SAMPLES`; bright light is cut as a sensor would."""
+    """Mean radiance of the pixels over the middle and `EDGE_SAMPLES`; bright light is cut off as by a sensor."""
     v, u = np.divmod(pixels, camera.width)
     total: Floats = np.minimum(first, np.float32(1.5))
     count = np.ones((len(pixels), 1), np.float32)
@@ -198,7 +198,7 @@ def _supersampled(
 
 
 def _facing_sun(triangle: NDArray[np.int32], normal: Floats, sun: Floats) -> NDArray[np.int64]:
-    # Without BLAS: the same bits whatever its threads.
+    # Without BLAS, so that the bits do not depend on its threads.
     cosine = normal[:, 0] * sun[0] + normal[:, 1] * sun[1] + normal[:, 2] * sun[2]
     return np.flatnonzero((triangle >= 0) & (cosine > 0))
 

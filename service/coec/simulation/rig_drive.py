@@ -1,7 +1,7 @@
 """A drive of a vehicle with several cameras and LiDARs: one way through one scene, each sensor at its own stamps.
 
-Every frame follows from the seed, its sensor and its number alone. A pair of the rig is a recording as any other; the
-frames of all sensors together are made once, whatever number of pairs they serve.
+Every frame follows from the seed, its sensor and its number alone. A pair of the rig is a recording like any other. As
+a stream of all sensors, each frame is made once, however many pairs use it.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ Vector6 = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
-    """What to drive: as `drive.DriveConfig`, for a rig.
+    """What to drive: like `drive.DriveConfig`, for a rig.
 
     Attributes:
-        camera: of every camera of the rig, `fisheyeW`.
-        faults: of a sensor, its own; a step or drift turns it about its own axes: T_sensor_ego becomes
+        camera: model of every camera of the rig, `fisheyeW`.
+        faults: of single sensors or of all; a step or drift turns a sensor about its own axes: T_sensor_ego becomes
             exp(ξ)·T_sensor_ego.
         workshop: by sensor, (6,) ξ, degrees and metres about its own axes, by which its nominal pose is wrong.
-        rows: of every camera, see `Optics`: who compares edges of pictures with a LiDAR's needs what the LiDAR sees.
+        rows: of every camera, see `Optics`: comparing edges with a LiDAR needs only the rows that the LiDAR sees.
     """
 
     layout: RigLayout = FOUR_FISHEYES
@@ -64,7 +64,7 @@ class RigConfig:
     rows: tuple[float, float] = (0.0, 1.0)
 
     def drive(self) -> RigDrive:
-        """Which it describes."""
+        """The drive that it describes."""
         return RigDrive(self)
 
 
@@ -74,10 +74,10 @@ class RigDrive:
     Attributes:
         config: as given.
         cameras, lidars: names of the sensors.
-        camera: every camera's intrinsics.
+        camera: intrinsics of every camera.
 
     Raises:
-        UsageError: a camera or a sensor that is not known, or figures out of range; names them.
+        UsageError: an unknown camera or sensor, or figures out of range; the message names them.
     """
 
     def __init__(self, config: RigConfig) -> None:
@@ -122,7 +122,7 @@ class RigDrive:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name for people."""
         return f"simulated drive of a rig, seed {self.config.seed}"
 
     @property
@@ -132,7 +132,7 @@ class RigDrive:
 
     @cached_property
     def plan(self) -> list[Arrival]:
-        """Everything that arrives, in the order of the stamps; streams: ego, LiDARs, cameras."""
+        """Everything that arrives, in the order of the stamps. Streams are numbered: ego, LiDARs, cameras."""
         return arrivals([self._streams[name] for name in self._order], self.config.seconds)
 
     def messages(self) -> Iterator[Message]:
@@ -141,23 +141,23 @@ class RigDrive:
             yield self.message(entry)
 
     def part(self, begin: int, end: int) -> list[Message]:
-        """Messages `begin` to `end` (excluded) of all, by their place in `messages()`: for several processes."""
+        """Messages `begin` to `end` (excluded) of `messages()`, so that several processes can share the work."""
         return [self.message(entry) for entry in self.plan[begin:end]]
 
     def message(self, entry: Arrival) -> Message:
-        """One of the plan."""
+        """The message of one entry of the plan."""
         return self._streams[self._order[entry.stream]].frame(entry.number, entry.stamp_ns)
 
     def stream(self, sensor: str) -> int:
-        """Of a sensor, or of `EGO`, in the plan."""
+        """Number of the stream of a sensor, or of `EGO`, in the plan."""
         return self._order.index(sensor)
 
     def T_sensor_ego(self, sensor: str, stamp_ns: int) -> Matrix4:
-        """(4, 4) truth at a time."""
+        """(4, 4) true pose at a time."""
         return shifted(self._mounted[sensor], self._faults[sensor], seconds_of(stamp_ns))
 
     def T_sensor_ego_nominal(self, sensor: str) -> Matrix4:
-        """(4, 4) as the workshop has it."""
+        """(4, 4) pose that the workshop assumes."""
         xi = dict(self.config.workshop).get(sensor, (0.0,) * 6)
         return perturb(self._mounted[sensor], np.array([*np.deg2rad(xi[:3]), *xi[3:]]))
 
@@ -166,11 +166,11 @@ class RigDrive:
         return self._journey.pose(seconds_of(stamp_ns))
 
     def mask(self, camera: str) -> NDArray[np.bool_]:
-        """(height, width): what a camera sees of the world where it was mounted."""
+        """(height, width): pixels of a camera that show the world, from where the camera was mounted."""
         return self._eyes[camera].mask_at(inverse(self._mounted[camera]))
 
     def pair(self, camera: str, lidar: str) -> RigPair:
-        """A camera and a LiDAR of the rig.
+        """The recording of a camera and a LiDAR of the rig.
 
         Raises:
             UsageError: there is no such sensor.
@@ -190,7 +190,7 @@ class RigDrive:
 
 
 class RigPair:
-    """A camera and a LiDAR of a rig: a `sources.recording.Recording`, whose truth is known.
+    """A camera and a LiDAR of a rig, as a `sources.recording.Recording` whose truth is known.
 
     Attributes:
         rig: with the workshop's poses as nominal, and a mask of lens and body.
@@ -209,12 +209,12 @@ class RigPair:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name for people."""
         return f"{self._drive.name}, {self.rig.pair}"
 
     @property
     def T_camera_lidar_start(self) -> Matrix4:
-        """(4, 4) the workshop's."""
+        """(4, 4) the workshop's calibration."""
         return self.rig.T_camera_lidar_nominal
 
     @property

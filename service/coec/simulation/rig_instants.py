@@ -1,7 +1,7 @@
-"""Instants of a rig: a sweep of one LiDAR, and the picture of every camera that is nearest to it.
+"""Instants of a rig: a sweep of one LiDAR, and for each camera the picture nearest to it.
 
-Cameras that are exposed when the beam of a LiDAR passes are a share of a turn apart from each other, and pair with one
-sweep all the same. Whoever needs a few pairs of each draws these frames alone, each once, however many pairs it serves.
+Cameras that are exposed when the beam of a LiDAR passes are apart by a share of a turn, but all pair with one sweep. To
+get a few pairs of each camera, only these frames have to be drawn, each once, however many pairs use it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Instant:
 
     Attributes:
         pictures: by the name of the camera.
-        motions: around them, ascending.
+        motions: around the sweep, ascending.
     """
 
     sweep: Arrival
@@ -37,8 +37,8 @@ class Instant:
 
 
 def instants(drive: RigDrive, lidar: str, period_s: float) -> list[Instant]:
-    """Of every so many seconds of a drive, as near as the turns of a LiDAR allow; those at its ends, which lack a
-    picture, left out."""
+    """An instant every `period_s` of a drive, as near as the turns of a LiDAR allow. Instants at the ends of the drive
+    that lack a picture are left out."""
     cameras = {drive.stream(camera): camera for camera in drive.cameras}
     by_stream: dict[int, list[Arrival]] = {}
     for entry in drive.plan:
@@ -61,7 +61,7 @@ def instants(drive: RigDrive, lidar: str, period_s: float) -> list[Instant]:
 
 
 def pair_of(picture: Message, sweep: Message, motions: tuple[Message, ...]) -> FramePair | None:
-    """The pair that the service makes of a picture and a sweep with the motion around them; None if it makes none."""
+    """The pair that the service would make of a picture, a sweep and the motion around them; None if it makes none."""
     pairer = Pairer(PairingConfig(), expects_motion=True)
     pairs = []
     for frame in sorted((picture, sweep, *motions), key=lambda frame: frame.stamp_ns):

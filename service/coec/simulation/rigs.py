@@ -1,4 +1,4 @@
-"""Vehicles with several cameras and LiDARs: where each sensor sits, and when it looks."""
+"""Vehicles with several cameras and LiDARs: where each sensor sits, and when it measures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coec.simulation.scan import Turn, even_deg
 NEAR = LidarModel(
     Turn(even_deg(-52.0, 52.0, 32), columns=900), reach_m=30.0, nearest_m=0.3, noise_m=0.02, divergence_rad=0.003
 )
-"""A short-range LiDAR that sees nearly a hemisphere: angles and reach as those of common blind-spot sensors."""
+"""A short-range LiDAR that sees nearly a hemisphere, with angles and reach of common blind-spot sensors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class MountedCamera:
 
     Attributes:
         T_ego_camera: (4, 4).
-        phase: when it exposes, share of the period of the pictures.
+        phase: when it exposes, as a share of the period of its pictures.
     """
 
     name: str
@@ -39,7 +39,7 @@ class MountedLidar:
 
     Attributes:
         T_ego_lidar: (4, 4).
-        phase: when the middle of its turn is, share of its period.
+        phase: when the middle of its turn is, as a share of its period.
     """
 
     name: str
@@ -50,7 +50,7 @@ class MountedLidar:
 
 @dataclass(frozen=True, slots=True)
 class RigLayout:
-    """The sensors of a vehicle; no two have one name."""
+    """The sensors of a vehicle, with unique names."""
 
     cameras: tuple[MountedCamera, ...]
     lidars: tuple[MountedLidar, ...]
@@ -58,7 +58,7 @@ class RigLayout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all sensors, cameras first."""
+        """Names of all sensors, cameras first."""
         return (*(camera.name for camera in self.cameras), *(lidar.name for lidar in self.lidars))
 
     @property
@@ -70,7 +70,7 @@ class RigLayout:
 def _camera(
     name: str, heading_deg: float, down_deg: float, at_m: tuple[float, float, float], phase: float
 ) -> MountedCamera:
-    """A camera that looks to a heading (from ahead, to the left) and down."""
+    """A camera that looks towards a heading (counted from ahead to the left) and down."""
     turn = rotation_exp(np.array([0.0, 0.0, np.deg2rad(heading_deg)]))
     nod = rotation_exp(np.array([0.0, np.deg2rad(down_deg), 0.0]))
     ahead = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -83,7 +83,7 @@ def _camera(
 def _lidar(
     name: str, turned_deg: tuple[float, float, float], at_m: tuple[float, float, float], model: LidarModel, phase: float
 ) -> MountedLidar:
-    """A LiDAR turned about x, y, z (a rotation vector) from looking ahead."""
+    """A LiDAR that is turned from looking ahead by a rotation vector about x, y, z."""
     transform = np.eye(4)
     transform[:3, :3] = rotation_exp(np.deg2rad(np.array(turned_deg)))
     transform[:3, 3] = at_m
@@ -104,9 +104,9 @@ FOUR_FISHEYES = RigLayout(
     ),
     half_view_deg=95.0,
 )
-"""Fisheyes of 190° on the four edges of a roof rack, each exposed when the roof LiDAR's beam passes its axis, a
-64-beam LiDAR amid them, and a short-range LiDAR on each flank, which run freely. Cameras on the roof are near the LiDAR
-(METHOD, section 1: the further the camera, the more differs its depth). Angles are those of real mounts: none is
-round."""
+"""Fisheyes of 190° on the four edges of a roof rack, each exposed when the beam of the roof LiDAR passes its axis; a
+64-beam LiDAR between them; and a free-running short-range LiDAR on each flank. The cameras are on the roof to be near
+the LiDAR, because their depth differs more the further away they are (METHOD, section 1). As on real mounts, no angle
+is a round number."""
 
 RIGS: Mapping[str, RigLayout] = MappingProxyType({"four-fisheyes": FOUR_FISHEYES})

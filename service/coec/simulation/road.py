@@ -14,7 +14,7 @@ STEP_M = 0.1
 LONGEST_BEND_M, SHORTEST_BEND_M = 900.0, 260.0
 """Wavelengths of the heading. With `HEADING_RAD` the radius stays above 90 m, wider than the ground strip."""
 HEADING_RAD = (0.30, 0.18, 0.10)
-"""Amplitudes of the waves of the heading, radians: their sum stays under a right angle, so the road goes on in x."""
+"""Amplitudes of the waves of the heading, radians. Their sum is below a right angle, so the road goes on in x."""
 GRADE = (0.012, 0.008)
 """Amplitudes of the waves of the slope, metres per metre."""
 
@@ -46,7 +46,7 @@ class Road:
 
 
 def build_road(seed: int, begin_m: float, end_m: float, calmer: float = 1.0) -> Road:
-    """The road of a seed between two arc lengths; `calmer`: its bends and slopes are so many times longer."""
+    """The road of a seed between two arc lengths; its bends and slopes are `calmer` times longer."""
     rng = np.random.default_rng([seed, 100])
     s: Doubles = begin_m + STEP_M * np.arange(int(np.ceil((end_m - begin_m) / STEP_M)) + 2, dtype=np.float64)
     length = calmer * rng.uniform(SHORTEST_BEND_M, LONGEST_BEND_M, 3) * np.array([1.3, 1.0, 0.7])

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 Doubles = NDArray[np.float64]
 
 PRISM_HZ = (121.57, -77.73)
-"""Turns of the two prisms, 7294 and -4664 a minute, as of the first Livox sensors: their ratio is not that of small
+"""Turns of the two prisms, 7294 and -4664 a minute, as in the first Livox sensors. Their ratio is not one of small
 whole numbers, so that no sweep repeats the last one."""
 PRISM_RAD = 0.307
-"""How far one prism bends the beam: 17.6°, together a circle of 70.4°."""
+"""How far one prism bends the beam: 17.6°; both together fill a circle of 70.4°."""
 
 
 class Fired(NamedTuple):
@@ -25,7 +25,7 @@ class Fired(NamedTuple):
 
     Attributes:
         rays: (columns, beams, 3) unit.
-        offset_s: (columns,) when each column is fired, from the stamp.
+        offset_s: (columns,) when each column is fired, relative to the stamp.
     """
 
     rays: Doubles
@@ -33,11 +33,11 @@ class Fired(NamedTuple):
 
 
 class Pattern(Protocol):
-    """The rays of a kind of sensor: `beams` are fired at once; `ringed` tells whether the sensor numbers them."""
+    """The rays of a kind of sensor."""
 
     @property
     def beams(self) -> int:
-        """How many are fired at once."""
+        """How many beams are fired at once."""
         ...
 
     @property
@@ -52,7 +52,8 @@ class Pattern(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """A head that turns clockwise from the rear: the middle of its turn looks forward. Beams from the lowest up."""
+    """A head that turns clockwise from the rear, so that it looks forward in the middle of its turn. Beams are numbered
+    from the lowest up."""
 
     elevations_rad: tuple[float, ...]
     columns: int
@@ -71,7 +72,7 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """A mirror that sweeps a fan of beams (from the lowest up) from the left to the right, once per sweep."""
+    """A mirror that sweeps a fan of beams (numbered from the lowest up) from left to right, once per sweep."""
 
     width_rad: float
     elevations_rad: tuple[float, ...]
@@ -91,12 +92,12 @@ class Raster:
 
 @dataclass(frozen=True, slots=True)
 class Rosette:
-    """Two prisms that turn against each other bend a row of beams into loops that fill a circle as time goes by.
+    """Two prisms that turn in opposite directions bend a row of beams into loops that fill a circle over time.
 
     Attributes:
         columns: firings in a sweep.
-        beams: in a row, upright.
-        apart_rad: between them.
+        beams: number in the upright row.
+        apart_rad: angle between neighbouring beams.
     """
 
     columns: int = 4000
@@ -119,12 +120,12 @@ class Rosette:
 
 
 def even_deg(low_deg: float, high_deg: float, beams: int) -> tuple[float, ...]:
-    """Elevations at even distances, from degrees to radians."""
+    """Evenly spaced elevations, given in degrees, returned in radians."""
     return tuple(float(angle) for angle in np.deg2rad(np.linspace(low_deg, high_deg, beams)))
 
 
 def _columns(width_rad: float, columns: int, elevations_rad: tuple[float, ...], period_s: float) -> Fired:
-    """Upright fans from the left to the right of a width."""
+    """A sweep of upright fans from left to right over a width."""
     azimuth = width_rad / 2 - width_rad * (np.arange(columns) + 0.5) / columns
     up = np.asarray(elevations_rad)
     rays = np.stack(

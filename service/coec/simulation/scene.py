@@ -24,13 +24,13 @@ Doubles = NDArray[np.float64]
 BEHIND, AHEAD = 3, 4
 """Stretches kept behind and ahead of the one that the vehicle is in: at least 144 m each way."""
 RAYS_AT_ONCE = 1 << 18
-"""Rays per call of Embree: bounds the memory of an image of any size."""
+"""Rays per call of Embree, which bounds the memory for an image of any size."""
 MISSED = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """What rays met first.
+    """The first surfaces that rays hit.
 
     Attributes:
         range_m: (N,) float32, inf for the sky.
@@ -53,7 +53,7 @@ class Solid:
         self._geometry = TriangleMesh(self._scene, np.ascontiguousarray(mesh.corners_m))
 
     def cast(self, origins_m: Floats, directions: Floats, reach_m: float) -> Hits:
-        """Origins in the frame of the mesh."""
+        """First hits of rays; origins and directions are in the frame of the mesh."""
         count = len(directions)
         range_m = np.empty(count, np.float32)
         triangle = np.empty(count, np.int32)
@@ -66,7 +66,7 @@ class Solid:
         return Hits(range_m, triangle, normal)
 
     def blocked(self, origins_m: Floats, directions: Floats) -> NDArray[np.bool_]:
-        """(N,): whether anything stands in the way."""
+        """(N,): whether the mesh blocks each ray."""
         result = np.empty(len(directions), bool)
         for low in range(0, len(directions), RAYS_AT_ONCE):
             part = slice(low, low + RAYS_AT_ONCE)
@@ -78,11 +78,11 @@ class Scene:
     """The street around one place, at any time.
 
     Attributes:
-        origin_m: (3,) world position from which the coordinates of its meshes are counted.
-        street: what stands still, without the models of the cars.
-        colour, material: (T, 3) float32 and (T,) int8 of all triangles: street, then each model of car.
+        origin_m: (3,) world position that is the origin of its meshes.
+        street: everything that stands still, without the models of cars.
+        colour, material: (T, 3) float32 and (T,) int8 of all triangles: the street, then each model of car.
         sky: light and weather.
-        movers: cars on their way; of the instant for which the scene was asked.
+        movers: moving cars near the place, at the instant for which the scene was requested.
         headlights: (L, 4, 3) of the vehicle, see `lamps.headlights`; none by day.
         bores: the tunnels of the road.
     """
@@ -119,7 +119,7 @@ class Scene:
         return hits
 
     def shadowed(self, points_m: Floats, time_s: float) -> NDArray[np.bool_]:
-        """(N,): whether something keeps the sun from points (N, 3), which are counted from `origin_m`."""
+        """(N,): whether something keeps the sun from points (N, 3), relative to `origin_m`."""
         sun = np.empty_like(points_m)
         sun[:] = self.sky.towards_sun
         dark = self._solid.blocked(points_m, sun)
@@ -137,7 +137,7 @@ class Scene:
         return dark
 
     def _cast_mover(self, mover: Mover, local: Floats, directions: Floats, time_s: Doubles, hits: Hits) -> None:
-        """Where a moving car is nearer than the street, the car; each ray meets it where it is at the ray's time."""
+        """Replaces hits where a moving car is nearer. Each ray meets the car where it is at the ray's time."""
         model = self._models[mover.model]
         ends = mover.poses(self.road, np.array([time_s.min(), time_s.max()]))[:, :3] - self.origin_m
         margin = float(np.linalg.norm(ends[1] - ends[0])) / 2
@@ -169,7 +169,7 @@ class Town:
         *,
         traffic: bool = True,
     ) -> None:
-        """Streets, unless other surroundings are given; `traffic`: whether anything moves there."""
+        """A street, unless other surroundings are given; `traffic` says whether anything moves there."""
         self.seed = seed
         self.surroundings: Surroundings = Street(seed) if surroundings is None else surroundings
         self.sky: Sky = draw_sky(seed)
@@ -177,7 +177,7 @@ class Town:
         self.road = build_road(seed, -margin, length_m + margin, self.surroundings.calmer)
         self._passages = passages
         self._traffic = traffic
-        # As far as the road is laid, but for a little: what keeps the sky off has no mouth in sight.
+        # Almost as far as the road reaches, so that the end of a ceiling is never in sight.
         self._bores = self.surroundings.bores(self.road, -margin + 1.0, length_m + margin - 1.0, passages)
         rng = np.random.default_rng([seed, 103])
         self._models = [Solid(self.surroundings.look(rng)) for _ in range(MODELS)]
@@ -190,13 +190,13 @@ class Town:
         return len(self._stretches)
 
     def lane_left_m(self) -> float:
-        """Where the vehicle drives, to the left of the centre line; in the right lane negative."""
+        """How far left of the centre line the vehicle drives; negative in the right lane."""
         return self.surroundings.left_m
 
     def scene(self, at_m: float, time_s: float = 0.0, progress: Progress | None = None) -> Scene:
         """The street around arc length `at_m`, with traffic at `time_s`.
 
-        progress: of the vehicle, which the cars in its lane keep their distance from; else it does 8 m/s from `at_m`.
+        progress: of the vehicle, from which cars in its lane keep their distance; None: 8 m/s from `at_m`.
         """
         place = int(np.floor(at_m / STRETCH_M))
         if self._scene is None or self._scene[0] != place:
@@ -209,7 +209,7 @@ class Town:
 
     def _build(self, place: int) -> Scene:
         wanted = range(place - BEHIND, place + AHEAD + 1)
-        # In the order of the road, wherever the vehicle comes from: the order of triangles shows in the bytes.
+        # In the order of the road, wherever the vehicle comes from, because the order of triangles changes the bytes.
         kept = {
             index: self._stretches.get(index) or self.surroundings.build(index, self.road, self._passages)
             for index in wanted
@@ -234,7 +234,7 @@ def _steady(at_m: float, since_s: float) -> Progress:
 
 
 def _turned(vectors: NDArray[np.floating], angle_rad: Doubles) -> Floats:
-    """(N, 3) turned about the vertical by (N,)."""
+    """Vectors (N, 3) turned about the vertical by angles (N,)."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     x, y = vectors[:, 0], vectors[:, 1]
     return np.column_stack([cosine * x - sine * y, sine * x + cosine * y, vectors[:, 2]]).astype(np.float32)
@@ -271,7 +271,7 @@ def _take(
 
 @njit(cache=True, nogil=True)
 def _near(origins: Floats, directions: Floats, centre: Doubles, radius_m: float) -> NDArray[np.bool_]:
-    """(N,): whether each ray passes a sphere."""
+    """(N,): whether each ray passes through a sphere."""
     result = np.empty(len(directions), np.bool_)
     for i in range(len(directions)):
         x = centre[0] - origins[i, 0]

@@ -1,4 +1,4 @@
-"""When which frame of which sensor arrives."""
+"""The order in which the frames of all sensors arrive."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coec.simulation.journey import START_NS
 
 
 class Arrival(NamedTuple):
-    """Frame `number` of stream `stream`, with its stamp. Sorts by time; of equal stamps, by stream."""
+    """Frame `number` of stream `stream`, with its stamp. Sorts by stamp, then by stream."""
 
     stamp_ns: int
     stream: int
@@ -30,5 +30,5 @@ def arrivals(streams: Sequence[Aboard], seconds: float) -> list[Arrival]:
 
 
 def seconds_of(stamp_ns: int) -> float:
-    """Of the drive."""
+    """The second of the drive at a stamp."""
     return (stamp_ns - START_NS) / 1e9

@@ -1,7 +1,7 @@
 """The light that comes back along each ray: procedural textures, sun and sky, haze.
 
 Textures are sums of value noise (Perlin, "An image synthesizer", SIGGRAPH 1985, with hashed lattice values) at places
-in the world, each octave faded out before a pixel covers its wavelength: what cannot be resolved does not flicker.
+in the world. Each octave fades out before a pixel covers its wavelength, so that unresolved detail does not flicker.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ RUBBER, CONCRETE = 13, 14
 LAMP = 16
 
 DAY_HORIZON = 0.5
-"""The horizon is brighter than this by day (`sky.draw_sky`): where it is darker, so is the skyline before it."""
+"""By day the horizon is brighter than this (`sky.draw_sky`); where it is darker, the skyline is darker, too."""
 SALTS = np.arange(64)
-"""By which one noise differs from another. The compiler makes a function anew for every whole number that it is called
-with, but not for every entry of an array."""
+"""Numbers that make one noise differ from another. They are in an array because the compiler compiles a function anew
+for every literal number with which it is called, but not for every entry of an array."""
 LAMP_RADIANCE = 2.0
-"""Of a lamp that is looked at: white, twice a wall in full sun."""
+"""Radiance of a visible lamp: white, twice a wall in full sun."""
 
 
 def shade(
@@ -39,8 +39,8 @@ def shade(
     """(N, 3) linear radiance in blue, green, red.
 
     Args:
-        origin_m: (3,) of the rays, world.
-        shadowed: (N,) share of the sun that is kept off, 0 to 1.
+        origin_m: (3,) origin of the rays, world.
+        shadowed: (N,) share of the sunlight that is blocked, 0 to 1.
         pixel_rad: angle between neighbouring rays.
     """
     sky = scene.sky
@@ -61,7 +61,7 @@ def _light(sky: Sky) -> Doubles:
 
 @njit(cache=True, inline="always")
 def _hash(i: np.int64, j: np.int64, salt: int) -> float:
-    """0 to 1 for an integer cell."""
+    """A hash from 0 to 1 for an integer cell."""
     h = (np.uint32(i) * np.uint32(0x8DA6B343)) ^ (np.uint32(j) * np.uint32(0xD8163841)) ^ np.uint32(salt)
     h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
     h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
@@ -92,7 +92,7 @@ def _grain(u: float, v: float, wave_m: float, footprint_m: float, salt: int) -> 
 
 @njit(cache=True)
 def _line(u: float, period_m: float, width_m: float, footprint_m: float) -> float:
-    """How much of a pixel lies in the lines of this width that repeat along u, 0 to 1."""
+    """Share of a pixel that lies in lines of this width that repeat along u, 0 to 1."""
     place = abs(u - period_m * math.floor(u / period_m) - 0.5 * period_m)
     place = 0.5 * period_m - place  # distance to the nearest line
     wide = 0.5 * max(width_m, footprint_m)
@@ -216,10 +216,10 @@ def _shade(
         factor = 1.0 if kind in (GLASS, LACQUER) else _texture(kind, u, v, foot)
         sunny = max(nx * light[0, 0] + ny * light[0, 1] + nz * light[0, 2], 0.0)
         if kind == FOLIAGE:
-            sunny = 0.35 + 0.5 * sunny  # leaves of every direction, lit through
+            sunny = 0.35 + 0.5 * sunny  # leaves face all directions and let light through
         sunny *= 1.0 - shadowed[i]
         open_sky = 0.62 + 0.38 * nz
-        # Light comes less into corners near the ground, and from below as a warm reflection.
+        # Walls get less light of the sky, and the ground reflects sunlight from below.
         if abs(nz) < 0.7:
             open_sky *= 0.72
         for c in range(3):

@@ -1,4 +1,4 @@
-"""A stretch of road as a building site: meshes are brought to places along it."""
+"""A stretch of road as a building site: meshes are put at places along it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Site:
     """Gathers the meshes of a stretch at places along the road. `left_m` counts from the centre line.
 
     Attributes:
-        origin_m: (3,) world position from which the meshes are counted.
-        meshes: what was brought so far.
+        origin_m: (3,) world position that is the origin of the meshes.
+        meshes: what was put there so far.
     """
 
     def __init__(self, road: Road, begin_m: float, empty: tuple[Span, ...] = ()) -> None:
-        """`empty`: where nothing is put up."""
+        """`empty`: spans of the road on which nothing is put."""
         self.road = road
         self.begin_m = begin_m
         self.origin_m = road.points(begin_m, 0.0, 0.0)
@@ -29,8 +29,8 @@ class Site:
         self._empty = empty
 
     def put(self, mesh: Mesh, s_m: float, left_m: float, turn_rad: float = 0.0, up_m: float = 0.0) -> None:
-        """Stands a mesh at arc length `begin_m + s_m`, its x along the road before it is turned; where the site is to
-        be empty, not."""
+        """Puts a mesh at arc length `begin_m + s_m`, its x along the road before it is turned. Does nothing where the
+        site has to stay empty."""
         if any(span.holds(self.begin_m + s_m) for span in self._empty):
             return
         x, y, z = self.road.points(self.begin_m + s_m, left_m, up_m) - self.origin_m

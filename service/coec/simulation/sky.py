@@ -15,10 +15,10 @@ class Sky:
 
     Attributes:
         towards_sun: (3,) float32 unit vector.
-        sun: of the direct light; 0 under an overcast sky.
-        zenith, horizon: of the sky.
-        clouds: share of the sky that they cover.
-        haze_m: range after which 63 % of a surface's light is lost to the air's.
+        sun: colour of the direct light; 0 under an overcast sky.
+        zenith, horizon: colours of the sky.
+        clouds: share of the sky that clouds cover.
+        haze_m: range after which 63 % of a surface's light is replaced by light of the air.
     """
 
     towards_sun: Floats
@@ -30,7 +30,7 @@ class Sky:
 
 
 def draw_sky(seed: int) -> Sky:
-    """The weather of a seed: a quarter overcast, the rest with the sun 12° to 65° high."""
+    """The weather of a seed: a quarter of all are overcast, the others have the sun 12° to 65° high."""
     rng = np.random.default_rng([seed, 106])
     height, around = np.deg2rad(rng.uniform(12, 65)), rng.uniform(0, 2 * np.pi)
     towards = np.array([np.cos(height) * np.cos(around), np.cos(height) * np.sin(around), np.sin(height)])

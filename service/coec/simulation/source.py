@@ -25,16 +25,16 @@ NUMBERS: dict[str, tuple[float, float]] = {
     "speed_mps": (0, 45),
     "rolling_shutter_s": (0, 0.1),
 }
-"""Query keys with a number: least and greatest value. The defaults are those of `DriveConfig`."""
+"""Query keys with a number, and its least and greatest value. The defaults are those of `DriveConfig`."""
 WHOLE = ("seed",)
 NAMES = ("scene", "camera", "lidar")
-"""Query keys with a name; which names there are, `DriveConfig` says."""
+"""Query keys with a name; `DriveConfig` says which names exist."""
 SWITCHES = ("depth", "traffic")
 WORDS = (*NAMES, *SWITCHES, "faults", "workshop", "intrinsics_off")
 
 
 MOST_OFF_PERCENT = 20.0
-"""A camera that is told wrong by more is another camera."""
+"""Intrinsics that are wrong by more than this belong to another camera."""
 
 
 def open_sim(query: dict[str, str]) -> SimulatedDrive:
@@ -51,7 +51,7 @@ def open_sim(query: dict[str, str]) -> SimulatedDrive:
 
 
 def drive_config_of(query: dict[str, str]) -> DriveConfig:
-    """What `sim:KEY=VALUE&...` says; every key may be left out.
+    """The configuration that `sim:KEY=VALUE&...` describes; every key may be left out.
 
     `faults` are separated by `;` (see `faults.FORMS`), `workshop` is rx,ry,rz[,tx,ty,tz] in degrees and metres,
     `intrinsics_off` is FOCAL[,CX,CY] in percent, `depth` and `traffic` are `yes` or `no`.
@@ -77,7 +77,7 @@ def drive_config_of(query: dict[str, str]) -> DriveConfig:
 
 
 def require_extra() -> None:
-    """Raises SourceError, which says what to install, where ray casting is not installed."""
+    """Raises SourceError, which says what to install, if ray casting is not installed."""
     if importlib.util.find_spec("embreex") is None:
         raise SourceError("a simulated drive needs the optional extra `sim`: pip install 'coec[sim]'")
 
@@ -86,13 +86,13 @@ RIG_KEYS = (
     *("seed", "seconds", "camera_hz", "lidar_hz", "ego_hz", "start_m", "speed_mps"),
     *("rig", "pair", "scene", "camera", "depth", "traffic", "faults", "workshop"),
 )
-"""Query keys of a rig; numbers as above."""
+"""Query keys of a rig; numbers have the limits of `NUMBERS`."""
 
 
 def open_rig(query: dict[str, str]) -> RigDrive:
-    """The drive of `sim:rig=four-fisheyes&KEY=VALUE&...`; every other key may be left out, `pair` is not looked at.
+    """The drive of `sim:rig=four-fisheyes&KEY=VALUE&...`; all keys but `rig` may be left out, `pair` is ignored.
 
-    `faults` are separated by `;`, those of a sensor begin with its name (see `faults.parse_sensor_fault`); `workshop`
+    `faults` are separated by `;`; those of a sensor begin with its name (see `faults.parse_sensor_fault`). `workshop`
     is SENSOR:rx,ry,rz[,tx,ty,tz] in degrees and metres about the sensor's axes, separated by `;`.
 
     Raises:
@@ -126,7 +126,7 @@ def open_pair_of_rig(query: dict[str, str]) -> RigPair:
     """The recording of `sim:rig=...&pair=CAMERA-LIDAR&...`.
 
     Raises:
-        UsageError, SourceError: as `open_rig`, and where the pair is not named or there is no such pair.
+        UsageError, SourceError: as `open_rig`, and if `pair` is missing or there is no such pair.
     """
     drive = open_rig(query)
     pairs = [f"{camera}-{lidar}" for camera, lidar in drive.config.layout.pairs]
@@ -183,7 +183,7 @@ def _three(text: str) -> tuple[float, ...]:
 
 
 def _numbers(text: str) -> tuple[float, ...]:
-    """The finite numbers of a list; none where one of them is not."""
+    """The numbers of a comma-separated list; empty if one of them is not a finite number."""
     try:
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:

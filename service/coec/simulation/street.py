@@ -1,7 +1,7 @@
 """Stretches of street along a road: ground, kerbs, marks, houses, gardens, parked cars, trees, lamps, signs, people.
 
 Every stretch follows from the seed and its number alone, so a drive of any length needs only those around the vehicle.
-Traffic keeps to the right; `left_m` counts from the centre line, sidewalks begin beyond `Style.half_road_m`.
+Traffic keeps to the right; `left_m` counts from the centre line; sidewalks begin beyond `Style.half_road_m`.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ KERB_M, KERB_WIDTH_M = 0.12, 0.15
 MOUTH_M = 9.0
 """Width of a side street where it opens."""
 MEADOW = (0.09, 0.23, 0.16)
-"""Colour of what lies beside an open road."""
+"""Colour of the ground beside an open road."""
 NO_PASSAGES = Passages()
 BACKDROP_M, BACKDROP_DOWN_M = 500.0, 3.0
-"""A last plane under everything, so that no ray falls through beside the ground."""
+"""A plane below everything, so that no ray falls through beside the ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +83,14 @@ def draw_style(seed: int) -> Style:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """One stretch; its mesh is counted from `origin_m` (3,), so that float32 stays exact far along the road."""
+    """One stretch; its mesh is relative to `origin_m` (3,), so that float32 stays exact far along the road."""
 
     origin_m: Doubles
     mesh: Mesh
 
 
 def build_stretch(seed: int, index: int, road: Road, style: Style, passages: Passages = NO_PASSAGES) -> Stretch:
-    """Stretch `index`, from `index * STRETCH_M` on. What is drawn does not depend on the passages, what stands does."""
+    """Stretch `index`, from `index * STRETCH_M` on. Passages remove objects, but do not change the random draws."""
     rng = np.random.default_rng([seed, 102, index + 2**20])
     begin_m, end_m = index * STRETCH_M, (index + 1) * STRETCH_M
     site = Site(road, begin_m, passages.empty())
@@ -108,7 +108,7 @@ def build_stretch(seed: int, index: int, road: Road, style: Style, passages: Pas
 
 
 def backdrop() -> Mesh:
-    """A plane far below and around, about the origin."""
+    """A wide plane below the ground, around the origin."""
     r, z = BACKDROP_M, -BACKDROP_DOWN_M
     return quads([[-r, -r, z], [r, -r, z], [r, r, z], [-r, r, z]], (0.10, 0.20, 0.17), Material.GRASS)
 
@@ -139,7 +139,7 @@ def _road(rng: np.random.Generator, site: Site, style: Style) -> None:
 
 
 def _ground(rng: np.random.Generator, site: Site, style: Style, side: float, mouth: bool, bare: bool) -> None:
-    """What lies beside the road: kerb, sidewalk and yards; a meadow up to the asphalt where it is bare."""
+    """The ground beside the road: kerb, sidewalk and yards, or where `bare` a meadow up to the asphalt."""
     half, front = style.half_road_m, style.front_m
     kerb, up = np.array([0.42, 0.43, 0.43]) * rng.uniform(0.8, 1.2), KERB_M
     paving = np.array([0.34, 0.36, 0.37]) * rng.uniform(0.7, 1.3)
@@ -173,7 +173,7 @@ def _ground(rng: np.random.Generator, site: Site, style: Style, side: float, mou
 
 
 def _row(rng: np.random.Generator, site: Site, style: Style, side: float, begin_m: float) -> None:
-    """The buildings of one side, none across the end of the stretch, and what stands before and behind them."""
+    """The buildings of one side, none beyond the end of the stretch, and what stands before and behind them."""
     kind = int(rng.choice(4, p=np.asarray(style.kinds) / np.sum(style.kinds)))
     at = begin_m + rng.uniform(0.0, 1.0)
     setback = (rng.uniform(0.0, 3.5), rng.uniform(3.5, 8.0), rng.uniform(2.0, 9.0), 0.0)[kind]

@@ -1,4 +1,4 @@
-"""The kinds of places through which a vehicle drives, by name: what stands there, what moves, how fast one goes."""
+"""The kinds of places through which a vehicle drives, by name: what stands there, what moves, how fast it drives."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from coec.simulation.tunnel import Bore, bore
 
 
 class Surroundings(Protocol):
-    """A kind of place, of a seed.
+    """A place of some kind, made from a seed.
 
     Attributes:
-        speed_mps: how fast one drives there, unless told otherwise.
-        calmer: bends and slopes are so many times longer than those of a street.
-        poor: whether stretches of it may be a tunnel or an open road.
+        speed_mps: default mean speed there.
+        calmer: bends and slopes are so many times longer than in a street.
+        poor: whether parts of it may be a tunnel or an open road.
     """
 
     speed_mps: ClassVar[float]
@@ -35,15 +35,15 @@ class Surroundings(Protocol):
 
     @property
     def left_m(self) -> float:
-        """Where the vehicle drives, left of the centre line."""
+        """How far left of the centre line the vehicle drives."""
         ...
 
     def build(self, index: int, road: Road, passages: Passages) -> Stretch:
-        """A stretch, by number: it does not depend on the others."""
+        """The stretch of a number; it does not depend on other stretches."""
         ...
 
     def look(self, rng: np.random.Generator) -> Mesh:
-        """Something that moves there."""
+        """A random model of something that moves there."""
         ...
 
     def movers(self, at_m: float, time_s: float, own: Progress) -> Iterator[Mover]:
@@ -51,7 +51,7 @@ class Surroundings(Protocol):
         ...
 
     def bores(self, road: Road, begin_m: float, end_m: float, passages: Passages) -> tuple[Bore, ...]:
-        """What keeps the sky off a road between two places."""
+        """Rooms that keep the sky off the road between two places."""
         ...
 
 
@@ -167,7 +167,7 @@ class Room:
 
     @property
     def left_m(self) -> float:
-        """See `Surroundings`: the middle; the vehicle sways less than a doorway leaves."""
+        """See `Surroundings`: the middle; the vehicle sways less than a doorway allows."""
         return 0.0
 
     @property

@@ -15,21 +15,21 @@ Progress = Callable[[Doubles], Doubles]
 """Arc length in metres at times in seconds."""
 
 MODELS = 10
-"""Looks of what moves."""
+"""Number of different looks of what moves."""
 ONCOMING_MPS, ONCOMING_GAP_M = 9.0, 55.0
 OWN_GAPS_M = (34.0, 71.0, 113.0, -27.0)
 """Places of the other cars in the own lane, ahead of the vehicle."""
 FAR_GAPS_M = (62.0, 118.0, -48.0)
 """The same on a highway: two seconds and a half apart."""
 HIGHWAY_MPS, HIGHWAY_GAP_M = 27.0, 130.0
-"""Of the traffic that comes the other way."""
+"""Speed and spacing of the oncoming traffic on a highway."""
 WALKERS, WALK_M, WALK_S = 3, 1.8, 7.0
 """People in a room: how many, how far they go to and fro, and how long that takes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mover:
-    """Something on its way: which model, where along the road at a time, how far left of the centre line."""
+    """Something that moves: its model, its place along the road over time, and how far left of the centre line."""
 
     model: int
     progress: Progress
@@ -45,20 +45,20 @@ class Mover:
 
 
 def in_street(seed: int, at_m: float, time_s: float, own: Progress, lane_m: float) -> Iterator[Mover]:
-    """Cars in the own lane and cars that come, lanes of this width."""
+    """Cars in the vehicle's lane and oncoming cars, in lanes of this width."""
     left = lane_m / 2
     yield from _ahead(seed, own, OWN_GAPS_M, -left)
     yield from _coming(seed, at_m, time_s, left, ONCOMING_MPS, ONCOMING_GAP_M)
 
 
 def on_highway(seed: int, at_m: float, time_s: float, own: Progress, own_left_m: float) -> Iterator[Mover]:
-    """Few cars, far apart, in the own lane and beyond the median."""
+    """Few cars, far apart, in the vehicle's lane and beyond the median."""
     yield from _ahead(seed, own, FAR_GAPS_M, own_left_m)
     yield from _coming(seed, at_m, time_s, -own_left_m, HIGHWAY_MPS, HIGHWAY_GAP_M)
 
 
 def in_room(seed: int, own: Progress, half_m: float) -> Iterator[Mover]:
-    """People who walk to and fro before the vehicle, between the walls at ± half the width."""
+    """People who walk to and fro ahead of the vehicle, between the walls at ± `half_m`."""
     for number in range(WALKERS):
         rng = np.random.default_rng([seed, 107, number])
         ahead, phase = float(rng.uniform(2.5, 7.0)), float(rng.uniform(0, 2 * np.pi))

@@ -1,4 +1,4 @@
-"""A tunnel: bare walls and a ceiling near the lane, a strip of lamps along its middle, a hill around it."""
+"""A tunnel: bare walls and a ceiling close to the lane, a strip of lamps along its middle, a hill around it."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from coec.simulation.site import Site
 Doubles = NDArray[np.float64]
 
 HIGH_M = 4.8
-"""From the road to the ceiling: room for a lorry of 4.0 m and for signs."""
+"""Height of the ceiling above the road: room for a lorry of 4.0 m and for signs."""
 VERGE_M = 0.8
-"""From the edge of the lane to the wall."""
+"""Distance from the edge of the lane to the wall."""
 STRIP_HALF_M, STRIP_DOWN_M = 0.15, 0.05
 """Half the width of the strip of lamps, and how far it hangs below the ceiling."""
 STEP_M = 3.0
-"""Walls are straight for so long: 1.3 cm beside the curve at the tightest bend."""
+"""Length of the straight pieces of walls: at most 1.3 cm off the curve at the tightest bend."""
 COVER_M, HILL_FLAT_M, HILL_FOOT_M = 1.6, 9.0, 42.0
-"""Of the hill: above the ceiling, half the width of its top, and where it meets the ground."""
+"""The hill: height above the ceiling, half the width of its top, and how far from the middle it meets the ground."""
 WALL, CEILING = (0.42, 0.45, 0.46), (0.20, 0.20, 0.20)
 PORTAL, TURF = (0.30, 0.31, 0.31), (0.09, 0.22, 0.16)
 SPINE_M = 1.0
@@ -32,14 +32,14 @@ SPINE_M = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bore:
-    """The room inside a tunnel, or whatever else has a ceiling with a strip of lamps over the middle of the road.
+    """The room inside a tunnel, or anything else with a ceiling and a strip of lamps over the middle of the road.
 
     Attributes:
         spine: (K, 5) points of the road's middle at every `SPINE_M` from one mouth to the other: x, y, z in metres
             (world), cosine and sine of the heading.
-        half_m: from the middle to a wall.
-        high_m: from the road to the ceiling.
-        light: of its lamps, in that of a tunnel's.
+        half_m: distance from the middle to a wall.
+        high_m: height of the ceiling above the road.
+        light: of its lamps, relative to those of a tunnel.
     """
 
     spine: Doubles
@@ -61,7 +61,7 @@ def bore_of(road: Road, begin_m: float, end_m: float, half_m: float, high_m: flo
 
 
 def dig(site: Site, span: Span, part: Span, lane_m: float) -> None:
-    """Brings the part of a tunnel that lies on a site; at its mouths the face of the hill."""
+    """Adds the part of a tunnel that lies on a site, with the face of the hill at its mouths."""
     half = lane_m + VERGE_M
     first, last = part.begin_m - site.begin_m, part.end_m - site.begin_m
     s = np.linspace(first, last, int(np.ceil((last - first) / STEP_M)) + 1)

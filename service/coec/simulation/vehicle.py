@@ -1,4 +1,4 @@
-"""How the vehicle moves, where its sensors sit, and what of its body the camera sees."""
+"""How the vehicle moves, where its sensors sit, and which parts of its body the camera sees."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from coec.simulation.road import Road
 Doubles = NDArray[np.float64]
 
 SPEED_SWING, SPEED_PERIOD_S = 0.25, 31.0
-"""The share by which the speed swings about its mean, and how fast."""
+"""The share by which the speed swings about its mean, and the period of the swing."""
 WANDER_M, WANDER_PERIOD_M = 0.25, 83.0
-"""The vehicle sways this far within its lane."""
+"""How far the vehicle sways within its lane, and over which distance."""
 PITCH_RAD, PITCH_HZ = 0.004, (1.3, 0.41)
 ROLL_RAD, ROLL_HZ = 0.003, (1.1, 0.33)
 HEAVE_M, HEAVE_HZ = 0.008, 1.2
-"""Movements on the springs: usual for a car on an even street at `LIVELY_MPS`."""
+"""Movements on the springs, as usual for a car on an even street at `LIVELY_MPS`."""
 LIVELY_MPS = 8.5
-"""Slower, the springs move less in proportion; a standing vehicle is still."""
+"""Below this speed, the springs move less in proportion; a standing vehicle is still."""
 TWIST_STEP_S = 0.005
 """Half the span of the central difference that gives velocities."""
 
 P_EGO_LIDAR_M = np.array([1.35, 0.0, 1.95])
 P_EGO_CAMERA_M = np.array([1.62, 0.06, 1.72])
-"""On the roof; the ego frame is the rear axle's middle on the ground. The range of a point is measured from the LiDAR
-(METHOD, section 1): the further the camera, the more differs its depth, so both are near each other."""
+"""Places on the roof, in the ego frame, whose origin is the middle of the rear axle on the ground. Both are close
+together, because a camera's depth differs more from the LiDAR's range the further away it is (METHOD, section 1)."""
 CAMERA_MOUNT_RAD = np.deg2rad([4.0, -2.0, 1.0])
 """Rotation of the camera about its x, y, z axes from looking straight ahead."""
 
@@ -44,7 +44,7 @@ class Pace:
     Attributes:
         start_m: arc length at time 0.
         phase: of the swing of its speed, radians.
-        speed_mps: mean speed; 0 stands.
+        speed_mps: mean speed; 0 for a standing vehicle.
     """
 
     start_m: float
@@ -58,11 +58,11 @@ class Pace:
 
     @property
     def fastest_mps(self) -> float:
-        """It is never faster."""
+        """The greatest speed."""
         return self.speed_mps * (1.0 + SPEED_SWING)
 
     def progress(self, time_s: Doubles) -> Doubles:
-        """Arc length, metres."""
+        """Arc length at times in seconds, metres."""
         omega = 2 * np.pi / SPEED_PERIOD_S
         swing = self.speed_mps * SPEED_SWING / omega
         result: Doubles = (
@@ -127,14 +127,14 @@ def _phases(seed: int) -> Doubles:
 
 
 def T_ego_lidar() -> Matrix4:
-    """(4, 4): upright above the axle."""
+    """(4, 4) pose of the LiDAR: upright above the axle."""
     transform = np.eye(4)
     transform[:3, 3] = P_EGO_LIDAR_M
     return transform
 
 
 def workshop_T_camera_lidar() -> Matrix4:
-    """(4, 4): where the camera was mounted."""
+    """(4, 4) true extrinsic as the camera was mounted."""
     ahead = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     axes = np.einsum("ij,jk->ik", ahead, rotation_exp(CAMERA_MOUNT_RAD))
     transform = np.eye(4)
@@ -145,7 +145,7 @@ def workshop_T_camera_lidar() -> Matrix4:
 
 @lru_cache(maxsize=1)
 def body() -> Mesh:
-    """Roof front, windscreen, bonnet and mirrors in the ego frame: what a camera on the roof has of its own car."""
+    """Roof front, windscreen, bonnet and mirrors in the ego frame: what a camera on the roof sees of its own car."""
     dark = (0.035, 0.03, 0.03)
     rails = [(1.75, 0.60, 1.50), (2.35, 0.72, 0.98), (3.15, 0.74, 0.80), (3.45, 0.66, 0.55), (3.5, 0.6, 0.3)]
     rows = np.array([[[x, -y, z], [x, y, z]] for x, y, z in rails])
@@ -167,7 +167,7 @@ def body() -> Mesh:
 
 @lru_cache(maxsize=1)
 def whole_body() -> Mesh:
-    """The body from bumper to bumper in the ego frame, closed on all sides: what sensors all around have of their own
+    """The body from bumper to bumper in the ego frame, closed on all sides: what sensors all around see of their own
     car."""
     dark = (0.035, 0.03, 0.03)
     # Along the middle: (x, half width, height) of the bonnet's nose, its end, the roof's front, its rear, the tail.

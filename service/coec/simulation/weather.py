@@ -1,4 +1,4 @@
-"""Rain and a low sun: what they do to the air, the light and the lens."""
+"""Rain and a low sun: their effects on the air, the light and the lens."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from coec.simulation.mesh import Floats
 from coec.simulation.sky import Sky
 
 DROP_M, DROP_REFLECTANCE = 5.0, 0.02
-"""Drops that answer a laser lie so far beyond its nearest range on the mean (further ones are too weak), and how
-bright they are."""
+"""Drops that reflect a laser: their mean distance beyond its nearest range (further ones are too weak), and their
+reflectance."""
 DROPS_PER_MMPH = 6e-4
-"""Share of the rays that a drop answers, per millimetre of rain an hour: 1.5 % at 25 mm/h, the order that published
+"""Share of the rays that a drop reflects, per millimetre of rain an hour: 1.5 % at 25 mm/h, the order that published
 rain chambers show for automotive sensors."""
 LENS_DROPS_PER_MMPH, LENS_DROP_SHARE = 2.0, (0.008, 0.03)
 """Drops on the lens per millimetre an hour, and their radius as a share of the width of the picture."""
 SHOWER_S = 4.0
-"""So long the drops on the lens stay: the time between two strokes of a wiper."""
+"""How long drops stay on the lens: the time between two strokes of a wiper."""
 SUN_LOW_RAD, SUN_ASIDE_RAD = math.radians(5.0), math.radians(8.0)
-"""Height of a low sun, and how far to the left of the way ahead it stands."""
+"""Height of a low sun, and how far to the left of the heading it stands."""
 SUN_POWER = (0.45, 0.75, 1.1)
-"""Light of a low sun: red, as `sky.draw_sky` has it at its lowest."""
+"""Light of a low sun: reddish, as in `sky.draw_sky` at its lowest."""
 
 
 @dataclass(frozen=True, slots=True)
 class Air:
-    """What the light of a laser goes through.
+    """The air between a laser and what it hits.
 
     Attributes:
         extinction_per_m: share of the light that is lost per metre, one way.
-        drops: share of the rays that a drop answers.
+        drops: share of the rays that a drop reflects.
     """
 
     extinction_per_m: float = 0.0
@@ -50,7 +50,7 @@ def rainy_air(mm_per_h: float) -> Air:
 
 
 def rainy_sky(sky: Sky, mm_per_h: float) -> Sky:
-    """The same place under rain clouds: grey, without sun, hazy."""
+    """The sky of the same place under rain clouds: grey, without sun, hazy."""
     grey = 0.6
     haze_m = min(sky.haze_m, 1.0 / max(rainy_air(mm_per_h).extinction_per_m, 1e-6))
     return replace(
@@ -60,7 +60,7 @@ def rainy_sky(sky: Sky, mm_per_h: float) -> Sky:
 
 
 def rained_lens(shape: tuple[int, int], mm_per_h: float, seed: int, shower: int) -> Floats:
-    """(h, w) cover of the lens by drops, 0 to 1; other drops in every shower."""
+    """(h, w) cover of the lens by drops, 0 to 1; every `shower` has other drops."""
     rng = np.random.default_rng([seed, 121, shower])
     cover = np.zeros(shape, np.float32)
     for _ in range(int(rng.poisson(LENS_DROPS_PER_MMPH * mm_per_h))):
@@ -72,7 +72,7 @@ def rained_lens(shape: tuple[int, int], mm_per_h: float, seed: int, shower: int)
 
 
 def low_sun_sky(sky: Sky, heading_rad: float) -> Sky:
-    """The same place with the sun low before a vehicle of this heading, under a clear sky."""
+    """The sky of the same place with a low sun ahead of a vehicle with this heading, and few clouds."""
     around = heading_rad + SUN_ASIDE_RAD
     towards = np.array(
         [math.cos(SUN_LOW_RAD) * math.cos(around), math.cos(SUN_LOW_RAD) * math.sin(around), math.sin(SUN_LOW_RAD)]

@@ -8,10 +8,10 @@ from itertools import chain
 from pathlib import Path
 
 STEPS = 4900
-"""Of the network that is shipped."""
+"""Steps of the shipped network."""
 SEED = 7
 FIRST = 1000
-"""Seed of the first street: those of demonstrations and tests stay unseen."""
+"""Seed of the first street, above those of demonstrations and tests, which stay unseen."""
 
 
 def main() -> None:
@@ -39,7 +39,7 @@ def main() -> None:
     arguments.run(arguments)
 
 
-# Each imports what it needs only: rendering needs no torch, training no Embree.
+# Each command imports only what it needs: rendering needs no torch, training no Embree.
 
 
 def _render(arguments: argparse.Namespace) -> None:

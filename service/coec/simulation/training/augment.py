@@ -1,4 +1,4 @@
-"""What a frame becomes each time it is shown: another part of it, mirrored, in other colours, worse."""
+"""Changes a frame each time it is shown: another part of it, mirrored, in other colours, degraded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def augment(shown: Shown, height: int, width: int, rng: np.random.Generator) -> 
     """RGB (height, width, 3), 0 to 255, and the target (height, width): see `target`."""
     bgr, code = _cut(shown, height, width, rng)
     rgb = bgr[:, :, ::-1].astype(np.float32)
-    if rng.random() < 0.25:  # what a real sky does to a sensor
+    if rng.random() < 0.25:  # a sky as bright as a real sensor sees it
         sky = (code == SKY)[:, :, None]
         rgb = np.where(sky, rng.uniform(120, 255, 3).astype(np.float32) * 0.3 + rng.uniform(120, 255) * 0.7, rgb)
     rgb = _recolour(np.clip(rgb, 0, 255) / np.float32(255), rng)
@@ -31,9 +31,9 @@ def augment(shown: Shown, height: int, width: int, rng: np.random.Generator) -> 
 
 
 def target(code: NDArray[np.uint16]) -> Floats:
-    """√(inverse range in 1/m), 0 for the sky, NaN where it is not known.
+    """√(inverse range in 1/m), 0 for the sky, NaN where unknown.
 
-    The root spreads what is far: 5 m to 50 m are 0.45 to 0.14 instead of 0.2 to 0.02. It changes no order.
+    The root spreads far ranges: 5 m to 50 m are 0.45 to 0.14 instead of 0.2 to 0.02. It keeps the order.
     """
     root = np.sqrt(code.astype(np.float32) / np.float32(65535))
     root[code == SKY] = 0.0

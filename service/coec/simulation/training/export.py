@@ -1,4 +1,4 @@
-"""From a checkpoint to the ONNX file that is shipped."""
+"""Makes the shipped ONNX file from a checkpoint."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from coec.simulation.training.network import StreetNet
 OPSET = 17
 INPUT, OUTPUT = "image", "inverse_depth"
 SMALL = 64
-"""Tensors with fewer values stay float32."""
+"""Weights with fewer values than this stay float32."""
 
 
 def export(checkpoint: Path, path: Path) -> None:
-    """Writes the averaged network with free height and width; large weights as float16, which halves the file.
+    """Writes the averaged network with free height and width; large weights are float16, which halves the file.
 
     Arithmetic stays float32: onnxruntime casts the weights once, when it loads them.
     """
@@ -44,7 +44,7 @@ def export(checkpoint: Path, path: Path) -> None:
 
 
 def _fuse(network: nn.Module) -> None:
-    """Batch normalisation into the convolution before it: only there, as each is used once."""
+    """Folds each batch normalisation into the convolution directly before it; that is safe, as each is used once."""
     for module in network.modules():
         if isinstance(module, nn.Sequential):
             for index in range(len(module) - 1):
@@ -69,7 +69,7 @@ def _halve_weights(graph: onnx.GraphProto) -> None:
 
 
 def same(checkpoint: Path, path: Path, image: Tensor) -> float:
-    """Largest difference between the two on an image (1, 3, H, W), as a share of the output's spread."""
+    """Largest difference between checkpoint and ONNX file on an image (1, 3, H, W), over the spread of the output."""
     import onnxruntime
 
     network = StreetNet()

@@ -1,4 +1,4 @@
-"""Frames on disk: one npz for each town, written as a whole or not at all."""
+"""Frames on disk: one npz file per town, written completely or not at all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coec.simulation.training.shown import SHAPES, Shown
 
 
 def write(folder: Path, seed: int, frames: Iterable[Shown]) -> Path:
-    """`town_<seed>.npz` with, for each kind that occurs, `<kind>_bgr` and `<kind>_code`, stacked."""
+    """Writes `town_<seed>.npz`: for each kind that occurs, the stacked arrays `<kind>_bgr` and `<kind>_code`."""
     by_kind: dict[str, list[Shown]] = {}
     for frame in frames:
         by_kind.setdefault(frame.kind, []).append(frame)
@@ -27,7 +27,7 @@ def write(folder: Path, seed: int, frames: Iterable[Shown]) -> Path:
 
 
 def path_of(folder: Path, seed: int) -> Path:
-    """Where the frames of a town are."""
+    """Path of the frames of a town."""
     return folder / f"town_{seed}.npz"
 
 

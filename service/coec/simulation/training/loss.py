@@ -1,4 +1,4 @@
-"""What the network is blamed for: wrong shape, wrong edges, wrong order."""
+"""The training loss: it punishes wrong shape, wrong edges, and wrong order."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from torch.nn import functional
 
 GRADIENT_WEIGHT, RANK_WEIGHT = 0.5, 0.5
 SCALES = 4
-"""Of the gradient term: each half the size of the one before."""
+"""Scales of the gradient term, each half the size of the one before."""
 PAIRS = 4096
-"""Random pairs of pixels of each picture whose order is compared, half of them neighbours."""
+"""Random pairs of pixels per picture whose order is compared; half of them are neighbours."""
 REACH_PX = 16
-"""Of neighbours, along rows and columns: a car stands out of the road behind it."""
+"""Greatest distance of neighbours along rows and columns, so that a car must stand out from the road behind it."""
 LEAST_SPREAD = 0.02
-"""Of the target, 1/√m: a wall is not blown up."""
+"""Least spread of a target, 1/√m, so that the normalisation does not magnify a flat wall."""
 SAME = 0.03
-"""Pairs whose inverse ranges' roots differ by less than this share of the larger have no order."""
+"""Pairs whose targets differ by less than this share of the larger have no order."""
 
 
 def loss(output: Tensor, target: Tensor, generator: torch.Generator) -> Tensor:
     """Mean distance from the normalised target and its gradients (Ranftl et al., TPAMI 2022, equations (5), (7), (11)),
     and a ranking term (Chen et al., NIPS 2016).
 
-    Only the target is normalised, so that no picture's scale has to be known and yet a flat output has no steep slope.
+    Only the target is normalised: then no picture's scale has to be known, and a flat output still has no steep slope.
 
     Args:
         output: (B, H, W), any scale and shift.
@@ -38,7 +38,7 @@ def loss(output: Tensor, target: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _normalised(x: Tensor, known: Tensor) -> Tensor:
-    """Less its median, over its mean distance from it: over the known pixels of each picture."""
+    """x minus its median, over its mean distance from the median, both over the known pixels of each picture."""
     flat, mask = x.flatten(1), known.flatten(1)
     count = mask.sum(1, keepdim=True).clamp(min=1)
     holes = torch.where(mask, flat, torch.full_like(flat, float("nan")))
@@ -69,6 +69,6 @@ def _order(output: Tensor, wanted: Tensor, known: Tensor, generator: torch.Gener
     difference = goal[:, first] - goal[:, second]
     larger = torch.maximum(goal[:, first], goal[:, second])
     told = mask[:, first] & mask[:, second] & (difference.abs() > SAME * larger)
-    # Scaled so that the term stops to pull once a pair is well apart.
+    # Scaled so that the term stops pulling once a pair is well apart.
     wrong = functional.softplus(-4.0 * difference.sign() * (flat[:, first] - flat[:, second]))
     return (wrong * told).sum() / told.sum().clamp(min=1)

@@ -1,7 +1,7 @@
 """The network `street`: a U-Net of depthwise separable convolutions (Ronneberger et al., MICCAI 2015; Howard et al.,
 MobileNets, 2017; blocks in the order of Liu et al., ConvNeXt, CVPR 2022), 0.9 million parameters.
 
-Fully convolutional: any height and width that are multiples of 32.
+It is fully convolutional: height and width may be any multiples of 32.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from torch.nn import functional
 WIDTHS = (16, 32, 48, 96, 160)
 """Channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the size."""
 DEPTHS = (0, 1, 2, 3, 3)
-"""Blocks there."""
+"""Blocks at each of these sizes."""
 UP = (16, 24, 32, 64)
 """Channels of the way back at 1/2, 1/4, 1/8 and 1/16."""
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of RGB / 255, as is custom since ImageNet: part of the network, which takes RGB 0 to 255."""
+"""Mean and deviation of RGB / 255, as is usual since ImageNet: part of the network, which takes RGB 0 to 255."""
 
 
 class Block(nn.Module):
-    """5×5 depthwise, then two 1×1 with twice the channels between; added to what came in."""
+    """A 5×5 depthwise convolution, then two 1×1 with twice the channels between them, added to the input."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class Block(nn.Module):
 
 
 class Context(nn.Module):
-    """Adds what the whole picture says, its mean, to each place."""
+    """Adds a function of the mean over the whole picture to each place."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ class StreetNet(nn.Module):
         self.context = Context(WIDTHS[-1])
         self.across = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(WIDTHS[:-1], UP, strict=True))
         self.below = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip((*UP[1:], WIDTHS[-1]), UP, strict=True))
-        # Not at 1/2: half of the time would go there.
+        # No blocks at 1/2, which would take half of the time.
         self.up = nn.ModuleList([nn.Identity(), *(Block(channels) for channels in UP[1:])])
         self.head = nn.Sequential(nn.Conv2d(UP[0], UP[0], 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(UP[0], 1, 1))
 

@@ -1,7 +1,7 @@
-"""Where the camera stands: in streets as they are, in a jam under a bridge, in a hall.
+"""Where the camera stands: in ordinary streets, in a jam under a bridge, in a hall.
 
-Streets alone teach that what is low is near and what is high is far. Beside a lorry, under a bridge and indoors
-it is not so.
+Streets alone teach that low things are near and high things are far. That is false beside a lorry, under a bridge and
+indoors.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from coec.simulation.sky import draw_sky
 Doubles = NDArray[np.float64]
 
 PLACES = 3
-"""Of each seed."""
+"""Places of each seed."""
 CROWDED = 1_000_000
-"""From this seed on, jams and halls take turns; below, there are streets."""
+"""From this seed on, jams and halls alternate; smaller seeds give streets."""
 TOWN_M = 1000.0
 LANE_M = 3.2
 WALLS = (Material.PAINT, Material.BRICK, Material.PLASTER, Material.CONCRETE, Material.TILES)
 
 
 class Place(Protocol):
-    """Somewhere to take pictures. The draws come in this order."""
+    """Somewhere to take pictures. Its methods must be called in this order, because they draw random numbers."""
 
     def draw_spot(self, rng: np.random.Generator) -> float:
-        """Where along the place, metres."""
+        """A random spot along the place, metres."""
 
     def stand(self, spot_m: float, rng: np.random.Generator) -> Matrix4:
         """T_world_ego (4, 4) of a vehicle there."""
 
     def draw_scene(self, rng: np.random.Generator) -> Scene:
-        """What is around."""
+        """The surroundings."""
 
 
 def places(seed: int) -> Iterator[tuple[Place, np.random.Generator]]:

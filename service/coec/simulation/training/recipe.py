@@ -1,7 +1,7 @@
-"""What the network is shown: streets through random cameras, on random mounts, in random light, at exact range.
+"""What the network learns from: streets seen by random cameras, on random mounts, in random light, with exact range.
 
-Everything about a frame that a real vehicle might have otherwise is drawn anew: the network is to learn what is common
-to all of them (domain randomisation: Tobin et al., IROS 2017).
+Everything in a frame that may differ on a real vehicle is drawn anew, so that the network learns what all have in
+common (domain randomisation: Tobin et al., IROS 2017).
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from coec.simulation.vehicle import P_EGO_CAMERA_M, body
 Doubles = NDArray[np.float64]
 
 FRAMES_PER_PLACE = 4
-"""Laying a place out takes longer than a frame."""
+"""More than one, because laying out a place takes longer than rendering a frame."""
 TOO_NEAR_M, TOO_NEAR_SHARE = 1.8, 0.3
-"""A frame with more than this share of its pixels nearer than that looks into a wall, and is drawn again."""
+"""A frame with more than this share of its pixels nearer than `TOO_NEAR_M` looks into a wall and is drawn again."""
 HEIGHT_M = (0.8, 2.2)
 TILT_RAD = np.deg2rad(8.0)
 """Greatest pitch and roll of a mount."""
@@ -55,7 +55,7 @@ def frames(seed: int) -> Iterator[Shown]:
 
 
 def draw_eye(kind: str, rng: np.random.Generator) -> Eye:
-    """A camera of a kind."""
+    """A random camera of a kind."""
     height, width = SHAPES[kind]
     cx, cy = (width - 1) / 2 + rng.normal(0, 0.015) * width, (height - 1) / 2 + rng.normal(0, 0.03) * height
     size = {"width": width, "height": height, "cx": cx, "cy": cy}
@@ -74,7 +74,7 @@ def draw_eye(kind: str, rng: np.random.Generator) -> Eye:
 
 
 def draw_lens(rng: np.random.Generator) -> Lens:
-    """What a camera does to the light: from a clean picture to a poor one."""
+    """Random properties of a lens, from a clean picture to a poor one."""
     return Lens(
         blur_px=float(rng.uniform(0.25, 1.1)),
         vignetting=float(rng.uniform(0.0, 0.45)),
@@ -107,7 +107,7 @@ def _frame(place: Place, own: Solid, rng: np.random.Generator) -> Shown:
 
 
 def _mount(with_body: bool, rng: np.random.Generator) -> Matrix4:
-    """T_ego_camera: on the roof behind the bonnet, or anywhere that sees no body."""
+    """Random T_ego_camera: on the roof behind the bonnet, or anywhere from which no body is seen."""
     if with_body:
         yaw = rng.normal(0, 0.08)
         place = P_EGO_CAMERA_M + np.array([rng.uniform(-0.2, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(-0.1, 0.3)])
@@ -123,7 +123,7 @@ def _mount(with_body: bool, rng: np.random.Generator) -> Matrix4:
 
 
 def _repaint(scene: Scene, rng: np.random.Generator) -> None:
-    """Other weather and other colours: over those of the frame before, where it is the same scene."""
+    """Gives a scene new weather and colours; colours change from those of the frame before if the scene is the same."""
     scene.sky = draw_sky(int(rng.integers(2**31)))
     colour = scene.colour
     if rng.random() < 0.5:  # all surfaces alike: lighter, darker, another tint

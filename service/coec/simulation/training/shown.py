@@ -1,4 +1,4 @@
-"""A frame to learn from. Apart from how it is rendered: training needs neither rays nor scenes."""
+"""A frame to learn from. Kept apart from rendering, because training needs neither rays nor scenes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SHAPES: dict[str, tuple[int, int]] = {"round": (192, 192), "wide": (160, 288), "
 KINDS: tuple[tuple[str, float], ...] = (("round", 0.4), ("wide", 0.35), ("panorama", 0.25))
 """Kinds with their shares."""
 NEAREST_M = 1.0
-"""Range whose inverse has the largest code, 65535; nearer surfaces have it, too."""
+"""Range whose inverse has the largest code, 65535; nearer surfaces have the same code."""
 UNKNOWN, SKY = 0, 1
 """Codes of pixels without a target (own body, outside the lens) and of the sky."""
 

@@ -20,21 +20,21 @@ logger = logging.getLogger(__name__)
 
 BATCH = 8
 RATE, WARM_STEPS, FALL_SHARE = 1.5e-3, 100, 0.35
-"""Learning rate of AdamW: it rises over the first steps, stays, and falls to 0 over the last share of them."""
+"""Learning rate of AdamW: rises over `WARM_STEPS`, stays, and falls to 0 over the last `FALL_SHARE` of steps."""
 DECAY = 0.02
 AVERAGE = 0.995
-"""Share of the averaged weights that stays at each step (Polyak)."""
+"""Share of the averaged weights that is kept at each step (Polyak)."""
 CLIP = 1.0
 """Largest norm of a gradient."""
 SCALES = (0.84, 1.0, 1.2)
-"""Of the sizes in `SHAPES`, drawn for each batch and rounded to multiples of 32."""
+"""Factors on the sizes in `SHAPES`, drawn for each batch; the sizes are rounded to multiples of 32."""
 SHARES = {"round": 0.3, "wide": 0.3, "panorama": 0.4}
-"""How often each kind is shown: strips are the hardest."""
+"""How often each kind is shown; strips most often, because they are the hardest."""
 SAVE_STEPS = 100
 
 
 class Shelf:
-    """The frames of a folder by kind; looks for new files when asked to."""
+    """The frames of a folder by kind; `refresh` reads new files."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -42,7 +42,7 @@ class Shelf:
         self.frames: dict[str, list[Shown]] = {kind: [] for kind in SHAPES}
 
     def refresh(self) -> int:
-        """Reads what has come since; the number of frames."""
+        """Reads the files that have come since the last call; returns the number of all frames."""
         for path in files.towns(self._folder):
             if path not in self._read:
                 self._read.add(path)
@@ -51,7 +51,7 @@ class Shelf:
         return sum(len(frames) for frames in self.frames.values())
 
     def batch(self, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """RGB (B, 3, H, W) and target (B, H, W)."""
+        """A random batch: RGB (B, 3, H, W) and target (B, H, W)."""
         kind = str(rng.choice(list(SHARES), p=list(SHARES.values())))
         scale = rng.choice(SCALES)
         height, width = (max(32, 32 * round(scale * side / 32)) for side in SHAPES[kind])
@@ -62,7 +62,7 @@ class Shelf:
 
 
 def train(folder: Path, checkpoint: Path, steps: int, seed: int, threads: int) -> None:
-    """Trains up to a step, on from the checkpoint if there is one; it holds the averaged weights at every time.
+    """Trains up to step `steps`, going on from the checkpoint if there is one. Checkpoints also hold averaged weights.
 
     The same folder, seed and steps give the same draws; the weights also depend on the processor.
     """
