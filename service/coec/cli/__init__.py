@@ -1,4 +1,4 @@
-"""The command line. What a command takes is in `commands`, what it does in the module of its name here.
+"""The command line. `commands` declares the options of each command; the module of the same name here does its work.
 
 Exit codes (CONTRACT, "Command line") are those of `exit_codes`. With `--json`, standard output holds one JSON document
 and nothing else.
@@ -24,7 +24,7 @@ from coec.errors import CoecError, UsageError
 from coec.reports import plain_text
 
 GROUPS = ("models", "sim", "fleet")
-"""Commands that have commands."""
+"""Commands with subcommands."""
 
 COMMANDS = (
     "calibrate",
@@ -52,16 +52,16 @@ COMMANDS = (
     "export",
     "demo",
 )
-"""In the order of the help text."""
+"""Commands in the order of the help text."""
 
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Of a write to standard output, or to a temporary file: no fault of ours."""
+"""Errors of a write to standard output or to a temporary file that are no fault of coec."""
 
 
 def application(words: Sequence[str]) -> typer.Typer:
-    """The commands that a command line can mean: the one that its first word names, and all where none is named, for
-    the help text or the refusal. To declare one takes a millisecond, and most calls need no other."""
+    """The commands that a command line may need: the one that its first word names, or all if it names none, for the
+    help text or the error. Declaring a command takes a millisecond, so most calls declare only one."""
     plain = plain_text.wants_plain(os.environ) or not plain_text.is_unicode(sys.stdout.encoding)
     app = typer.Typer(
         name="coec",
@@ -83,7 +83,7 @@ def application(words: Sequence[str]) -> typer.Typer:
 
 
 def _tell_version(asked: bool) -> None:
-    """Before anything else of the command line is looked at."""
+    """Prints the version, before anything else on the command line is parsed."""
     if asked:
         from coec.cli import version as work
 
@@ -103,7 +103,7 @@ def _coec(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="With --version: one JSON document.")] = False,
 ) -> None:
-    # Without a callback, Typer takes an application of one command for that command.
+    # Without a callback, Typer would treat an application with one command as that command itself.
     if as_json:
         raise UsageError("--json before a command belongs to --version; of a command, write it behind its name")
 
@@ -112,7 +112,7 @@ def main() -> int:
     """Entry point; returns the exit status."""
     as_json = "--json" in sys.argv[1:]
     plain_text.never_fail()
-    # Who asked for a picture need not hear where its library keeps fonts for want of a home.
+    # Without a home directory, matplotlib warns about where it keeps fonts, which is of no interest here.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         command = typer.main.get_command(application(sys.argv[1:]))
@@ -124,7 +124,7 @@ def main() -> int:
         if isinstance(ended.__context__, BrokenPipeError):
             return _unread()
         status = ended.code if isinstance(ended.code, int) else 0
-        # A command that ends so by itself has said why.
+        # A command that ends like this by itself has printed why.
         if isinstance(getattr(ended.__context__, "__cause__", None), KeyboardInterrupt):
             print("coec: interrupted", file=sys.stderr)
             if as_json:
@@ -154,14 +154,14 @@ def main() -> int:
 
 
 def _unread() -> int:
-    """Whoever read our output has gone; nobody is left to be told, also not by the interpreter at its exit."""
+    """The reader of our output has gone, so nothing more is printed, not even by the interpreter at its exit."""
     sys.stdout = None
     return BROKEN_PIPE
 
 
 def _with_signs_of(encoding: str, command: Any) -> None:
-    """Help texts of a command and of those below it in a locale that lacks signs: they would be sent as UTF-8 all the
-    same."""
+    """Replaces signs that the locale's encoding lacks in the help texts of a command and its subcommands, which would
+    otherwise be printed as UTF-8."""
     for told in (command, *command.params):
         if getattr(told, "help", None):
             told.help = plain_text.encodable(told.help, encoding)

@@ -17,7 +17,7 @@ def run(options: Options) -> int:
     """Draws streams of checks, and prints what the change detector makes of them.
 
     Raises:
-        UsageError: a value that no configuration may have.
+        UsageError: a value is not allowed in a configuration.
         OutputError: the folder cannot be written.
     """
     try:

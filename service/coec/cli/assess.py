@@ -1,4 +1,4 @@
-"""`coec models assess`: how good a depth network is for this purpose, before it goes on a vehicle."""
+"""`coec models assess`: how good a depth network is for calibration, before it goes on a vehicle."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from coec.schemas.replies import Vector3
 from coec.sources import windows
 
 STAGES = 3
-"""Steps of which an assessment tells."""
+"""Steps that an assessment reports."""
 
 STYLES = {"good": "bold green", "usable_in_fused": "bold yellow", "do_not_use": "bold red"}
 
 
 def run(options: Options) -> int:
-    """Prints the assessment; 1 if the network is of no use on this recording.
+    """Prints the assessment; returns 1 if the network is of no use on this recording.
 
     Raises:
         CoecError: no such network or source, or nothing to compare.
@@ -70,7 +70,7 @@ def run(options: Options) -> int:
 
 
 def _infer(window: Window, depth: DepthModel, stages: Stages) -> list[float | None]:
-    """Milliseconds of every frame, decoding included.
+    """Infers the depth of every frame; returns the milliseconds of each, decoding included.
 
     Raises:
         CalibrationError: a frame has no depth.

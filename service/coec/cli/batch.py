@@ -1,4 +1,4 @@
-"""`coec batch`: many windows judged again, tables out."""
+"""`coec batch`: judges many windows again and writes tables."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from coec.schemas.fleet import BatchReport, WindowRow
 MIB = 2**20
 
 LINE_S = 30.0
-"""Between two lines of progress where standard error is no terminal."""
+"""Time between two lines of progress where standard error is no terminal."""
 
 
 def run(options: Options) -> int:
-    """Judges every window that has no row yet; 1 if one of them has no result.
+    """Judges every window that has no row yet; returns 1 if one of them has no result.
 
     Raises:
         UsageError: no window, or the folder holds another batch.
         ConfigError: the configuration cannot be used.
-        SourceError: a store cannot be asked, or an optional extra is not installed.
+        SourceError: a store cannot be read, or an optional extra is not installed.
         OutputError: the folder cannot be written.
         FleetError: the engine failed.
     """
@@ -58,7 +58,7 @@ def _engine(options: Options) -> Engine:
 
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
-    """What is to be called with every row: a bar with rate and remaining time, or a line now and then."""
+    """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then."""
     bars = Progress(
         TextColumn("windows"),
         BarColumn(),

@@ -30,10 +30,10 @@ from coec.sources import windows
 
 
 def run(options: Options) -> int:
-    """Prints the result; 1 if its verdict is negative.
+    """Prints the result; returns 1 if its verdict is negative.
 
     Raises:
-        CoecError: there is no result, or nothing can be written where it is to be.
+        CoecError: there is no result, or the output folder cannot be written.
     """
     if options.output is not None:
         output.try_folder(options.output)
@@ -108,14 +108,15 @@ def _document(
 
 
 def _finite(value: float) -> float | None:
-    """JSON has no word for what is not a number."""
+    """The value, or None if it is not finite, because JSON has no NaN."""
     return float(value) if np.isfinite(value) else None
 
 
 def _write(
     folder: Path, camera: Camera, done: Calibrated, document: dict[str, Any]
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """Files, and what was left out. `camera`: of the recording, which another one may have been fitted to."""
+    """Writes the files; returns them, and what was left out. `camera` is the recording's, to which another may have
+    been fitted."""
     window, result, compensated = done.window, done.result, done.configuration.motion_compensation
     caption = Caption(
         before="start",

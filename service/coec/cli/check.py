@@ -1,4 +1,4 @@
-"""`coec check`: what a recording holds, what is missing, and what it is good for."""
+"""`coec check`: what a recording holds, what it lacks, and what it is good for."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from coec.sources import Recording, open_source, windows
 from coec.sources.spec import is_bag, parse_spec
 
 PAIRS = 6
-"""Of the trial, evenly chosen: as many as a check of the monitor has."""
+"""Pairs of the trial, evenly chosen: as many as in a check of the monitor."""
 
 LEVEL_STYLES = {"fail": "bold red", "warn": "bold yellow", "ok": ""}
 
 
 def run(source: str, *, depth: str | None, as_json: bool) -> int:
-    """Says what is there; 1 where a calibration cannot come of it. Of a bag that cannot be opened as a recording of a
-    pair, its topics.
+    """Prints what the recording holds; returns 1 if no calibration can come of it. For a bag that cannot be opened as a
+    recording of a pair, prints its topics.
 
     Raises:
         UsageError, SourceError: the recording cannot be opened, or a file of it cannot be read.
@@ -55,7 +55,7 @@ def run(source: str, *, depth: str | None, as_json: bool) -> int:
 
 
 def _trial(recording: Recording, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
-    """A calibration of a few pairs about the recording's own extrinsic: how sharply this scene tells the pose."""
+    """A calibration of a few pairs near the recording's own extrinsic: shows how well this scene fixes the pose."""
     loaded = windows.chosen_from(recording, PAIRS, lambda done, total: times.step("load", done, total))
     configuration = configuration_of(Choices(depth=depth), loaded.configuration)
     limits = LimitsConfig()
@@ -126,12 +126,12 @@ def _show_topics(source: str) -> None:
         return
     from coec.sources.bag.topics import open_topics
 
-    # A file that is damaged has been said to be.
+    # A damaged file has been reported already.
     with suppress(SourceError):
         bag = open_topics(replace(spec, query={}))
         table = console.table("topic", "type", "messages", "Hz", right=(2, 3))
         for topic, info in bag.infos.items():
-            # Nobody vouches for the names in a file.
+            # Names in a file are not trusted.
             name, kind = (text if text.isprintable() else ascii(text) for text in (topic, info.type_name))
             table.add_row(name, kind, str(info.count), f"{info.rate_hz:.2f}")
         console.out.print(table)

@@ -1,4 +1,4 @@
-"""`coec check-config`: what a configuration comes to, before a vehicle depends on it."""
+"""`coec check-config`: shows the effective configuration of a file, before a vehicle depends on it."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
     """Prints the effective configuration of a file, or a template.
 
     Raises:
-        ConfigError: the file, or a file it names, cannot be used.
-        UsageError: neither or both were asked for.
+        ConfigError: the file, or a file that it names, cannot be used.
+        UsageError: neither or both were requested.
     """
     if defaults == (path is not None):
         raise UsageError("give a configuration file, or --defaults")
@@ -93,7 +93,7 @@ def example() -> Config:
 
 
 def _check(pair: PairConfig, config: Config) -> list[str]:
-    """What was found to be usable; reads the mask and opens the network.
+    """What was found usable for a pair; reads the mask and opens the network.
 
     Raises:
         ConfigError: the rig or the network cannot be used.
@@ -104,10 +104,10 @@ def _check(pair: PairConfig, config: Config) -> list[str]:
 
 
 def _check_awaited(pair: OpenPairConfig, config: Config) -> list[str]:
-    """The same of a pair whose rig is found when its sensors are heard.
+    """What was found usable for a pair whose rig the service finds from its sensors.
 
     Raises:
-        ConfigError: what it is given of a rig, or the network, cannot be used.
+        ConfigError: the given parts of the rig, or the network, cannot be used.
     """
     check_given(pair)
     found = "its frames, and what else is left out, come from /tf_static and CameraInfo when the service runs"

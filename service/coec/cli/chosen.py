@@ -1,4 +1,4 @@
-"""What the command line says of how a recording is calibrated."""
+"""The options of the command line that decide how a recording is calibrated."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from coec.library.choices import Choices
 
 
 class Chosen(Protocol):
-    """Options that commands share; None = not given."""
+    """Options that several commands share; None = not given."""
 
     @property
     def depth(self) -> str | None: ...
@@ -21,7 +21,7 @@ class Chosen(Protocol):
 
 
 def choices_of(options: Chosen) -> Choices:
-    """What was given on the command line."""
+    """The choices that were given on the command line."""
     return Choices(
         depth=options.depth,
         objective=options.objective,

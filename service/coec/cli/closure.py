@@ -1,4 +1,4 @@
-"""`coec evaluate --closure A B`: two sensors calibrated by themselves, against the pose that lies between them."""
+"""`coec evaluate --closure A B`: calibrates two sensors by themselves, and compares them by the pose between them."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def run(options: Options, source_a: str, source_b: str) -> int:
     """Prints the report; how good the figures are is for the reader to judge.
 
     Args:
-        options: what both calibrations share; its `relative` is the pose of sensor A in the frame of B, None: as the
-            recordings tell.
-        source_a: of the one sensor.
-        source_b: of the other.
+        options: what both calibrations share; its `relative` is the pose of sensor A in the frame of B; None: taken
+            from the recordings.
+        source_a: recording of sensor A.
+        source_b: recording of sensor B.
 
     Raises:
         CoecError: there is nothing to compare.
@@ -74,7 +74,7 @@ def relative_of(text: str) -> Matrix4:
     """T_b_a (4, 4) from `rx,ry,rz,tx,ty,tz`: rotation vector in degrees and translation in metres.
 
     Raises:
-        UsageError: it is not three or six finite numbers.
+        UsageError: the text is not three or six finite numbers.
     """
     return se3.perturbation(windows.vector_of("--relative", text))
 

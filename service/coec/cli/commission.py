@@ -1,4 +1,4 @@
-"""`coec commission`: good windows of a rig in, its baseline out."""
+"""`coec commission`: learns the baseline of a rig from good windows of it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from coec.sources import windows
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rigged:
-    """Windows of one rig, and what looks at them need."""
+    """Windows of one rig, and what is needed to look at them."""
 
     windows: tuple[Window, ...]
     configuration: CalibrationConfig
@@ -41,7 +41,7 @@ def run(options: Options) -> int:
     """Prints and writes the baseline.
 
     Raises:
-        CoecError: there is none.
+        CoecError: no baseline can be learned.
     """
     sensors = sensors_of(options.sensors or ())
     try_file(options.output)
@@ -81,7 +81,7 @@ def load(sources: Sequence[str], options: Options, times: StageTimes) -> Rigged:
     """The windows of all sources, with the configuration of the first.
 
     Raises:
-        UsageError: no source, or a value that does not exist.
+        UsageError: no source, or an unknown value.
     """
     if not sources:
         raise UsageError("name at least one recording of a rig whose calibration is right")
@@ -102,7 +102,7 @@ def sensors_of(named: Sequence[str]) -> dict[str, str]:
     """Serial numbers by stream, from `camera=SERIAL` and the like.
 
     Raises:
-        UsageError: not of this form.
+        UsageError: a text is not of this form.
     """
     sensors = {}
     for text in named:
@@ -126,7 +126,7 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
 
 
 def show(baseline: Baseline) -> None:
-    """The baseline for people."""
+    """Prints the baseline for people."""
     console.show(
         f"{baseline.pair}: commissioned from {baseline.pairs} pairs of {baseline.windows} "
         f"window{'s' if baseline.windows > 1 else ''}, hash {baseline_hash(baseline)}"
@@ -135,7 +135,7 @@ def show(baseline: Baseline) -> None:
 
 
 def show_learned(baseline: Baseline) -> None:
-    """Bias, limits, and what they detect, as tables."""
+    """Prints bias, limits, and what the limits detect, as tables."""
     table = console.table("axis", "bias", "± σ", "σ of a check at 6 pairs", "unit", right=(1, 2, 3))
     bias, known = _in_degrees(baseline.pose.bias), _in_degrees(baseline.pose.bias_sigma)
     of_check = _in_degrees(baseline.pose.sigma(6))

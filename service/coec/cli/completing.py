@@ -1,35 +1,35 @@
-"""What a shell is told of values that an option knows, when a person presses Tab. Imported with every command line:
-what is heavy is imported when it is asked for."""
+"""Values that the shell suggests for an option when Tab is pressed. This module is imported with every command line, so
+heavy imports are made only on request."""
 
 from __future__ import annotations
 
 
 def depth_models(incomplete: str) -> list[str]:
-    """Names of networks, and `stereo`."""
+    """Names of depth networks, and `stereo`."""
     from coec.adapters.depth.model_cards import built_in_cards
 
     return _beginning(("stereo", *built_in_cards()), incomplete)
 
 
 def objectives(incomplete: str) -> list[str]:
-    """Of `calibrate`, and `all` of `evaluate`."""
+    """Objectives."""
     return _beginning(("fused", "mi", "intensity"), incomplete)
 
 
 def camera_models(incomplete: str) -> list[str]:
-    """That can be fitted."""
+    """Camera models that can be fitted."""
     return _beginning(("double_sphere",), incomplete)
 
 
 def export_formats(incomplete: str) -> list[str]:
-    """Of `export`."""
+    """Formats of `export`."""
     from coec.adapters.exports import FORMATS
 
     return _beginning(tuple(FORMATS), incomplete)
 
 
 def query_keys(incomplete: str) -> list[str]:
-    """What can be asked for; of commands, each by its name."""
+    """Keys that can be queried; commands each by name."""
     from coec.cli.commands.query import KEYS
     from coec.schemas.commands import NAMES
 

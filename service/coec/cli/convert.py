@@ -1,4 +1,4 @@
-"""`coec convert`: a recording for other tools, or the configuration that serves it."""
+"""`coec convert`: writes a recording for other tools, or a configuration that serves it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run(source: str, out: Path, *, as_json: bool) -> int:
 
     Raises:
         UsageError: OUT is neither .mcap nor .yaml.
-        OutputError: it cannot be written.
+        OutputError: OUT cannot be written.
         SourceError: the recording cannot be read.
     """
     if out.suffix not in (".mcap", ".yaml", ".yml"):
@@ -57,9 +57,9 @@ def run(source: str, out: Path, *, as_json: bool) -> int:
 
 
 def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path | None) -> PairConfig:
-    """A pair that takes the frames of a recording as they are, on `sensors/<pair>/camera|lidar|ego`.
+    """A pair that accepts the frames of a recording as they are, on `sensors/<pair>/camera|lidar|ego`.
 
-    The window is one that the recording can fill, see `_window`.
+    Its window is one that the recording can fill, see `_window`.
     """
     rig = recording.rig
     streams = Streams.default(rig.pair)
@@ -84,11 +84,11 @@ def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path 
 
 
 def _window(camera_stamps_ns: Sequence[int]) -> WindowConfig:
-    """The default window, fitted to a recording that could not fill it.
+    """The default window, or one adapted to a recording that could not fill it.
 
-    Of less than twice as many camera frames as a window needs there would be too few as soon as some are refused (the
-    vehicle stood): half of them are then enough. A drive so short that it touches fewer bins of a slice than a window
-    needs pairs gets slices of half its length: one window is judged while the other half still passes.
+    With fewer than twice the camera frames that a window needs, too few would be left as soon as some are refused (the
+    vehicle stood); then half of the frames are enough. A drive so short that it touches fewer bins of a slice than a
+    window needs pairs gets slices of half its length, so that one window is judged while the other half still passes.
     """
     window = WindowConfig()
     frames = len(camera_stamps_ns)
@@ -106,7 +106,7 @@ def _calibration(camera: CameraFrame) -> CalibrationConfig:
 
 
 def first_frames(recording: Recording) -> list[CameraFrame | LidarFrame | EgoMotion]:
-    """The first camera frame, and what is needed to pair it."""
+    """The first camera frame, and the frames that are needed to pair it."""
     return list(recording.messages([0]))
 
 

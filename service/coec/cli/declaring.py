@@ -1,4 +1,4 @@
-"""A command of Typer from a function of one dataclass: each field is declared once, as argument or option."""
+"""Makes a Typer command of a function that takes one dataclass; each field is declared once, as argument or option."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ OptionsT = TypeVar("OptionsT")
 
 
 def taking(run: Callable[[OptionsT], int]) -> Callable[..., None]:
-    """What Typer reads and calls for `run(options)`: takes the fields of the dataclass that `options` is annotated
-    with, has the help text of `run`, and exits with the status that `run` returns."""
+    """The function that Typer reads and calls for `run(options)`. It takes the fields of the dataclass that annotates
+    `options`, has the help text of `run`, and exits with the status that `run` returns."""
     options = get_type_hints(run)["options"]
 
     def command(**given: Any) -> None:

@@ -1,4 +1,4 @@
-"""`coec diagnose`: how well a wrong extrinsic is seen on a recording, or whether its extrinsic is right."""
+"""`coec diagnose`: whether a recording's extrinsic is right, or how well a wrong one is detected on it."""
 
 from __future__ import annotations
 
@@ -33,20 +33,21 @@ from coec.reports.stage_times import StageTimes
 from coec.sources import windows
 
 REACH_DEG = 8.0
-"""How far from the pose that is asked about a mount is looked for: a knock, not a search of any pose. Beyond, `coec
-calibrate` finds it."""
+"""How far from the given pose a mount is searched: as far as a knock, not any pose. Beyond that, `coec calibrate` finds
+it."""
 
 
 MAX_SIGMA_DEG = 1.0
-"""Standard deviation of a rotation from which on nothing is told of it: a knock is told with its own, however sure one
-must be of what is served."""
+"""Above this standard deviation of a rotation, a result is not reported. The limit is looser than for serving, because
+a knock is reported with its σ."""
 
 
 def run(options: Options) -> int:
-    """One check at the recording's extrinsic, 1 if it is flagged or cannot tell; with `detection`, the table instead.
+    """One check at the recording's extrinsic; returns 1 if it is flagged or cannot tell. With `detection`, prints the
+    table of detection instead.
 
     Raises:
-        CoecError: nothing can be seen.
+        CoecError: no check is possible.
     """
     with console.progress() as bars:
         times = StageTimes(bars)
@@ -96,7 +97,7 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
         if against is not None:
             raise UsageError(f"{options.rig} does not hold for this recording: {against}")
     seen = diagnose(window, rigged.depth, rigged.images, rigged.configuration, baseline)
-    # What a commissioned rig is off by is known of its checks alone.
+    # For a commissioned rig, the bias is known for checks only, not for a solve.
     asks = seen.flagged and not seen.causes and baseline is None
     measured = _measured(rigged, window, seen) if asks else None
     if options.output is not None:
@@ -140,9 +141,9 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
 
 
 def _measured(rigged: commission.Rigged, window: Window, seen: Observation) -> diagnosis.Measured | None:
-    """How far a mount that a check accuses is off, by a solve of all pairs within reach of where it was; None where
-    there is no result. It searches translations where the check says that there is one; where it does not, the camera's
-    centre is known no better than the check knows it: what turned a mount may have shifted it."""
+    """How far off an accused mount is, by a solve of all pairs within reach of its old pose; None without a result.
+    Translations are searched if the check sees one. If not, the camera's centre counts as known only as well as the
+    check knows it, because what turned the mount may also have shifted it."""
     shifted = np.abs(seen.offset[3:]) >= diagnosis.TELLING * seen.sigma[3:]
     chosen = {"dof": 6 if shifted.any() else 3, "reach_deg": REACH_DEG}
     search = rigged.configuration.search.model_copy(update=chosen)

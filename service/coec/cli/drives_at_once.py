@@ -1,4 +1,4 @@
-"""Many simulated drives at once, each made by one process on one core."""
+"""Runs many simulated drives at once, each in one process on one core."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ class DrivesError(CoecError):
 
 
 def finished(work: Callable[[_Drive], _Row], drives: Sequence[_Drive], jobs: int | None) -> Iterator[_Row]:
-    """What `work` makes of each drive, as they are finished, by `jobs` processes (None: one for each core).
+    """The result of `work` for each drive, in the order in which drives finish, by `jobs` processes (None: one per
+    core).
 
-    `work`, the drives and what is made of them go from process to process, unless one process is enough.
+    `work`, the drives and the results are sent between processes, unless one process is enough.
 
     Raises:
         DrivesError: a process died.
@@ -37,7 +38,7 @@ def finished(work: Callable[[_Drive], _Row], drives: Sequence[_Drive], jobs: int
         return
     with one_thread_each():
         spawn = multiprocessing.get_context("spawn")
-        # Of a command that is killed nothing goes on.
+        # If the command is killed, its processes end, too.
         pool = ProcessPoolExecutor(processes, spawn, initializer=die_with, initargs=(os.getpid(),))
         try:
             for done in as_completed([pool.submit(work, drive) for drive in drives]):
@@ -47,5 +48,5 @@ def finished(work: Callable[[_Drive], _Row], drives: Sequence[_Drive], jobs: int
                 "a process that ran a drive died, for want of memory perhaps: start again with fewer --jobs, the "
                 "drives that are done are kept"
             ) from error
-        finally:  # also where the caller has gone before the end
+        finally:  # also if the caller stops before the end
             pool.shutdown(cancel_futures=True)

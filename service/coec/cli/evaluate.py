@@ -1,4 +1,4 @@
-"""`coec evaluate`: one recording, one known pose, many starts around it."""
+"""`coec evaluate`: solves one recording with a known pose from many starts around it."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from coec.schemas.evaluation import ComparisonReport, EvaluationReport
 from coec.sources import windows
 
 ALL = "all"
-"""Objective that stands for `METHODS`, one after the other."""
+"""Value of the objective that means all `METHODS`, one after the other."""
 
 METHODS = ("fused", "mi", "intensity")
-"""This project's, the paper's, and the one before it."""
+"""This project's method, the paper's, and the one before the paper."""
 
 
 def run(options: Options) -> int:
@@ -60,7 +60,7 @@ def run(options: Options) -> int:
         evaluation_tables.show_comparison(document)
     else:
         evaluation_tables.show(document)
-    # Whoever reads the figures has them, should they not be written.
+    # Printed first, so that the figures are not lost if they cannot be written.
     if options.output is not None:
         output.write(options.output / "report.json", to_json(document))
         page.write(options.output / "report.html", told())
@@ -70,7 +70,7 @@ def run(options: Options) -> int:
 
 
 def plan_of(options: Options) -> Plan:
-    """What was asked for on the command line."""
+    """The experiments that the command line requests."""
     return Plan(
         rotation_deg=options.rotation_deg,
         translation_m=options.translation_m,
@@ -85,7 +85,7 @@ def plan_of(options: Options) -> Plan:
 
 
 def _first_of(options: Options) -> Options:
-    """With one objective: all methods share their depth."""
+    """The options with one objective, to load what all methods share."""
     return replace(options, objective=METHODS[0]) if options.objective == ALL else options
 
 
@@ -101,16 +101,16 @@ class Evaluated:
 def _compare(
     options: Options, subject: Subject, bars: Progress, stages: Stages
 ) -> tuple[ComparisonReport, Callable[[], Page]]:
-    """Every method, as far as the source allows, and what makes the page of all.
+    """Evaluates every method that the source allows; returns the report, and a function that makes the page of all.
 
     Raises:
-        CalibrationError: it allows none.
+        CalibrationError: the source allows none.
     """
     found: dict[str, Evaluated] = {}
     not_evaluated: dict[str, str] = {}
     for method in METHODS:
         folder = None if options.output is None else options.output / method
-        # The monitor looks through both witnesses whatever is maximised: one table tells all.
+        # The monitor uses both witnesses whatever is maximised, so one table of detection is enough.
         splits = options.detection if method == METHODS[0] else 0
         of_method = replace(options, objective=method, output=folder, detection=splits)
         heard = stages.begin(method, 1)
@@ -147,7 +147,7 @@ def _compare(
 
 
 def _evaluate(options: Options, subject: Subject, stages: Stages) -> Evaluated:
-    """One method: its experiments, their report, and what belongs into the output folder but for the report.
+    """Evaluates one method: runs its experiments, and writes everything but the report into the output folder.
 
     Raises:
         CalibrationError: there is no result even from the source's calibration.

@@ -1,4 +1,4 @@
-"""With which status a command ends, and what that means."""
+"""The exit statuses of commands, and their meaning."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ FAULT = 70
 """EX_SOFTWARE of sysexits.h."""
 
 INTERRUPTED = 130
-"""As a shell reports a process that SIGINT ended."""
+"""Status that a shell reports for a process ended by SIGINT."""
 
 BROKEN_PIPE = 141
-"""As a shell reports a process that SIGPIPE ended."""
+"""Status that a shell reports for a process ended by SIGPIPE."""
 
 EXIT_CODES: Mapping[int, str] = {
     SUCCESS: "success; of `calibrate`: accepted; of `doctor`: nothing failed; of `run`: stopped as it was told to",
@@ -27,4 +27,4 @@ EXIT_CODES: Mapping[int, str] = {
     INTERRUPTED: "Ctrl-C; `evaluate` prints and writes what was finished by then",
     BROKEN_PIPE: "whoever read the output has gone",
 }
-"""All that there are."""
+"""All exit statuses with their meaning."""

@@ -1,4 +1,4 @@
-"""`coec export`: a calibration in the files of other programs."""
+"""`coec export`: writes a calibration as a file of another program."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def run(options: Options) -> int:
     Raises:
         UsageError: no such format, or an option that does not fit.
         SourceError, WindowError, StateError: the source cannot be read, or holds no calibration.
-        NotAcceptedError: it is not accepted, and `--force` was not given.
-        OutputError: the file cannot be written, or what it holds cannot be changed.
+        NotAcceptedError: the calibration is not accepted, and `--force` was not given.
+        OutputError: the file cannot be written, or its content cannot be changed.
     """
     known(options.format)
     extrinsic = _read(options)
@@ -82,7 +82,7 @@ def _of_document(path: Path, camera: CameraIntrinsics | None, frames: Frames) ->
 
 
 def _of_state(folder: Path, name: str | None, config: Config | None, frames: Frames) -> Extrinsic:
-    """What the service of a state directory serves, with its whole covariance."""
+    """The calibration that the service of a state directory serves, with its full covariance."""
     pairs = read_pairs(folder)
     if name is None and len(pairs) != 1:
         raise UsageError(f"{folder} holds the pairs {', '.join(sorted(pairs))}: choose one with --pair")

@@ -1,7 +1,7 @@
-"""`coec fetch`: what a vehicle keeps of a red event, brought home over whatever link there is, and looked at once here.
+"""`coec fetch`: fetches what a vehicle keeps of a red event, over whatever link there is, and makes a page of it.
 
-Everything that comes is what a vehicle says: names become file names only where they are names, sizes are bounded, and
-what a document says of itself is held against what was asked for.
+Nothing that a vehicle sends is trusted: names become file names only where they are valid names, sizes are bounded, and
+what a document says about itself is compared with what was asked for.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ LATEST: Final = "latest"
 VEHICLE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 AROUND_NS: Final = 600 * 1_000_000_000
-"""Of the history, before the first and after the last figure that is kept of the event: 10 minutes."""
+"""History that is fetched before the first and after the last figure of the event: 10 minutes."""
 
 SNIPPET_NS: Final = 60 * 1_000_000_000
-"""Sensor time between an event and a snippet that belongs to it: a suspicion is told before it, by up to a minute."""
+"""Most sensor time between an event and its snippet: a suspicion comes up to a minute before the event."""
 
 ENTRIES: Final = 300
-"""Of the history at most, some 6 kB each."""
+"""Most entries of the history, some 6 kB each."""
 
 WAIT_S: Final = 0.5
-"""Before a vehicle whose uplink is busy is asked again."""
+"""Time before a vehicle with a busy uplink is asked again."""
 
 WAITS: Final = frozenset({"uplink_busy", "busy", "not_drawn"})
 
@@ -73,13 +73,13 @@ M = TypeVar("M", bound=Message)
 
 
 def run(options: Options) -> int:
-    """Fetches, or lists; 1 where something that the vehicle keeps could not be had.
+    """Fetches an event, or lists events; returns 1 if something that the vehicle keeps could not be fetched.
 
     Raises:
-        UsageError: what was typed is no name.
+        UsageError: an argument is no valid name.
         ConnectionFailedError: no router answered.
-        NotFoundError: the vehicle does not answer; says what it said last, where somebody kept that. Or no such event.
-        RemoteError: an error reply, or an answer to something else.
+        NotFoundError: no such event, or the vehicle does not answer; then its last word is given, if kept.
+        RemoteError: an error reply, or an answer about something else.
         OutputError: the folder cannot be written.
     """
     if not VEHICLE.fullmatch(options.vehicle):
@@ -107,7 +107,7 @@ def run(options: Options) -> int:
 
 
 def _events(session: zenoh.Session, keys: Keys, options: Options) -> list[EvidenceEvent]:
-    """Of the pairs that are asked about, the latest last."""
+    """Red events of the chosen pairs, the latest last."""
     selector = f"{keys.evidence(options.pair or '*')}?format=json"
     answers = ask(session, selector, options.timeout_s)
     if not answers:
@@ -120,7 +120,7 @@ def _events(session: zenoh.Session, keys: Keys, options: Options) -> list[Eviden
 
 
 def _nobody(session: zenoh.Session, keys: Keys, options: Options, selector: str) -> NotFoundError:
-    """With what the vehicle said last, where somebody kept it."""
+    """The error that nobody answers, with the last word of the vehicle, if one is kept."""
     for answer in ask(session, keys.last("*"), options.timeout_s):
         try:
             word = read_word(answer.key, answer.payload)
@@ -163,7 +163,7 @@ def _chosen(events: Sequence[EvidenceEvent], options: Options) -> EvidenceEvent:
 
 @dataclass(slots=True)
 class _Fetch:
-    """One event. What cannot be had is written down with its reason, and does not keep the rest from coming."""
+    """Fetches one event. What cannot be fetched is noted with the reason, and does not stop the rest."""
 
     session: zenoh.Session
     keys: Keys
@@ -231,7 +231,7 @@ class _Fetch:
         return found[0] if found else None
 
     def _configuration(self) -> bytes:
-        """As the vehicle says it; a newer one may have what this program does not know."""
+        """The configuration as the vehicle sends it; a newer vehicle may have keys that this program does not know."""
         data = self._answer(f"{self.keys.config}?format=json")
         try:
             document = json.loads(data)
@@ -258,7 +258,7 @@ class _Fetch:
         )
 
     def _snippets(self, event: EvidenceEvent) -> Iterator[str]:
-        """What was recorded at full rate about the event."""
+        """Ids of the snippets that were recorded at full rate about the event."""
         listed: list[WindowsReply] = []
         self._try("snippets", lambda: listed.append(self._document(WindowsReply, self.keys.windows(self.pair))))
         for snippet in listed[0].snippets if listed else ():
@@ -315,8 +315,8 @@ class _Fetch:
 
 
 def chain_holds(history: HistoryReply) -> bool | None:
-    """Whether the entries that are here are what their hashes say, and each holds the hash of the one before it in its
-    book, where that is here. None: nothing can be told, as no two follow each other, or another version wrote them."""
+    """Whether the entries match their hashes, and each holds the hash of the entry before it in its book, as far as
+    that was fetched. None: unknown, because no two fetched entries follow each other, or another version wrote them."""
     linked = 0
     last: dict[str, ChainedEntry] = {}
     for chained in sorted(history.entries, key=lambda item: item.entry.sequence):
@@ -326,7 +326,7 @@ def chain_holds(history: HistoryReply) -> bool | None:
         if before is not None:
             follows = entry.previous_sha256 == before.sha256
             linked += follows
-            # Others of the book may lie between them that were not asked for, unless the numbers say that none does.
+            # Entries that were not fetched may lie between the two, unless their numbers say that none does.
             if not follows and entry.sequence == before.entry.sequence + 1:
                 return False
         last[entry.book] = chained
@@ -334,12 +334,12 @@ def chain_holds(history: HistoryReply) -> bool | None:
 
 
 def _recorded(recording_id: str) -> str:
-    """Where a recording lies in the folder."""
+    """Path of a recording within the folder."""
     return f"windows/{recording_id}.mcap"
 
 
 def _around(key: str, event: EvidenceEvent) -> str:
-    """The history about an event, with what was decided of the windows before and after it."""
+    """Selector of the history about an event, including the decisions on the windows before and after it."""
     stamps = [event.stamp_ns, *(point.stamp_ns for point in event.metrics)]
     for window_id in (event.window_before, event.window_after):
         if window_id is not None and OF_PAIR.fullmatch(window_id):

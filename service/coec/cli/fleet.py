@@ -1,4 +1,4 @@
-"""`coec fleet report`: what many windows say of a fleet."""
+"""`coec fleet report`: what many windows say about a fleet."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from coec.schemas.fleet import AXES, FleetReport
 from coec.schemas.fleet_now import FleetNow
 
 SHOWN = 15
-"""Pairs in the table on the screen; the page has all."""
+"""Most pairs in the table on the screen; the page has all."""
 
 
 def run(options: Options) -> int:
-    """Writes page and document into the output folder, if one is given, and shows the most urgent pairs.
+    """Writes page and document into the output folder, if one is given, and prints the most urgent pairs.
 
     Raises:
-        UsageError: there are no tables, or `--now` is no such document.
+        UsageError: there are no tables, or the file of `--now` is no such document.
         SourceError: the optional extra is not installed.
         OutputError: a file cannot be written.
     """

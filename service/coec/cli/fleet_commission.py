@@ -1,4 +1,4 @@
-"""`coec fleet commission`: baselines of vehicles of one model in, those of the model out."""
+"""`coec fleet commission`: combines baselines of vehicles of one model into baselines of the model."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from coec.reports import console
 
 
 def run(options: Options) -> int:
-    """Prints and writes a baseline for every pair that all of the vehicles have.
+    """Prints and writes a baseline for every pair that all vehicles have.
 
     Raises:
-        UsageError: a file is named twice, or has no baseline.
+        UsageError: a file is named twice or has no baseline, or no pair is common to all.
         CalibrationError: too few vehicles, or baselines that do not belong together.
         StateError: a file is damaged, or cannot be written.
     """

@@ -1,4 +1,4 @@
-"""A camera model that is refused leaves a picture of what it misses."""
+"""Draws a picture of where a refused camera model is off."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from coec.reports import pictures
 
 @contextmanager
 def drawn_if_refused(folder: Path | None, camera: Camera) -> Iterator[None]:
-    """Draws into the folder what a fit to the camera misses, should it be refused within, and says where that is.
+    """If a fit to the camera is refused within, draws into the folder where the fit is off, and says where the picture
+    is.
 
     Raises:
-        LensError: the one from within, with the place of the picture; where there is no folder, how to have one.
+        LensError: the one from within, plus the path of the picture; without a folder, plus how to get a picture.
         OutputError: the picture cannot be written.
     """
     try:

@@ -1,4 +1,4 @@
-"""`coec lidars`: where one LiDAR of a vehicle sits from another, of what both see."""
+"""`coec lidars`: where one LiDAR of a vehicle sits relative to another, from what both see."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ DEGREES = np.array([*np.rad2deg(np.ones(3)), *np.ones(3)])
 
 
 def run(options: Options) -> int:
-    """Tells the pose of `b` in `a`; 1 if they see too little in common.
+    """Prints the pose of `b` in `a`; returns 1 if they see too little in common.
 
     Raises:
-        UsageError, SourceError: see `open_lidars`; or what searches the clouds is not installed.
+        UsageError, SourceError: see `open_lidars`; or the library that searches clouds is not installed.
     """
     search = Trees()
     recording = open_lidars(options.source, options.a, options.b)

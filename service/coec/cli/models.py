@@ -1,4 +1,4 @@
-"""`coec models`: which depth networks are known."""
+"""`coec models`: lists the known depth networks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coec.reports import console
 
 
 def show(file: Path, *, as_json: bool) -> int:
-    """The card of a file.
+    """Prints the card of a file.
 
     Raises:
         ModelError: the file is absent or has no card.

@@ -1,4 +1,4 @@
-"""The pair that a command is about."""
+"""Chooses the pair that a command is about."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from coec.errors import UsageError
 
 
 def pair_named(config: Config, name: str | None) -> PairConfig:
-    """The one of this name, or (None) the only one.
+    """The pair of this name, or with None the only one.
 
     Raises:
-        UsageError: there is none of this name, there are several to choose from, or it is awaited still.
+        UsageError: no pair has this name, there are several to choose from, or the pair is still awaited.
     """
     pairs = {pair.name: pair for pair in config.pairs}
     if name is None and len(pairs) == 1:

@@ -1,6 +1,6 @@
-"""What several commands take: each option is declared once, here or in the module of its only command.
+"""Options of several commands. Each option is declared once, here or in the module of its only command.
 
-A help text takes no longer than this imports: nothing heavy may be imported here, nor in `commands`.
+The imports decide how long a help text takes, so nothing heavy may be imported here or in `commands`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ConfigFile = Annotated[
     Path, typer.Option("--config", help="Configuration of the daemon (YAML).", metavar="FILE", show_default=False)
 ]
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
-"""As `config` has it, which takes too long to import for a help text."""
+"""The same as in `config`, which takes too long to import for a help text."""
 
 Connect = Annotated[
     str | None, typer.Option(help="Zenoh endpoint of the router.", metavar="ENDPOINT", show_default=DEFAULT_CONNECT)
@@ -32,10 +32,10 @@ Connect = Annotated[
 Jobs = Annotated[
     int | None, typer.Option(help="Processes, of one core and 1 GB each.", min=1, show_default="the cores")
 ]
-"""Of a command that draws many drives."""
+"""Option of commands that draw many drives."""
 
 DegreesOfFreedom = Literal["3", "6"]
-"""Of a search: rotation only, or translation too."""
+"""Degrees of freedom of a search: rotation only, or translation too."""
 
 Depth = Annotated[
     str | None,
@@ -69,7 +69,7 @@ NoMotionCompensation = Annotated[
     bool, typer.Option("--no-motion-compensation", help="Take the clouds as they were recorded.")
 ]
 
-# Of a running service.
+# Options about a running service.
 ServiceConfig = Annotated[
     Path | None,
     typer.Option("--config", help="Of the service: names the vehicle, the prefix and the router.", metavar="FILE"),
@@ -82,7 +82,7 @@ SessionFile = Annotated[
 ]
 RouterTimeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the router.", min=0.01)]
 
-# Of a vehicle that does not exist.
+# Options about a simulated vehicle.
 Seed = Annotated[int, typer.Option(help="Same seed, same bytes.", min=0)]
 SimCamera = Annotated[
     str,

@@ -1,4 +1,4 @@
-"""`coec paper`: the published experiments on a recording, with their figures beside ours."""
+"""`coec paper`: repeats the published experiments on a recording, with the published figures beside ours."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from coec.reports.paper_page import Plots, paper_page
 from coec.sources import open_source, windows
 
 FAR_DEG, DRIVE_DEG = 25.0, (5.0, 10.0)
-"""Starts of the published experiments."""
+"""Radii of the starts in the published experiments."""
 
 MARGIN_DEG = 5.0
 """How far the search reaches beyond its start."""
@@ -42,7 +42,7 @@ def run(options: Options) -> int:
     """Writes metrics.png, bullseye.png, drive.png, report.json and report.html, and prints what is in them.
 
     Raises:
-        CoecError: an experiment cannot be done.
+        CoecError: an experiment is not possible.
     """
     output.try_folder(options.output)
     with console.progress() as bars:
@@ -80,7 +80,7 @@ def run(options: Options) -> int:
 
 
 def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> tuple[dict[str, Any], Block]:
-    """Limits learned on every second pair, tried on the others; and a plot."""
+    """Learns limits on every second pair and tries them on the others; returns the figures and a plot."""
     sight = sight_of(bench.window, bench.depth, bench.images, bench.configuration, Silence())
     frames = depth_features(sight, bench.reference)
     heard = stages.begin("metrics", 2 * options.samples)
@@ -127,7 +127,7 @@ def _bullseye(bench: Bench, options: Options, stages: Stages) -> tuple[dict[str,
 
 
 def _drive(bench: Bench, options: Options, stages: Stages) -> tuple[list[dict[str, Any]], Block]:
-    """Every window of the drive from starts all around, so that together they are about `runs` for each radius."""
+    """Solves every window of the drive from starts all around, in all about `runs` solves for each radius."""
     count = _window_count(bench, options)
     per_window = max(options.runs // count, 1)
     heard = stages.begin("drive", len(DRIVE_DEG) * count * per_window)
@@ -173,10 +173,10 @@ def _window_count(bench: Bench, options: Options) -> int:
 
 def windows_of(stamps_ns: Sequence[int], slice_s: float) -> int:
     """How many windows of this length a recording with these frames has, at least one. Each frame stands for the time
-    to the next one: 1200 frames at 10 Hz are two minutes, though the last is taken 0.1 s before their end."""
+    to the next: 1200 frames at 10 Hz are two minutes, although the last is taken 0.1 s before their end."""
     lasted_s = (stamps_ns[-1] - stamps_ns[0]) * 1e-9
     interval_s = lasted_s / max(len(stamps_ns) - 1, 1)
-    # Half an interval of grace: stamps jitter.
+    # Half an interval of tolerance, because stamps jitter.
     return max(int((lasted_s + 1.5 * interval_s) // slice_s), 1)
 
 
@@ -194,7 +194,7 @@ def _drive_windows(bench: Bench, options: Options) -> Iterator[tuple[float, Benc
         try:
             loaded = windows.load(options.source, None, WindowConfig().pairs, lambda *_: None, (begin_s, end_s))
         except SourceError:
-            # No camera frame of this slice has a sweep: it is no window.
+            # A slice in which no camera frame has a sweep is no window.
             continue
         depth = inferred(loaded.window, model, lambda *_: None)
         of_slice = Bench(loaded.window, depth, greys_of(loaded.window), bench.configuration)
@@ -202,7 +202,7 @@ def _drive_windows(bench: Bench, options: Options) -> Iterator[tuple[float, Benc
 
 
 def _reaching(configuration: CalibrationConfig, radius_deg: float) -> CalibrationConfig:
-    """A search that reaches beyond starts at this radius."""
+    """The configuration with a search that reaches beyond starts at this radius."""
     reach = {"rotation_deg": radius_deg + MARGIN_DEG, "reach_deg": radius_deg + MARGIN_DEG}
     return configuration.model_copy(update={"search": configuration.search.model_copy(update=reach)})
 

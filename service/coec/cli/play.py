@@ -1,4 +1,4 @@
-"""`coec play`: a recording published on Zenoh, as frames of a pair or on topics of ROS 2."""
+"""`coec play`: publishes a recording on Zenoh, as frames of a pair or on topics of ROS 2."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from coec.sources.spec import is_rig, parse_spec
 
 CONNECT_S = 10.0
 LISTENER_S = 5.0
-"""How long to wait for a router, and for somebody who listens."""
+"""How long to wait for a router, and for a listener."""
 
 DEFAULT_PERIOD_NS = 100_000_000
-"""Between two passes of a recording with a single frame: 10 Hz."""
+"""Time between two passes of a recording with a single frame: 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where to publish: the pair of the configuration, if there is one, the routers, and how ROS is spoken there."""
+    """Where to publish: the pair of the configuration, if there is one, the routers, and the middleware there."""
 
     pair: OpenPairConfig | None
     endpoints: tuple[str, ...]
@@ -108,7 +108,7 @@ def _pair(config: Config, name: str | None) -> OpenPairConfig:
 
 
 def _warn(recording: Recording, pair: OpenPairConfig | None, encoding: str) -> None:
-    """What the receiver is going to refuse, or to miss."""
+    """Prints what the receiver is going to refuse or to miss."""
     for frame in recording.messages([0]):
         if isinstance(frame, CameraFrame) and frame.depth is not None and encoding == "cdr":
             say_without_depth()
@@ -125,21 +125,21 @@ def _warn(recording: Recording, pair: OpenPairConfig | None, encoding: str) -> N
 
 
 def say_without_depth() -> None:
-    """That the depth maps of a recording do not go with its frames."""
+    """Says that the depth maps of a recording are not sent with its frames."""
     console.say("coec: ROS 2 messages carry no depth maps: the service needs a depth network for these frames")
 
 
 def say_deaf(deaf: list[str]) -> None:
-    """Who is not there, if somebody is not."""
+    """Says on which streams nobody listens, if there are any."""
     if deaf:
         console.say(f"coec: nobody listens to {', '.join(deaf)}; publishing all the same")
 
 
 def first_stamp_ns(recording: Recording) -> int:
-    """Of its first frame.
+    """Stamp of the first frame of a recording.
 
     Raises:
-        SourceError: it has none.
+        SourceError: the recording has no frame.
     """
     for frame in recording.messages():
         return frame.stamp_ns
@@ -147,7 +147,7 @@ def first_stamp_ns(recording: Recording) -> int:
 
 
 def pause_ns(recording: Recording) -> int:
-    """Between two passes: the usual period of the camera."""
+    """Time between two passes: the usual period of the camera."""
     stamps = np.diff(np.array(recording.camera_stamps_ns))
     return int(np.median(stamps)) if len(stamps) else DEFAULT_PERIOD_NS
 
@@ -156,7 +156,7 @@ def pause_ns(recording: Recording) -> int:
 def display(
     name: str, total: int, options: Options, *, counted: tuple[str, ...]
 ) -> Iterator[Callable[[Stamped, Played], None]]:
-    """A bar that is told after each frame; it counts the frames of the streams `counted`, `total` in all."""
+    """A progress bar to call after each frame; it counts the frames of the streams `counted`, `total` in all."""
     rate = "as fast as it goes" if options.rate == 0 else f"× {options.rate:g}"
     with console.progress() as bars:
         task = bars.add_task(f"{name} {rate}", total=None if options.loop else total, note="")
@@ -171,7 +171,7 @@ def display(
 
 
 def report(options: Options, played: Played, elapsed_s: float, deaf: list[str], what: str) -> None:
-    """What was published: `what` by stream."""
+    """Prints what was published: the number of `what` by stream."""
     if options.as_json:
         console.print_json(
             {

@@ -1,4 +1,4 @@
-"""`coec play sim:rig=...`: all sensors of a simulated rig, each on a key or on topics of its own."""
+"""`coec play sim:rig=...`: publishes all sensors of a simulated rig, each on its own key or topics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def frames(options: Options, target: Target, spec: SourceSpec) -> int:
     """Publishes every frame on `sensors/<sensor>`, ego-motion on `sensors/ego`.
 
     Raises:
-        UsageError, SourceError: see `open_rig`; a configuration, whose keys are those of one pair.
+        UsageError, SourceError: see `open_rig`; or a configuration was given, whose keys are those of one pair.
         ConnectionFailedError: no router.
     """
     if options.config is not None or options.pair is not None:
@@ -49,7 +49,7 @@ def frames(options: Options, target: Target, spec: SourceSpec) -> int:
 
 
 def programme_of(spec: SourceSpec) -> Programme:
-    """The rig on topics of ROS 2.
+    """The rig as topics of ROS 2.
 
     Raises:
         UsageError, SourceError: see `open_rig`.

@@ -1,4 +1,4 @@
-"""`coec play --middleware rmw_zenoh|ros2dds`: a bag on its own topics, any other recording on those of a pair."""
+"""`coec play --middleware rmw_zenoh|ros2dds`: plays a bag on its own topics, other recordings on those of a pair."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from coec.sources.spec import SourceSpec, is_bag, is_rig, parse_spec
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """What can be played.
+    """A recording as topics that can be played.
 
     Attributes:
-        infos: the topics; counts are those of one pass.
-        messages: one pass over the messages of these topics, ascending by their stamps.
-        pause_ns: between two passes.
+        infos: the topics; counts are of one pass.
+        messages: one pass over the messages of given topics, ascending by stamp.
+        pause_ns: time between two passes.
     """
 
     name: str
@@ -50,10 +50,10 @@ class Programme:
 
 
 def topics(options: Options, target: Target, middleware: Middleware) -> int:
-    """Publishes every message of the topics that are asked for, or of all.
+    """Publishes every message of the requested topics, or of all.
 
     Raises:
-        UsageError, SourceError: no such recording or topic; a message that cannot be moved to now.
+        UsageError, SourceError: no such recording or topic, or a message whose stamps cannot be shifted to now.
         ConnectionFailedError: no router.
     """
     if options.encoding != "msgpack":
@@ -105,7 +105,7 @@ def _bag(spec: SourceSpec) -> Programme:
 
 
 def _frames(options: Options, pair: OpenPairConfig | None) -> Programme:
-    """Another recording, on the topics of the configuration's pair, or else on those below `/<pair>/`."""
+    """A recording that is no bag, on the topics of the configuration's pair, or else on those below `/<pair>/`."""
     recording = open_source(options.source)
     rig: Rig = recording.rig
     named = PairTopics.default(options.pair or rig.pair) if pair is None else PairTopics.of_pair(pair)
@@ -130,7 +130,7 @@ def _split(asked: list[str] | None) -> tuple[str, ...]:
 
 
 def _chosen(programme: Programme, asked: tuple[str, ...], middleware: Middleware) -> dict[str, TopicInfo]:
-    """The topics to play: those asked for; else all that have a key, the others are named."""
+    """The topics to play: the requested ones, else all that can be played; says which are left out."""
     infos = programme.infos
     unknown = [topic for topic in asked if topic not in infos]
     if unknown:
@@ -147,7 +147,7 @@ def _chosen(programme: Programme, asked: tuple[str, ...], middleware: Middleware
 
 
 def _awaited(chosen: Iterable[str], pair: OpenPairConfig | None) -> list[str]:
-    """The topics to which somebody should listen before the first message: the configured pair's, or all."""
+    """The topics that need a listener before the first message is sent: those of the configured pair, or all."""
     ours = [topic for topic in chosen if topic != TF_STATIC]
     configured = {stream.topic for stream in pair.streams.values()} if pair is not None else None
     missing = sorted(topic for topic in configured or () if topic is not None and topic not in ours)

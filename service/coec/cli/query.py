@@ -1,4 +1,4 @@
-"""`coec query`: what a running service says."""
+"""`coec query`: asks a running service."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ PLAIN_KEYS = (*PAIR_KEYS, "overlay", *VEHICLE_KEYS)
 WITH_ARGUMENT = {"windows": "ID", "evidence": "ID", "command": "NAME"}
 JPEG = "image/jpeg"
 PATIENCE_S = 60.0
-"""With a window of which no piece comes; what has come waits for the next attempt."""
+"""How long to wait for a window of which no piece arrives; what has arrived is kept for the next attempt."""
 
 OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d{1,19}(\.snippet)?", re.ASCII)
-"""What windows, snippets and red events are called: their pair, and a time in nanoseconds."""
+"""Names of windows, snippets and red events: their pair, and a time in nanoseconds."""
 
 PICTURE_KEYS = ("overlay", "evidence")
 """Keys whose answer may be a picture, for `--output`."""
@@ -56,8 +56,8 @@ PICTURE_KEYS = ("overlay", "evidence")
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Which service is asked, and how its router is reached. `credentials` are those of the session, with which
-    commands are proven; None: it has none."""
+    """Which service is asked, and how its router is reached. `credentials` of the session prove commands; None: the
+    session has none."""
 
     vehicle: str
     prefix: str
@@ -72,7 +72,7 @@ def asked_of(
     connect: str | None,
     zenoh_file: Path | None = None,
 ) -> Asked:
-    """The service of a configuration, or one with the default names; what else is given comes first.
+    """The service of a configuration, or one with the default names; other given arguments take precedence.
 
     Raises:
         ConfigError: the configuration, or the Zenoh configuration, cannot be read.
@@ -95,13 +95,13 @@ def asked_of(
 
 
 def run(options: Options) -> int:
-    """Asks and shows the answers; 1 if a command was not accepted.
+    """Asks and prints the answers; returns 1 if a command was not accepted.
 
     Raises:
-        UsageError: no such key, what was typed makes no key, or it is not clear of which pair.
+        UsageError: no such key, the arguments make no valid key, or the pair is ambiguous.
         NotFoundError: nobody answered.
         RemoteError: an error reply.
-        NotProvenError: who answered a command is not the service.
+        NotProvenError: a command was answered by someone other than the service.
     """
     asked = asked_of(options.config, options.vehicle, options.prefix, options.connect, options.zenoh)
     keys = _keys(options, asked)
@@ -123,7 +123,7 @@ def run(options: Options) -> int:
 
 
 def _answers(session: zenoh.Session, key: str, options: Options, asked: Asked, payload: bytes | None) -> list[Reply]:
-    """To the query; a command is proven where the session has a certificate."""
+    """Answers to the query; a command is proven if the session has a certificate."""
     selector = _selector(key, _params(key, options))
     credentials = asked.credentials
     if not _is_command(key):
@@ -134,7 +134,7 @@ def _answers(session: zenoh.Session, key: str, options: Options, asked: Asked, p
     encoding = MSGPACK if "format=msgpack" in (options.params or ()) else JSON
     try:
         return [give(session, selector, payload, options.timeout_s, speaker, encoding)]
-    except NotFoundError:  # nobody answered: as with every other key
+    except NotFoundError:  # nobody answered; treated as for every other key
         return []
 
 
@@ -143,10 +143,10 @@ def _is_command(key: str) -> bool:
 
 
 def _keys(options: Options, asked: Asked) -> Keys:
-    """The keys that are asked for, once everything typed is known to fit into one.
+    """The keys of the service, after checking that everything typed fits into a key.
 
     Raises:
-        UsageError: it does not; names what.
+        UsageError: something does not fit; the message names it.
     """
     if not math.isfinite(options.timeout_s):
         raise UsageError(f"--timeout {options.timeout_s}: give a number of seconds")
@@ -163,7 +163,7 @@ def _keys(options: Options, asked: Asked) -> Keys:
 
 
 def _pair_of(session: zenoh.Session, options: Options, keys: Keys, named: str) -> str:
-    """Of which pair a window or a red event is: the one given, that in its name, else the vehicle's only one."""
+    """The pair of a window or a red event: the given one, else the one in its name, else the vehicle's only one."""
     if options.pair is not None:
         return options.pair
     found = OF_PAIR.fullmatch(named)
@@ -171,7 +171,7 @@ def _pair_of(session: zenoh.Session, options: Options, keys: Keys, named: str) -
 
 
 def _resolve(session: zenoh.Session, options: Options, keys: Keys) -> tuple[str, str | None]:
-    """The key expression, and what kind of reply is shown in words (None: as it comes)."""
+    """The key expression, and the kind of reply, which decides how it is printed (None: as it comes)."""
     head, _, argument = options.key.partition("/")
     if f"/{VERSION_CHUNK}/" in options.key:
         return options.key, None
@@ -197,7 +197,7 @@ def _only_pair(session: zenoh.Session, options: Options, keys: Keys) -> str:
 
 
 def _params(key: str, options: Options) -> tuple[str, ...]:
-    """Those that were given; with a command goes for how long its acknowledgement is waited for."""
+    """The given parameters; to a command is added how long its acknowledgement is awaited."""
     given = tuple(options.params or ())
     if not _is_command(key) or any(item.startswith("timeout_ms=") for item in given):
         return given
@@ -213,10 +213,10 @@ def _selector(key: str, params: tuple[str, ...]) -> str:
 
 
 def _payload(options: Options) -> bytes | None:
-    """That of a command: as it was given, or of the options that stand for its entries.
+    """The payload of a command: as given, or made from the options that stand for its entries.
 
     Raises:
-        UsageError: what was given belongs to no such command; says what there is.
+        UsageError: what was given does not fit the command; the message says what does.
     """
     typed = {argument.name: getattr(options, argument.name) for argument in (TO, RELEASE, REASON, SENSOR)}
     given = {name: value for name, value in typed.items() if value not in (None, False)}
@@ -264,7 +264,7 @@ def _show(replies: list[Reply], kind: str | None, options: Options, key: str) ->
 
 
 def _value(reply: Reply) -> Any:
-    """The payload as a JSON value: text where it is not JSON."""
+    """The payload as a JSON value, or as text if it is not JSON."""
     if reply.encoding.startswith("application/json"):
         return json.loads(reply.payload)
     return reply.payload.decode("utf-8", errors="replace")
@@ -285,7 +285,7 @@ def _succeeded(reply: Reply, kind: str | None) -> bool:
 
 
 def _save_picture(options: Options, way: Way, keys: Keys, head: str, argument: str) -> int:
-    """`overlay`, or `evidence/ID` with `--param overlay=before`, as a JPEG file."""
+    """Saves `overlay`, or `evidence/ID` with `--param overlay=before`, as a JPEG file."""
     if head not in PICTURE_KEYS or (head == "evidence") != bool(argument):
         raise UsageError(
             "--output belongs to windows/ID, overlay, and evidence/ID with --param overlay=before or after"

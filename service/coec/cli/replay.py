@@ -1,4 +1,4 @@
-"""`coec replay`: the recorded decision again, from the file alone."""
+"""`coec replay`: reaches the recorded decision again, from the file alone."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from coec.schemas.base import to_json
 
 
 def run(path: Path, *, depth: str | None, as_json: bool) -> int:
-    """Says whether the result is the recorded one; 1 if not.
+    """Prints whether the result is the recorded one; returns 1 if not.
 
     Raises:
-        WindowError: damaged, or it holds no result.
-        ModelError, CalibrationError: the decision cannot be reached at all.
+        WindowError: the file is damaged or holds no result.
+        ModelError, CalibrationError: no decision can be reached.
     """
     recorded = read_result(path)
     if recorded is None:
@@ -56,7 +56,7 @@ def run(path: Path, *, depth: str | None, as_json: bool) -> int:
 
 
 def _differences(recorded: Any, reached: Any, at: str = "") -> list[tuple[str, Any, Any]]:
-    """(place, recorded, reached) of every value that is not the same."""
+    """(place, recorded, reached) of every value that differs."""
     if isinstance(recorded, dict) and isinstance(reached, dict):
         keys = sorted(recorded.keys() | reached.keys())
         return [

@@ -1,4 +1,4 @@
-"""The configuration of a service for all sensors of a simulated rig, each told once."""
+"""The configuration of a service for all sensors of a simulated rig, each described once."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def document_of(drive: RigDrive, lidars: Sequence[str], folder: Path) -> dict[str, Any]:
-    """`cameras`, `lidars`, `ego` and `pairs: all`, with the poses that the workshop believes in, for frames on
-    `sensors/<sensor>`; masks go into the folder.
+    """`cameras`, `lidars`, `ego` and `pairs: all`, with the poses that the workshop assumes, for frames on
+    `sensors/<sensor>`. Writes the masks into the folder.
 
     Args:
-        lidars: of the drive, those that are to be paired.
+        lidars: those LiDARs of the drive that are to be paired.
 
     Raises:
         OutputError: a mask cannot be written.

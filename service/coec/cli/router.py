@@ -1,4 +1,4 @@
-"""`coec router`: the Zenoh router of a vehicle, of the version that the service uses."""
+"""`coec router`: runs the Zenoh router of a vehicle, in the version that the service uses."""
 
 from __future__ import annotations
 

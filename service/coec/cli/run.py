@@ -1,4 +1,4 @@
-"""`coec run`: the daemon."""
+"""`coec run`: runs the daemon."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 from coec.config import Config, load_config
 
 MATRIX_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-"""What the service multiplies is (N, 3) by (3, 3): more threads only spin, for longer than the work takes. Read when
-NumPy is imported; the worker process gets its own."""
+"""Set to 1, because the service multiplies (N, 3) by (3, 3), where more threads only spin for longer than the work
+takes. Read when NumPy is imported; the worker process gets its own."""
 
 
 def run(path: Path, *, embedded_router: bool, state_dir: Path | None) -> int:
@@ -25,7 +25,7 @@ def run(path: Path, *, embedded_router: bool, state_dir: Path | None) -> int:
     config = read()
     for name in MATRIX_THREADS:
         os.environ.setdefault(name, "1")
-    # After the configuration has been read, so that a mistake in it is told at once.
+    # Imported after the configuration is read, so that a mistake in it is reported at once.
     from coec import daemon
     from coec.adapters.system import allocator
 

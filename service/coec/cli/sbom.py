@@ -20,7 +20,7 @@ DOCUMENT, TABLE = "coec.cdx.json", "licences.md"
 
 
 def run(lock: Path | None, output: Path | None, *, as_json: bool) -> int:
-    """Prints the table, or the document; writes both to a folder.
+    """Prints the table or the document, and writes both to a folder if one is given.
 
     Raises:
         NotFoundError: coec is not installed as a package, or something it needs is not.
@@ -49,7 +49,7 @@ def run(lock: Path | None, output: Path | None, *, as_json: bool) -> int:
 
 
 def inventory_here() -> Inventory:
-    """Of the interpreter that runs this.
+    """Inventory of the installation that runs this.
 
     Raises:
         NotFoundError: coec is not installed as a package, or something it needs is not.
@@ -60,7 +60,7 @@ def inventory_here() -> Inventory:
 
 
 def _networks() -> Sequence[Network]:
-    """Those whose file comes with the package."""
+    """The networks whose file comes with the package."""
     found = []
     for card in list_models():
         file = CARDS / f"{card.name}.onnx"

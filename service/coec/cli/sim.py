@@ -1,4 +1,4 @@
-"""`coec sim`: drives of a vehicle that does not exist, as files."""
+"""`coec sim`: writes drives of a simulated vehicle to files."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from coec.simulation.rig_drive import RigDrive
 
 MOST_PROCESSES = 4
-"""Each keeps its own street in memory."""
+"""Most processes, because each keeps its own street in memory."""
 TRUTH_TOPIC = "/ground_truth/tf"
-"""True `camera` <- `lidar` and `world` <- `ego` at each exposure. No source reads it: the service cannot know."""
+"""True `camera` <- `lidar` and `world` <- `ego` at each exposure. No source reads it, so the service cannot know."""
 
 
 def opened(options: Options) -> SimulatedDrive:
@@ -114,7 +114,7 @@ def view(options: sim_view.Options) -> int:
 
 
 def _query(options: Options, more: tuple[str, ...]) -> dict[str, str]:
-    """The words of `simulation.source`."""
+    """The query of `simulation.source` that the options mean."""
     names = ("seed", "seconds", "camera", "camera_hz", "lidar_hz", "scene", "speed_mps", "workshop", *more)
     query = {name: str(getattr(options, name)) for name in names if getattr(options, name) is not None}
     if options.faults:

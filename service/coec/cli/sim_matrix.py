@@ -1,4 +1,4 @@
-"""`coec sim matrix`: many simulated drives, one table of what the estimator and the monitor make of them."""
+"""`coec sim matrix`: runs estimator and monitor on many simulated drives, and makes one table of the results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run(options: Options) -> int:
     """Runs the drives that have no result in the folder yet, and writes report.json and a picture there.
 
     Raises:
-        UsageError: no drive fits.
+        UsageError: no drive matches, or windows are too small for a check.
         SourceError: the optional extra is not installed.
         OutputError: a file cannot be written.
         DrivesError: a process died.
@@ -60,6 +60,6 @@ def _path(folder: Path, name: str) -> Path:
 
 
 def _kept(folder: Path, drive: MatrixDrive, settings: Settings) -> MatrixRow | None:
-    """The row of a drive that was run before with these settings; a damaged one is run again."""
+    """The row of a drive that was run before with these settings; None if there is none, or it is damaged."""
     row = output.kept(_path(folder, drive.name), MatrixRow)
     return row if row is not None and row.settings == settings.fingerprint else None

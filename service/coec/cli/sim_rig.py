@@ -1,4 +1,4 @@
-"""`coec sim drive --rig`: a drive of a vehicle with several cameras and LiDARs, as one bag, each sensor drawn once."""
+"""`coec sim drive --rig`: writes a drive of a vehicle with several cameras and LiDARs as one bag, drawn once."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def drive(options: Options) -> int:
 
 
 def vehicle_of(made: RigDrive) -> Vehicle:
-    """What is said of the vehicle, with the poses that the workshop believes in."""
+    """Description of the vehicle for ROS, with the poses that the workshop assumes."""
     lidar = made.lidars[0]
     cameras = {camera: made.pair(camera, lidar).rig for camera in made.cameras}
     sensors = (*made.lidars, *made.cameras)
@@ -89,12 +89,12 @@ def vehicle_of(made: RigDrive) -> Vehicle:
 
 
 def source_of(folder: Path, camera: str, lidar: str) -> str:
-    """The SOURCE of a pair of what was written."""
+    """The SOURCE of one pair in the written bag."""
     return f"{folder / BAG}?camera={image_topic(camera)}&points={points_topic(lidar)}&intrinsics={folder / camera}.yaml"
 
 
 def _write_camera(made: RigDrive, camera: str, folder: Path) -> None:
-    """A bag has no place for a mask: it lies beside, with the YAML file that names it."""
+    """Writes the mask of a camera beside the bag, which has no place for it, and the YAML file that names it."""
     write(folder / f"{camera}_mask.png", mask_to_png(made.mask(camera)))
     intrinsics = {"model": name_of(made.camera), **intrinsics_of(made.camera)}
     lines = ["camera:", *(f"  {key}: {value}" for key, value in intrinsics.items()), f"mask: {camera}_mask.png", ""]

@@ -1,4 +1,4 @@
-"""`coec sim rig-drives`: are the sensors of a rig that moved named, and no others, on rendered drives."""
+"""`coec sim rig-drives`: whether a rig names the sensors that moved, and no others, on rendered drives."""
 
 from __future__ import annotations
 

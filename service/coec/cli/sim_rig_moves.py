@@ -1,4 +1,4 @@
-"""`coec sim rig-moves`: are the sensors of a rig that moved named, and no others."""
+"""`coec sim rig-moves`: whether a rig names the sensors that moved, and no others."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from coec.reports import console, rig_tables
 
 
 def run(drives: int, rigs: int, *, as_json: bool) -> int:
-    """Draws so many drives of each fault, and so many rigs, and prints the report."""
+    """Draws `drives` drives of each fault and `rigs` rigs, and prints the report."""
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(rig_moves.FAULTS) * drives, note="")
         report = rig_moves.report(drives, rigs, lambda note: bars.update(task, advance=1, note=note))

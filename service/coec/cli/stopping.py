@@ -1,4 +1,4 @@
-"""How commands are told to stop."""
+"""How signals stop commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from types import FrameType
 
 @contextmanager
 def until_signal() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set: what was announced is withdrawn before the end."""
+    """An event that SIGINT and SIGTERM set, so that a command can withdraw what it announced before it ends."""
     stop = threading.Event()
 
     def receive(_number: int, _frame: FrameType | None) -> None:
@@ -29,19 +29,18 @@ def until_signal() -> Iterator[threading.Event]:
 
 
 LATER_S = 0.05
-"""Until a Ctrl-C that was lost comes again: the call of a library that lost it has returned by then, or loses it
-again."""
+"""Delay until a lost Ctrl-C is sent again: by then the call that lost it has returned, or it loses it again."""
 
 
 @contextmanager
 def no_interrupt_lost() -> Iterator[None]:
-    """A Ctrl-C that falls into a call from C, of the compiler for instance, is dropped by Python with a traceback;
-    within, it comes again a moment later."""
+    """Sends a lost Ctrl-C again a moment later. Python drops a Ctrl-C, with a traceback, if it arrives in a callback
+    from C, for example from the compiler."""
     before = sys.unraisablehook
 
     def hear(what: sys.UnraisableHookArgs) -> None:
         if issubclass(what.exc_type, KeyboardInterrupt):
-            # No `threading.Timer`: its start waits for its thread, and an interrupt amid this hook is lost for good.
+            # No `threading.Timer`: its start waits for its thread, and an interrupt within this hook is lost for good.
             _thread.start_new_thread(_interrupt_later, (threading.get_ident(),))
         else:
             before(what)
@@ -55,5 +54,5 @@ def no_interrupt_lost() -> Iterator[None]:
 
 def _interrupt_later(thread: int) -> None:
     time.sleep(LATER_S)
-    # A signal, and no `interrupt_main`, which wakes nobody who waits.
+    # A signal rather than `interrupt_main`, which does not wake a waiting thread.
     signal.pthread_kill(thread, signal.SIGINT)

@@ -1,4 +1,4 @@
-"""`coec --version`: this program, and what its decisions are computed with."""
+"""`coec --version`: the versions of this program and of what its decisions are computed with."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from importlib import metadata
 from coec import __version__
 
 DECIDING = ("numpy", "numba", "llvmlite", "onnxruntime", "opencv-python-headless", "nlopt", "eclipse-zenoh")
-"""Distributions of which another version may round, draw or order otherwise: what differs from machine to machine where
-a decision does."""
+"""Distributions whose other versions may round, draw or order differently. Where two machines decide differently, these
+may differ."""
 
 
 def document() -> dict[str, str | None]:
@@ -24,7 +24,7 @@ def document() -> dict[str, str | None]:
 
 
 def text() -> str:
-    """The same in two lines."""
+    """The versions in two lines."""
     of = document()
     own = of.pop("coec")
     return f"coec {own}\n" + ", ".join(f"{name} {version or 'not installed'}" for name, version in of.items())

@@ -1,4 +1,4 @@
-"""`coec watch`: a fleet on one screen; or what one vehicle says, a line a change, for programs and logs."""
+"""`coec watch`: shows a fleet on one screen, or prints a line per change of one vehicle, for programs and logs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ EVERY_VEHICLE = "*"
 
 
 def run(options: Options) -> int:
-    """Shows until told to stop; 1 if nothing was heard at all.
+    """Shows until told to stop; returns 1 if nothing was heard at all.
 
     Raises:
         ConfigError: the session's configuration cannot be used.
         ConnectionFailedError: no router answered.
-        UsageError: a state that is none, or options of both forms.
+        UsageError: an unknown state, or options of both forms.
     """
     of_board = options.once or bool(options.states) or bool(options.find)
     of_lines = options.lines or options.seconds is not None

@@ -1,4 +1,4 @@
-"""A fleet on one screen: what its pairs said last, and on a key what one of them says when it is asked."""
+"""A fleet on one screen: the last word of each pair, and at a key press the answer of one pair."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ from coec.schemas.keys import MAX_LENGTH, Keys
 from coec.schemas.replies import HistoryReply
 
 FRAME_S = 0.5
-"""Between two pictures of the screen: ages are told in seconds."""
+"""Time between two updates of the screen, which shows ages in seconds."""
 
 ASK_AGAIN_S = 10.0
 ASKED_AT_ONCE = 16
-"""Silent pairs that are asked every `ASK_AGAIN_S` whether a word of theirs was lost: 2 kB/s at most, however many there
-are."""
+"""How many silent pairs are asked every `ASK_AGAIN_S` whether a word of theirs was lost: at most 2 kB/s, whatever the
+fleet."""
 
 RESULTS = 10
-"""Of the history of a pair: 50 kB."""
+"""Most results of a pair's history: 50 kB."""
 
 ANSWER_S = 10.0
-"""To wait for what is asked on a key; over a bad link that is what a picture takes."""
+"""Timeout for the answer to a key press; a picture takes so long over a bad link."""
 
 MAX_MESSAGE = 2 * MAX_LENGTH
-"""Bytes of one that is taken in."""
+"""Most bytes of an accepted message."""
 
 PANE_ROWS = 16
-"""Lines for what is known of one pair."""
+"""Lines for the details of one pair."""
 
 QUICK_FILTERS: tuple[tuple[str, frozenset[str]], ...] = (
     ("", frozenset()),
@@ -57,11 +57,11 @@ QUICK_FILTERS: tuple[tuple[str, frozenset[str]], ...] = (
 
 
 def run(options: Options, asked: Asked) -> int:
-    """Shows the board until it is left, or once; 1 if no pair has said anything.
+    """Shows the board until the user leaves it, or once; returns 1 if no pair has said anything.
 
     Raises:
         ConnectionFailedError: no router answered.
-        UsageError: a state that is none.
+        UsageError: an unknown state.
     """
     chosen = Filter(of_states(options.states or (), UsageError), options.find or "")
     with (
@@ -92,7 +92,7 @@ def run(options: Options, asked: Asked) -> int:
 
 
 class Asking:
-    """Questions to one pair at a time, beside the screen; what comes is shown when it has come."""
+    """Asks one pair at a time in a thread of its own, so that the screen goes on; shows the answer when it arrives."""
 
     def __init__(self, session: zenoh.Session, prefix: str) -> None:
         self._session = session
@@ -108,7 +108,7 @@ class Asking:
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     def begin(self, what: str, name: Name, size: tuple[int, int]) -> None:
-        """Ask for `history` or `overlay`, unless something is being asked; `size` in characters."""
+        """Ask for `history` or `overlay`, unless a question is still open; `size` in characters."""
         if self._future is not None and not self._future.done():
             return
         self._what = f"{what} of {name[0]}/{name[1]}"
@@ -116,7 +116,7 @@ class Asking:
         self._future = self._thread.submit(make, name, size)
 
     def shown(self) -> RenderableType:
-        """What came, or that it has not yet."""
+        """The answer, or that it has not arrived yet."""
         if self._future is None or not self._future.done():
             return Text(f"asking for the {self._what} …", "dim")
         try:
@@ -136,11 +136,11 @@ class Asking:
 
 @dataclass(slots=True)
 class Board:
-    """What is on the screen, and what keys do to it. Owned by one thread.
+    """The content of the screen, and what keys do to it. Owned by one thread.
 
     Attributes:
         index: of the chosen pair among those that are shown.
-        name: of the pair that was chosen by a key, which stays chosen wherever it goes; None: the first of them is.
+        name: of the pair that a key chose, which stays chosen wherever it moves; None: the first pair is chosen.
     """
 
     roster: Roster
@@ -156,12 +156,12 @@ class Board:
     fleet: FleetNow | None = None
 
     def once(self) -> FleetNow:
-        """All that has come by now."""
+        """The fleet, with everything that has arrived by now."""
         self._hear()
         return self.roster.now(self.clock(), self.given)
 
     def press(self, key: str | None) -> bool:
-        """Do what a key means; False: the board is left."""
+        """Act on a key; returns False if the key leaves the board."""
         pairs = self.fleet.pairs if self.fleet is not None else ()
         pair = pairs[self.index] if self.index < len(pairs) else None
         step = {"up": -1, "k": -1, "down": 1, "j": 1, "page up": -10, "page down": 10}.get(key or "", 0)

@@ -1,4 +1,4 @@
-"""What a service says of itself, a line a change. It asks and listens, and never gives a command."""
+"""Prints what a service says about itself, a line per change. It asks and listens, and never gives a command."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from coec.schemas.keys import Keys
 from coec.schemas.replies import HealthReply
 
 WAITING = 1024
-"""Changes that may wait to be written, some 10 MB; what comes beyond is counted and left out."""
+"""Changes that may wait to be written, some 10 MB; further ones are counted and left out."""
 
 POLL_S = 0.2
-"""Between two looks whether to stop."""
+"""Time between two checks whether to stop."""
 
 
 def run(options: Options, asked: Asked) -> int:
-    """Writes a line a change until told to stop, or for some seconds; 1 if nothing was heard at all.
+    """Writes a line per change until told to stop, or for some seconds; returns 1 if nothing was heard at all.
 
     Raises:
         ConnectionFailedError: no router answered.
@@ -50,7 +50,7 @@ def run(options: Options, asked: Asked) -> int:
 
 @contextmanager
 def _changes(session: zenoh.Session, asked: Asked, timeout_s: float) -> Iterator[queue.Queue[Change]]:
-    """What is so now, and every change from then on."""
+    """The present state, and every change from then on."""
     waiting: queue.Queue[Change] = queue.Queue(WAITING)
     lost = Counter[str]()
 

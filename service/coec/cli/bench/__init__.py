@@ -1,8 +1,8 @@
-"""`coec bench`: how fast this machine is: the kernels beside the plain forms in the same run, the worker by itself, and
-the daemon under the load of a vehicle.
+"""`coec bench`: measures how fast this machine is: the kernels against plain forms in the same run, the worker by
+itself, and the daemon under the load of a vehicle.
 
-Ratios compare runs of one process that alternate, each at its fastest: what else the machine does cancels out as far as
-it can. Processor time is that of a process alone; round trips and starts are by the clock on the wall.
+Ratios compare the fastest of alternating runs in one process, so that other load on the machine cancels out as far as
+possible. Processor time is that of one process alone; round trips and starts are wall-clock time.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from coec.sources import windows
 FRAMES = 25
 FRAME_COUNTS = (5, 25, 50, 200)
 REPEATS, FEW_REPEATS, TURNS = 180, 3, 6
-"""Runs of which the fastest counts; of the plain forms, which take a hundred times as long, fewer. In how many turns
-they are taken, so that what else the machine does falls on all."""
+"""Runs of which the fastest counts; fewer of the plain forms, which take a hundred times as long; and the number of
+turns over which runs are spread, so that other load falls on all of them."""
 
 START_DEG = (6.0, -6.0, 5.3)
 """10.0° from the truth, about all three axes."""
@@ -49,10 +49,10 @@ FAR_START_DEG = (14.0, -16.0, 13.1)
 """25.0° from the truth."""
 
 STREET = f"sim:seed=1&seconds={4 * FRAMES}&camera=fisheye480&camera_hz=0.25&lidar_hz=0.25&ego_hz=10&depth=yes"
-"""The recording for the fused solve: it needs images. One frame in four seconds, some forty metres apart."""
+"""Recording for the fused solve, which needs images: one frame every four seconds, some forty metres apart."""
 
 APART = ("load", "prepare", "depth")
-"""Stages that do not belong to a solve."""
+"""Stages that are not part of a solve."""
 
 
 Runs = Mapping[str, tuple[Callable[[], Any], int]]
@@ -60,10 +60,11 @@ Runs = Mapping[str, tuple[Callable[[], Any], int]]
 
 
 def run(*, as_json: bool) -> int:
-    """Measures and prints the table; always 0: what is not as required is marked, and no verdict.
+    """Measures and prints the table; always returns 0: a figure that misses its requirement is marked, but there is no
+    verdict.
 
     Raises:
-        SourceError: what draws the street of one of the solves is not installed.
+        SourceError: the library that draws the street of one of the solves is not installed.
     """
     require_extra()
     with console.progress(counted=False) as bars:
@@ -76,7 +77,7 @@ def run(*, as_json: bool) -> int:
 
 
 def measure(bars: Progress) -> dict[str, Any]:
-    """All figures, by the names of the contract. Times are the fastest of several runs."""
+    """All figures within this process, by the names of the contract. Times are the fastest of several runs."""
     task = bars.add_task("one evaluation", total=None, note="")
     search = SearchConfig(dof=3)
     start = _moved(START_DEG)
@@ -121,8 +122,8 @@ def measure(bars: Progress) -> dict[str, Any]:
 
 
 def measure_fused(bars: Progress) -> dict[str, Any]:
-    """The figures of the fused objective, six degrees of freedom, without depth inference: how long, and how far from
-    the truth it ends. The first run may compile."""
+    """The figures of a fused solve with six degrees of freedom, without depth inference: its time, and the error of its
+    end. The first run may compile."""
     loaded = windows.load(STREET, None, WindowConfig().pairs, lambda *_: None)
     xi = np.array([*np.radians(FAR_START_DEG), 0.0, 0.0, 0.0])
     window = windows.started_at(loaded.window, xi)
@@ -142,7 +143,7 @@ def measure_processes(bars: Progress) -> dict[str, Any]:
     """The figures of whole processes, by their names in `rows.ROWS`: worker and daemon, one after the other.
 
     Raises:
-        CalibrationError: the worker came to no result.
+        CalibrationError: the worker reached no result.
         ConnectionFailedError: the daemon did not become ready.
     """
     task = bars.add_task("processes", total=None, note="")
@@ -176,13 +177,13 @@ def _by_frames(objective: MutualInformation) -> dict[str, float]:
 
 
 def _spread_percent(ms_by_frames: Mapping[str, float]) -> float:
-    """How far the time of one frame is from the mean of its times over all numbers of frames, at most, %."""
+    """Largest deviation of the time per frame from its mean over all numbers of frames, %."""
     per_frame = np.array([ms / int(count) for count, ms in ms_by_frames.items()])
     return float(100.0 * np.abs(per_frame / per_frame.mean() - 1.0).max())
 
 
 def _nothing_left_out(model: str) -> MutualInformation:
-    """The objective with every point of every sweep, as no pose is out of reach: a box of half a turn."""
+    """The objective with every point of every sweep: with a box of half a turn, no pose is out of reach."""
     return scene.objective_of(scene.CAMERAS[model], FRAMES, scene.T_TRUE, SearchBox(np.pi, 0.0))
 
 
@@ -191,8 +192,8 @@ def _moved(degrees: tuple[float, float, float]) -> Any:
 
 
 def _fastest(runs: Runs) -> dict[str, float]:
-    """The least seconds of each, in turns of some runs, as a search makes them: what a window holds is then in the
-    cache. A first run of each, which may compile, does not count."""
+    """The fewest seconds of each. Each turn has several runs of one kind in a row, as in a search, so that the data of
+    a window is in the cache. A first run of each, which may compile, does not count."""
     for call, _ in runs.values():
         call()
     least = dict.fromkeys(runs, np.inf)

@@ -1,4 +1,4 @@
-"""A daemon of the benchmark, beside it in a process of its own: started, asked, ended."""
+"""Starts, asks and ends a daemon of the benchmark, which is a process of its own."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from coec.runtime.worker.child import PACKAGE_ROOT
 from coec.schemas.keys import Keys
 
 TIMEOUT_S = 60.0
-"""Of an answer, and of an end."""
+"""Timeout of an answer, and of the end of a process."""
 
 POLL_S, READY_S = 0.1, 300.0
-"""Between two questions whether the daemon runs: before it does, it can tell nobody. A first start compiles every
-kernel, for a minute and a half on two busy cores."""
+"""Period of asking whether the daemon runs, because it cannot announce that; and the time limit, because a first start
+compiles every kernel, for a minute and a half on two busy cores."""
 
 SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(*sys.argv[1:]))"
 """Program of the process that sends frames; its arguments are those of `load.main`."""
@@ -31,7 +31,7 @@ SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(*sys.
 
 @contextmanager
 def running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A Python process of ours, asked to end at the end."""
+    """A Python process of ours, which is terminated at the end."""
     process = subprocess.Popen(
         [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=PACKAGE_ROOT
     )
@@ -46,7 +46,7 @@ def await_running(session: zenoh.Session, keys: Keys) -> None:
     """Wait until the service says that it runs.
 
     Raises:
-        ConnectionFailedError: it does not.
+        ConnectionFailedError: it does not within `READY_S`.
     """
     end_s = time.monotonic() + READY_S
     while time.monotonic() < end_s:
@@ -58,7 +58,7 @@ def await_running(session: zenoh.Session, keys: Keys) -> None:
 
 
 def status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
-    """Of the daemon."""
+    """Status of the daemon."""
     return answered(session, keys.status)
 
 
@@ -69,7 +69,7 @@ def answered(session: zenoh.Session, key: str) -> dict[str, Any]:
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
+    """A port on which nothing listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

@@ -1,5 +1,5 @@
-"""The daemon under the load of a vehicle: what its I/O process takes of the machine, and how soon it answers while its
-worker solves. Real processes: the daemon (which is the router, too), the sensors, and this one, which asks.
+"""The daemon under the load of a vehicle: processor time and memory of its I/O process, and how soon it answers while
+its worker solves. Processes are real: the daemon (which is also the router), the sensors, and this one, which asks.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from coec.schemas.keys import Keys
 VEHICLE, PAIR = "bench", "0-0"
 KEYS = Keys("coec", VEHICLE)
 SETTLE_S, SECONDS = 10.0, 25.0
-"""Under load before anything counts; and each of the two times that count."""
+"""Time under load before anything counts, and length of each of the two measurements."""
 
 SLICE_S = 20.0
-"""25 pairs in so much time, nine times the default: the recorder, too, is at work all the while."""
+"""A window of 25 pairs in so much time, nine times the default rate, so that the recorder works all the time."""
 
 ENOUGH_CORES = 64.0
-"""Budget: windows come nine times as often as the default is for."""
+"""Budget, because windows come nine times as often as the default budget is meant for."""
 
 QUERY_PERIOD_S, COMMAND_PERIOD_S = 0.05, 0.5
 BUSY_SHARE = 0.5
-"""Of a period between two queries: the worker is solving when it used more processor time."""
+"""The worker counts as solving if it used more than this share of a query period as processor time."""
 
 
 @dataclass(slots=True)
 class Seen:
-    """Round trips of queries in ms, while the worker was at work and while it waited."""
+    """Round trips of queries in ms, while the worker was solving and while it waited."""
 
     solving_ms: list[float] = field(default_factory=list)
     waiting_ms: list[float] = field(default_factory=list)
 
 
 def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
-    """Runs the daemon in `folder` under load, by native frames and by topics of ROS.
+    """Runs the daemon in `folder` under load, with native frames and with topics of ROS.
 
     Raises:
         ConnectionFailedError: the daemon did not become ready.
@@ -65,7 +65,7 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
 
 
 def native(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
-    """By native frames as they come, and then with one solve after another."""
+    """Figures with native frames, first at their rate alone, then also with one solve after another."""
     with _settled(folder, "native", WindowConfig(slice_s=SLICE_S), heard) as (session, process):
         document = _resources(session, process, heard)
         heard("the daemon under load: queries during solves")
@@ -73,7 +73,7 @@ def native(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
 
 
 def ros(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
-    """By the same sensors as nodes of ROS, with windows as long as they are by default."""
+    """Figures with the same sensors as nodes of ROS, and windows of the default length."""
     with _settled(folder, "ros", WindowConfig(), heard) as (session, process):
         return {f"ros_{name}": figure for name, figure in _resources(session, process, heard).items()}
 
@@ -82,7 +82,7 @@ def ros(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
 def _settled(
     folder: Path, form: str, window: WindowConfig, heard: Callable[[str], None]
 ) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
-    """A daemon that has been under load for a while, without a bound on what its worker may take."""
+    """A daemon that has been under load for a while, with a budget that does not limit its worker."""
     with loaded(folder, form, (window, BudgetConfig(cores=ENOUGH_CORES)), heard) as (session, process):
         _ask(session, KEYS, process, SETTLE_S, at_work=False)
         yield session, process
@@ -92,7 +92,7 @@ def _settled(
 def loaded(
     folder: Path, form: str, stages: tuple[WindowConfig, BudgetConfig], heard: Callable[[str], None], pace: float = 1.0
 ) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
-    """A daemon under the load `form` of `load.LOADS`, at so many seconds of driving in a second, and who may ask it.
+    """A daemon under the load `form` of `load.LOADS`, at `pace` seconds of driving in a second, with a session.
 
     Raises:
         ConnectionFailedError: the daemon did not become ready.
@@ -114,7 +114,7 @@ def loaded(
 
 
 def _resources(session: zenoh.Session, process: ProcessReading, heard: Callable[[str], None]) -> dict[str, Any]:
-    """Processor and memory of the I/O process, and what came meanwhile."""
+    """Processor and memory of the I/O process, and what arrived in the meantime."""
     heard("the daemon under load: processor and memory")
     process.reset_peak()
     cpu_s, begin_s = process.cpu_s, time.monotonic()
@@ -131,7 +131,7 @@ def _resources(session: zenoh.Session, process: ProcessReading, heard: Callable[
 
 
 def _round_trips(session: zenoh.Session, process: ProcessReading) -> dict[str, Any]:
-    """Of queries, while the worker solves and while it waits."""
+    """Round trips of queries, while the worker solves and while it waits."""
     seen = _ask(session, KEYS, process, SECONDS, at_work=True)
     document: dict[str, Any] = {"query_during_solve_count": len(seen.solving_ms)}
     for name, times_ms in (("during_solve", seen.solving_ms), ("idle", seen.waiting_ms)):
@@ -151,18 +151,18 @@ def _ask(session: zenoh.Session, keys: Keys, process: ProcessReading, seconds: f
         begin_s = time.perf_counter()
         ask_one(session, keys.extrinsic(PAIR), daemons.TIMEOUT_S)
         elapsed_s = time.perf_counter() - begin_s
-        # The pace of the questions is part of what is measured.
+        # The pace of the queries is part of what is measured.
         time.sleep(max(QUERY_PERIOD_S - (time.monotonic() - now_s), 0.0))
         busy = worker.cpu_s - worker_s >= BUSY_SHARE * QUERY_PERIOD_S
         (seen.solving_ms if busy else seen.waiting_ms).append(1e3 * elapsed_s)
         if at_work and not busy and now_s >= next_command_s:
-            session.get(keys.command(PAIR, "calibrate"))  # whether there is a window to solve does not matter
+            session.get(keys.command(PAIR, "calibrate"))  # it does not matter if there is no window to solve
             next_command_s = now_s + COMMAND_PERIOD_S
     return seen
 
 
 def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
-    """What came and what became of it, since the start; a stream of several pairs counts once."""
+    """Frames that came and what they became, since the start; a stream that several pairs share counts once."""
     pairs = daemons.status(session, keys)["pairs"]
     streams = {
         f"{kind}s": sum({pair["name"].split("-")[index]: pair[kind]["accepted"] for pair in pairs}.values())
@@ -174,7 +174,7 @@ def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
 
 
 def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig, budget: BudgetConfig) -> Config:
-    """Every camera with every LiDAR, as if all were at one place: what is found there does not matter."""
+    """Every camera paired with every LiDAR, as if all were at one place; the results do not matter."""
     what = load.LOADS[form]
     stages = {"window": window, "calibration": CalibrationConfig(search=SearchConfig(dof=6))}
     intrinsics = intrinsics_config(what.camera)

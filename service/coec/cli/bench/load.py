@@ -1,5 +1,5 @@
-"""The sensors of the benchmark, in a process of their own, until its standard input ends: cameras, LiDARs and
-ego-motion at the rates of a vehicle, as native frames or as nodes of ROS 2 send them.
+"""The sensors of the benchmark, in a process that runs until its standard input ends: cameras, LiDARs and ego-motion at
+the rates of a vehicle, as native frames or as sent by nodes of ROS 2.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class Load:
 
     Attributes:
         cameras, lidars: how many.
-        camera_hz: images a second of each.
-        sweep_every: of how many images each LiDAR has a sweep.
+        camera_hz: images a second of each camera.
+        sweep_every: each LiDAR has one sweep per so many images of a camera.
         side_px: of the images.
-        is_ros: as nodes of ROS.
+        is_ros: whether sensors are nodes of ROS.
     """
 
     cameras: int = 1
@@ -52,7 +52,7 @@ class Load:
 
     @property
     def camera(self) -> Camera:
-        """Of every camera."""
+        """Model of every camera."""
         return scene.camera_of(CAMERA, self.side_px)
 
 
@@ -62,26 +62,27 @@ LOADS: Mapping[str, Load] = {
     "rig": Load(cameras=4, camera_hz=10.0, sweep_every=1),
     "large_rig": Load(cameras=8, lidars=3, camera_hz=10.0, sweep_every=1, side_px=700),
 }
-"""By name. A rig is of four fisheyes and a LiDAR; a large one of eight with three, with pictures of half the width."""
+"""Loads by name. A rig has four fisheyes and a LiDAR; a large one has eight and three, with pictures of half the
+width."""
 
 ROOMS = 7
-"""Different frames that are sent in turn: a camera that sends one and the same would look frozen."""
+"""Different frames that are sent in turn, because a camera that repeats one picture would look frozen."""
 
 CAMERA = "double_sphere"
 CONNECT_S = 60.0
 SPEED_MPS = 10.0
 TOPICS = {"camera": "/bench/camera/compressed", "lidar": "/bench/points", "ego": "/bench/odometry"}
-"""Of one pair."""
+"""Topics of the only pair in the load of ROS."""
 
 
 def key(kind: str, index: int = 0) -> str:
-    """Of the native frames of the camera, the LiDAR or the ego-motion of this number."""
+    """Key of the native frames of the camera, the LiDAR or the ego-motion of this number."""
     return f"bench/{kind}-{index}"
 
 
 def main(endpoint: str, name: str, pace: str = "1") -> int:
-    """Publishes until standard input ends; always 0. `name` is one of `LOADS`; `pace`: seconds of driving in a second,
-    by which stamps and frames come."""
+    """Publishes until standard input ends; always returns 0. `name` is one of `LOADS`; `pace` is the seconds of driving
+    in a second."""
     load = LOADS[name]
     pairs = [scene.pair(load.camera, seed, 0) for seed in range(ROOMS)]
     with connected([endpoint], CONNECT_S) as session:
@@ -106,7 +107,7 @@ Send = Callable[[Frame, int], None]
 
 
 def _native(session: zenoh.Session, load: Load) -> Send:
-    """Native frames on their keys."""
+    """Sends native frames on their keys."""
     encoding = zenoh.Encoding("application/msgpack")
     many = {"camera": load.cameras, "lidar": load.lidars, "ego": 1}
     streams = {
@@ -127,7 +128,7 @@ def _native(session: zenoh.Session, load: Load) -> Send:
 
 
 def _ros(session: zenoh.Session, load: Load) -> Send:
-    """CDR on `TOPICS`, as nodes of rmw_zenoh publish it."""
+    """Sends CDR on `TOPICS`, as nodes of rmw_zenoh do."""
     del load
     node = RosNode(session, RmwZenoh(Node(0, str(session.info.zid()), 0, "/bench", "sensors"), messages.type_hash))
     publishers = RosPublishers(session, node)

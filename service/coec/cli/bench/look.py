@@ -1,4 +1,4 @@
-"""What a look of the monitor takes of the processor: six pairs of a simulated street, from bytes to the verdict."""
+"""Processor time of a look of the monitor: six pairs of a simulated street, from bytes to the verdict."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from coec.config import CalibrationConfig, DepthConfig, LimitsConfig
 from coec.sources import windows
 
 PAIRS = 6
-"""Of a look, as the monitor takes them unless told otherwise."""
+"""Pairs of a look: the default of the monitor."""
 
 DRIVE = f"seed=930001&seconds={PAIRS + 0.5}&camera_hz=1&lidar_hz=1&ego_hz=10&lidar=64&depth=yes"
-"""A pair in a second, of a LiDAR of 64 beams: 110,000 points and more a sweep."""
+"""One pair per second, with a LiDAR of 64 beams: at least 110,000 points per sweep."""
 
 SIDES_PX: Mapping[str, str] = {"1400": "fisheye1400", "700": "fisheye700"}
 """Cameras, by the side of their images."""
 
 REPEATS = 12
-"""Looks of which the fastest counts; what else a machine does to the caches makes the others slower."""
+"""Looks of which the fastest counts, because other load on the caches only makes looks slower."""
 
 
 def measure(heard: Callable[[str], None]) -> dict[str, Any]:
-    """By the side of the images: the least processor time of all threads over a look at the right pose, ms, and how far
-    beside the truth it puts the mount, degrees. A look that is flagged, faint or blind has no time: it is not the one
-    that is asked for."""
+    """By the side of the images: the least processor time of all threads for a look at the right pose, ms, and how far
+    off the truth the look puts the mount, degrees. A look that is flagged, faint or blind gets no time, because it is
+    not the look that should be measured."""
     spent: dict[str, float | None] = {}
     off_deg: dict[str, float] = {}
     for side, camera in SIDES_PX.items():
@@ -47,8 +47,8 @@ def measure(heard: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _look(window: Window) -> tuple[float, Observation]:
-    """As the worker looks: images are decoded once, and nothing is left of the look before. The first run of a machine
-    compiles."""
+    """Looks as the worker does: images are decoded once per look, and nothing is kept from the look before. The first
+    run on a machine compiles."""
     configuration, limits = CalibrationConfig(depth=DepthConfig(model="stereo")), LimitsConfig()
     depth, least_s = open_depth(configuration.depth, limits), float("inf")
     for _ in range(1 + REPEATS):

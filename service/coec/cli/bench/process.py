@@ -1,4 +1,4 @@
-"""What a process takes of the machine, as Linux counts it."""
+"""Processor time and memory of a process, as Linux counts them."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from pathlib import Path
 BYTES_PER_MB = 1e6
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 _CPU_FIELD = 11
-"""Of utime in /proc/PID/stat, counted from behind the name of the program (proc(5)); stime follows."""
+"""Index of utime in /proc/PID/stat, counted after the name of the program (proc(5)); stime follows."""
 
 _RESET_PEAK = "5"
-"""Written to /proc/PID/clear_refs: the peak begins anew at what is resident now (proc(5))."""
+"""Written to /proc/PID/clear_refs, resets the peak to the memory that is resident now (proc(5))."""
 
 
 class ProcessReading:
-    """A look at a process of ours by its id."""
+    """Readings of a process of ours, by its id."""
 
     def __init__(self, pid: int) -> None:
         self._folder = Path(f"/proc/{pid}")
 
     @property
     def cpu_s(self) -> float:
-        """Processor time of all its threads since it began, s. What else the machine does is not in it."""
+        """Processor time of all its threads since it began, s, without other load on the machine."""
         behind_name = (self._folder / "stat").read_text().rpartition(")")[2].split()
         return (int(behind_name[_CPU_FIELD]) + int(behind_name[_CPU_FIELD + 1])) / _TICKS_PER_S
 
@@ -38,7 +38,7 @@ class ProcessReading:
 
     @property
     def peak_mb(self) -> float:
-        """Most resident memory (RSS) since the start or `reset_peak`, MB."""
+        """Peak resident memory (RSS) since the start or `reset_peak`, MB."""
         return self._of("status", "VmHWM")
 
     @property
@@ -49,11 +49,11 @@ class ProcessReading:
         ]
 
     def reset_peak(self) -> None:
-        """Let `peak_mb` begin anew."""
+        """Reset `peak_mb`."""
         (self._folder / "clear_refs").write_text(_RESET_PEAK)
 
     def _of(self, file: str, name: str) -> float:
-        """An entry in kB, as MB."""
+        """An entry of a file in kB, as MB."""
         lines = (self._folder / file).read_text().splitlines()
         kilobytes = next(line.split()[1] for line in lines if line.startswith(f"{name}:"))
         return int(kilobytes) * 1024 / BYTES_PER_MB

@@ -1,4 +1,4 @@
-"""What it takes of the processor to write windows: encoding, lz4, checksums, digest, and the disk."""
+"""Processor time of writing windows: encoding, lz4, checksums, digest, and the disk."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ RATE_BYTES_PER_S = 35e6
 """A camera of half a megabyte and a LiDAR of three at 10 Hz, every frame written."""
 
 PAIRS, WINDOWS = 25, 6
-"""Of a window, and windows of which the one that took least counts."""
+"""Pairs of a window, and number of windows, of which the fastest counts."""
 
 
 def measure(heard: Callable[[str], None]) -> dict[str, float]:
-    """Share of a core at `RATE_BYTES_PER_S` of frames, as the recorder writes them by default; percent."""
+    """Percent of a core that the recorder takes at `RATE_BYTES_PER_S` of frames, with its default packing."""
     heard("writing windows")
     camera = scene.CAMERAS["double_sphere"]
     rig = scene.rig_of(camera)
@@ -46,8 +46,8 @@ def measure(heard: Callable[[str], None]) -> dict[str, float]:
 
 
 def _in_millimetres(pair: FramePair) -> FramePair:
-    """With points as drivers give them, in whole millimetres and hundredths of the brightest: in noise of every bit lz4
-    finds nothing to do, and takes no time."""
+    """The pair with points as drivers give them, in whole millimetres, and intensities in hundredths. In data with
+    noise in every bit, lz4 would find nothing to compress and take no time."""
     rng = np.random.default_rng(pair.stamp_ns)
     brightness = np.round(rng.random(len(pair.lidar.xyz_m)), 2).astype(np.float32)
     xyz_m = np.round(pair.lidar.xyz_m, 3).astype(np.float32)

@@ -1,8 +1,8 @@
 """The daemon with the cameras of a whole vehicle: four fisheyes and one LiDAR, as four pairs; and eight cameras with
-three LiDARs, as twenty-four. What its processes take of the machine, and how long a pair is not seen.
+three LiDARs, as twenty-four. Measures the load of its processes, and how long a pair goes without a look.
 
-At the rates of a vehicle and with the defaults of the configuration: a check of each pair every five seconds, a window
-of each every three minutes, and what the budget allows of that. Real processes, as in `live`.
+Rates are those of a vehicle, and the configuration is the default: a check of each pair every five seconds, and a
+window of each every three minutes, as far as the budget allows. Processes are real, as in `live`.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from coec.runtime.worker import jobs
 KEYS = live.KEYS
 
 SETTLE_S = 20.0
-"""Under load before anything counts: the first checks, whose pairs the worker has never seen the like of."""
+"""Time under load before anything counts: it has the first checks, for which the worker is not warm yet."""
 
 SECONDS = {"rig": WindowConfig().slice_s, "large_rig": 60.0}
-"""Of the time that counts, by load: each pair of the rig has one window in it; the large one is on the budget that many
-pairs wait for, and a minute shows how long."""
+"""Time that counts, by load. It holds one window of each pair of the rig. In the large rig many pairs wait for the
+budget, and a minute shows how long."""
 
 LOOK_S = 1.0
-"""Of driving, between two looks at how old the latest check of each pair is."""
+"""Driving time between two readings of the age of each pair's latest check."""
 
 KINDS = (jobs.Kind.CHECK.value, jobs.Kind.SOLVE.value, jobs.PREFETCH)
-"""What the worker does for the stream."""
+"""Kinds of work that the worker does for the streams."""
 
 PACE = 1.0
-"""Seconds of driving in a second. Every figure is by the second of driving: a machine that is busy with something else
-can be asked for the same at a slower pace."""
+"""Seconds of driving in a second. All figures are per second of driving, so that a machine that is busy with something
+else can be measured at a slower pace."""
 
 
 def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def _figures(session: zenoh.Session, service: ProcessReading, pairs: Sequence[st
 
 
 def _spent_s(status: dict[str, Any], kind: str) -> float:
-    """What the worker has taken for work of a kind, s."""
+    """Time that the worker has spent on a kind of work, s."""
     taken_s: float = status["budget"]["spent_s"].get(kind, 0.0)
     return taken_s
 

@@ -1,4 +1,4 @@
-"""The speed table: each figure of the benchmark beside what is required of it."""
+"""The speed table: each figure of the benchmark beside its required bound."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coec.reports import console
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A figure by its name in the document. `required` is a bound on it: from above, of a ratio from below."""
+    """A figure by its name in the document. `required` bounds it from above, or a ratio from below."""
 
     key: str
     work: str
@@ -28,15 +28,15 @@ class Row:
         return self.unit == "×"
 
     def met(self, value: float) -> bool:
-        """Whether the figure is as required; without a bound it is."""
+        """Whether the figure meets its bound; without a bound it does."""
         if self.required is None:
             return True
         return value >= self.required if self.at_least else value <= self.required
 
 
 OFF_DEG = 0.2
-"""The time of a solve counts where it ends at the truth: within two of the standard deviations that the fused one tells
-of its end, 0.06 to 0.11°, rounded."""
+"""The time of a solve counts only if it ends this near to the truth: two of the standard deviations that the fused
+solve claims, 0.06 to 0.11°, rounded."""
 
 ROWS: tuple[Row, ...] = (
     Row("mi_25_frames_ms", "one MI, 25 frames of 114,000 points", "ms", 2, 2.5),
@@ -84,7 +84,7 @@ ROWS: tuple[Row, ...] = (
 
 
 def table(document: Mapping[str, Any]) -> Table:
-    """What was measured, beside what is required."""
+    """The measured figures beside the required bounds."""
     shown = console.table("work", "figure", "required", "", right=(1, 2))
     for row in ROWS:
         value = document.get(row.key)

@@ -24,16 +24,16 @@ from coec.geometry.mutual_information import BinnedFrames
 from coec.geometry.projection import unproject
 
 POINTS, BEAMS = 114_000, 64
-"""Of a sweep of the LiDAR of KITTI and KITTI-360."""
+"""Points and beams of a sweep, as of the LiDAR of KITTI and KITTI-360."""
 
 IMAGE_PX, MAP_PX = 1400, 512
-"""Side of the image (KITTI-360's fisheye), and of the depth map as a network returns it."""
+"""Side of the image (KITTI-360's fisheye), and of a depth map as a network returns it."""
 
 LOWEST_RAD, HIGHEST_RAD = np.deg2rad([-24.8, 2.0])
 """Elevations of that LiDAR's beams."""
 
 T_TRUE: Matrix4 = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""The camera looks ahead: its axes x right, y down, z forward in the LiDAR's x forward, y left, z up."""
+"""The camera looks ahead: its axes are x right, y down, z forward, those of the LiDAR x forward, y left, z up."""
 
 _SENSOR = {"width": IMAGE_PX, "height": IMAGE_PX, "cx": 699.5, "cy": 699.5, "fx": 437.5, "fy": 437.5}
 CAMERAS: dict[str, Camera] = {
@@ -48,8 +48,8 @@ CAMERAS: dict[str, Camera] = {
 
 
 JPEG_QUALITY, PLASTER_PX, PLASTER = 90, 6, 13.0
-"""Of a picture: walls with a grain of so many pixels and so many grey values (standard deviation) are as sharp as a
-street to the inspection, and make half a megabyte of an image of 1400²."""
+"""Quality of a picture, and grain of its walls in pixels and in grey values (standard deviation). With this grain, the
+inspection finds pictures as sharp as of a street, and an image of 1400² has half a megabyte."""
 
 FISHEYES = ("double_sphere", "kannala_brandt", "mei", "eucm")
 """Cameras whose image is a circle that touches the borders; the corners are masked."""
@@ -80,7 +80,7 @@ def pair(camera: Camera, seed: int, stamp_ns: int) -> FramePair:
 
 
 def picture(camera: Camera, seed: int, stamp_ns: int) -> CameraFrame:
-    """A JPEG: the nearer the wall, the darker, of coarse plaster."""
+    """A JPEG of walls in coarse plaster, darker where they are nearer."""
     rng, phases = _room(seed)
     side_px = camera.width
     rays, valid = _pixel_rays(camera)
@@ -118,7 +118,7 @@ def first(frames: BinnedFrames, count: int) -> BinnedFrames:
 
 
 def repeated(frames: BinnedFrames, times: int) -> BinnedFrames:
-    """A window of so many times the frames, each at a place of its own in memory."""
+    """A window with the frames repeated `times` times, each copy at its own place in memory."""
     shifts = np.arange(times)[:, None] * frames.first_point[-1]
     return replace(
         frames,
@@ -142,14 +142,14 @@ def _features(camera: Camera, seed: int) -> Features:
 
 
 def _room(seed: int) -> tuple[np.random.Generator, NDArray[np.float64]]:
-    """What is left to chance, and the four phases (rad) of the room's walls."""
+    """The random generator of a room, and the four phases (rad) of its walls."""
     rng = np.random.default_rng(seed)
     return rng, rng.uniform(0.0, 2.0 * np.pi, 4)
 
 
 @lru_cache(maxsize=1)
 def _pixel_rays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """(N, 3) unit directions of the pixels, LiDAR frame, row by row, and which of them there are."""
+    """(N, 3) unit directions of the pixels, LiDAR frame, row by row, and which of them are valid."""
     across = np.arange(camera.width, dtype=np.float64)
     rays, valid = unproject(camera, np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2))
     return rays @ T_TRUE[:3, :3], valid

@@ -1,4 +1,4 @@
-"""The worker process by itself: how soon it is of use, and what a solve takes of the memory."""
+"""The worker process by itself: how soon it is ready, and how much memory a solve takes."""
 
 from __future__ import annotations
 
@@ -32,21 +32,22 @@ from coec.runtime.worker.supervisor import Worker, WorkerState
 
 CAMERA = "double_sphere"
 POLL_S, TIMEOUT_S = 0.005, 300.0
-"""The worker is asked whether it has started, as nothing tells it. A first start compiles every kernel."""
+"""Period of polling whether the worker has started, because nothing announces it; and the timeout, because a first
+start compiles every kernel."""
 
 SOLVES: Mapping[str, CalibrationConfig] = {
     "mi": CalibrationConfig(objective=ObjectiveConfig(kind="mi"), search=SearchConfig(dof=3)),
     "fused": CalibrationConfig(search=SearchConfig(dof=6)),
 }
-"""Whose memory is looked at: the paper's, and the default objective with all six degrees of freedom."""
+"""Solves whose memory is measured: the paper's objective, and the default one with six degrees of freedom."""
 
 
 def measure(folder: Path, frames: int, heard: Callable[[str], None]) -> dict[str, Any]:
-    """Starts a worker for each of `SOLVES` and gives it a window of `frames` frames, with all that belongs to it:
-    reading, depth inference, the solve, writing the result into the file. One more gets a check of the monitor at once.
+    """Starts a worker for each of `SOLVES` and has it do a whole window of `frames` frames: reading, depth inference,
+    the solve, writing the result into the file. Another worker gets a check of the monitor at its start.
 
     Raises:
-        CalibrationError: the worker came to no result.
+        CalibrationError: the worker reached no result.
     """
     document: dict[str, Any] = {}
     heard("windows for the worker")

@@ -1,7 +1,7 @@
 """`coec demo`: a simulated vehicle whose mount is knocked, and the service that notices and repairs it.
 
-The vehicle renders and publishes, the service is a process of its own behind a Zenoh router, and a client watches:
-alarm and repair are the service's. Only the client knows the truth.
+The vehicle renders and publishes, the service is a process of its own behind a Zenoh router, and a client watches. So
+alarm and repair come from the service alone; only the client knows the truth.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
 
 POLL_S = 0.2
-"""Of the live view: it asks the service as any user would, by query."""
+"""Period of the live view, which asks the service by query, as any user would."""
 
 START_S, DRIVE_S = 600.0, 600.0
-"""Limits for the service to come up and for the drive. The first run on a machine compiles the kernels, in this process
-and in the service: about a minute on two quiet cores, several where others want them, too."""
+"""Time limits for the start of the service and for the drive. The first run on a machine compiles the kernels, in this
+process and in the service: about a minute on two idle cores, several minutes on busy ones."""
 
 
 def run(output: Path, *, as_json: bool) -> int:
-    """Runs the demonstration; 1 if the story did not come true: no alarm, no repair, or not within the limit.
+    """Runs the demonstration; returns 1 if the story did not come true: no alarm, no repair, or not within the limit.
 
     Raises:
         DemoError: the service does not start, answer or end.
-        SourceError: what casts the rays is not installed.
+        SourceError: the library that casts rays is not installed.
         OutputError: a file cannot be written.
     """
     files.try_folder(output)
@@ -63,7 +63,7 @@ def run(output: Path, *, as_json: bool) -> int:
         config = _configure(drive, folder)
         with running(folder / "coec.yaml", folder / "coec.log") as daemon, Screen() as screen:
             screen.wait("The service starts, the street is built …")
-            # Compiles what the renderers then find compiled, while the service compiles its own.
+            # Compiles kernels that the renderers then find compiled, while the service compiles its own.
             with compile_news.heard_by(screen.hear):
                 picture, page = first_look.write(output, drive)
             console.say(f"demo: the first picture is {picture}, and {page} shows it until there is more to tell")
@@ -93,7 +93,7 @@ def run(output: Path, *, as_json: bool) -> int:
 
 
 def _configure(drive: SimulatedDrive, folder: Path) -> Config:
-    """Writes the configuration of the service, and what it names, into the folder."""
+    """Writes the configuration of the service, and the files that it names, into the folder."""
     rig = drive.rig
     mask = np.ones((rig.camera.height, rig.camera.width), bool) if rig.mask is None else rig.mask
     files.write(folder / "mask.png", mask_to_png(mask))
@@ -103,7 +103,7 @@ def _configure(drive: SimulatedDrive, folder: Path) -> Config:
 
 
 def _truth(drive: SimulatedDrive) -> Callable[[float], Matrix4]:
-    """True T_camera_lidar by the second of the drive."""
+    """Function that gives the true T_camera_lidar at a second of the drive."""
     first_ns = drive.camera_stamps_ns[0]
     return lambda second: drive.truth(first_ns + round(second * NS_PER_S))
 
@@ -123,7 +123,7 @@ def _until_running(watch: Watch, daemon: Daemon, screen: Screen) -> None:
 
 
 def _watch(watch: Watch, vehicle: Vehicle, daemon: Daemon, screen: Screen) -> tuple[Seen, Ending]:
-    """Until the story is told, or the drive is over; what was seen last, and what became of it."""
+    """Watches until the story is told or the drive is over; returns what was seen last, and the outcome."""
     deadline_s = time.monotonic() + DRIVE_S
     try:
         if vehicle.start(START_S):
@@ -147,7 +147,7 @@ def _watch(watch: Watch, vehicle: Vehicle, daemon: Daemon, screen: Screen) -> tu
 
 
 def _fetch(watch: Watch, seen: Seen, output: Path) -> tuple[Path | None, Matrix4]:
-    """The window on which what is served rests, if any, and what was served when the alarm was raised."""
+    """Fetches the window of the served extrinsic, if any; returns it, and what was served at the alarm."""
     events = watch.events()
     blamed = np.array(events[-1].camera_from_lidar.matrix) if events else watch.nominal
     window_id = seen.extrinsic.window_id

@@ -16,10 +16,10 @@ import coec
 from coec.errors import CoecError
 
 STOP_S = 15.0
-"""What `coec run` promises."""
+"""Time within which `coec run` promises to stop."""
 
 LAST_WORDS = 5
-"""Lines of its log that are shown when it fails."""
+"""Lines of the service's log that are shown when it fails."""
 
 
 class DemoError(CoecError):
@@ -36,20 +36,20 @@ class Daemon:
         self._log = log
 
     def check(self) -> None:
-        """Raises DemoError, with its last words, when the service has ended."""
+        """Raises DemoError, with the last lines of the log, when the service has ended."""
         if self._child.poll() is not None:
             raise DemoError(f"the service ended with status {self._child.returncode}; {self.last_words()}")
 
     def last_words(self) -> str:
-        """For messages."""
+        """The last lines of the log, for error messages."""
         lines = self._log.read_text(errors="replace").splitlines()[-LAST_WORDS:]
         return "its last words:\n" + "\n".join(_plain(line) for line in lines)
 
     def end(self) -> None:
-        """Asks it to end, and waits.
+        """Asks the service to end, and waits.
 
         Raises:
-            DemoError: it does not, or not with status 0.
+            DemoError: it does not end, or not with status 0.
         """
         self._child.send_signal(signal.SIGTERM)
         try:
@@ -64,7 +64,7 @@ class Daemon:
 def running(config: Path, log: Path) -> Iterator[Daemon]:
     """`coec run --embedded-router` with a configuration; killed at the end if it still runs."""
     command = [sys.executable, "-m", "coec", "run", "--config", str(config), "--embedded-router"]
-    # The package is found where this one was, also when it is not installed.
+    # The child finds the package where this process did, even if it is not installed.
     path = os.pathsep.join(filter(None, [str(Path(coec.__file__).parent.parent), os.environ.get("PYTHONPATH")]))
     with log.open("wb") as stream:
         child = subprocess.Popen(command, stdout=stream, stderr=stream, env={**os.environ, "PYTHONPATH": path})
@@ -77,7 +77,7 @@ def running(config: Path, log: Path) -> Iterator[Daemon]:
 
 
 def free_endpoint() -> str:
-    """A Zenoh endpoint on this machine that nobody uses now."""
+    """A Zenoh endpoint on this machine that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

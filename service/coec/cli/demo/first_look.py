@@ -1,4 +1,4 @@
-"""What there is to look at before the service has said anything: the first pair of the drive."""
+"""What a user can look at before the service has said anything: the first pair of the drive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
 
 PICTURE = "first_picture"
-"""Stem of its file."""
+"""Stem of the picture's file."""
 
 ABOUT = (
     "A simulated vehicle drives, and the service of a real one listens to its camera and its LiDAR. Its mount will be "
@@ -25,7 +25,7 @@ ABOUT = (
 
 
 def write(output: Path, drive: SimulatedDrive) -> tuple[Path, Path]:
-    """The picture, and a page that holds its place until there is a report. Both are drawn of what is sent later.
+    """Writes the picture, and a page that stands in until there is a report. The pair that it shows is sent later.
 
     Raises:
         OutputError: a file cannot be written.

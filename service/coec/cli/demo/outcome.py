@@ -1,4 +1,4 @@
-"""Whether the story came true: right before the knock, alarmed by it, repaired."""
+"""Whether the story came true: right before the knock, alarm after it, then repaired."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from coec.cli.demo.watch import ALARM, Moment
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """What became of the drive; seconds of driving, None for what did not happen.
+    """The outcome of the drive, in seconds of driving; None for what did not happen.
 
     Attributes:
-        false_alarm_s: the first alarm before the knock, at an extrinsic that was right.
-        alarm_s: the first alarm after it.
-        repaired_s: when the service had, after the alarm, an estimate of its own within the limit, and was healthy.
-        error_before_deg: error of what was served after the knock, before the repair: the largest.
+        false_alarm_s: the first alarm before the knock while the extrinsic was right.
+        alarm_s: the first alarm after the knock.
+        repaired_s: when, after the alarm, the service had an estimate of its own within the limit and was healthy.
+        error_before_deg: largest error of the served extrinsic after the knock, which is that before the repair.
         error_after_deg: error at the end.
     """
 
@@ -30,7 +30,7 @@ class Ending:
 
     @property
     def passed(self) -> bool:
-        """Whether all of the story came true, and stayed so until the end."""
+        """Whether the whole story came true, and the service is healthy at the end."""
         return not self.objections()
 
     def objections(self) -> tuple[str, ...]:
@@ -52,10 +52,10 @@ def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float)
 
     Args:
         timeline: ascending in time.
-        knock_s: second of the drive at which the mount was bent.
-        max_error_deg: an estimate must be nearer to the truth to count as a repair, also at the end.
+        knock_s: second of the drive at which the mount was knocked.
+        max_error_deg: an estimate counts as a repair only if it is nearer to the truth than this, also at the end.
     """
-    # The workshop's calibration, which is served first, is wrong: who accuses it is right.
+    # An alarm about the workshop's calibration, which is served first and is wrong, is no false alarm.
     false = (m for m in timeline if m.health == ALARM and m.drive_s < knock_s and m.error_deg < max_error_deg)
     late = [moment for moment in timeline if moment.drive_s >= knock_s]
     alarm_s = next((moment.drive_s for moment in late if moment.health == ALARM), None)
@@ -77,5 +77,5 @@ def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float)
 
 
 def is_repaired(moment: Moment, max_error_deg: float) -> bool:
-    """Whether what is served is an estimate of the service's own, within the limit of the truth, and it is healthy."""
+    """Whether the service is healthy and serves an estimate of its own within the limit of the truth."""
     return moment.health == "healthy" and moment.provenance == "estimated" and moment.error_deg < max_error_deg

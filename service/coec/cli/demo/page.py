@@ -1,4 +1,4 @@
-"""The page of the demonstration: what was knocked, what the service said of it, and what it left behind."""
+"""The page of the demonstration: what was knocked, what the service said about it, and which files there are."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def demo_page(
     """The page.
 
     Args:
-        series: all that was seen, in the order of time.
-        happened: what was different from before, and a remark, which may be empty.
+        series: everything that was seen, in order of time.
+        happened: the moments at which something changed, each with a remark that may be empty.
         summary: names and values.
         result: of the window that repaired the mount; None: there is none.
         compared: points on the image before and after the repair; None: they were not drawn.
-        window: the recorded one that repaired the mount; None: there is none.
+        window: the recorded window that repaired the mount; None: there is none.
     """
     sections = [Section("Error and health over the drive", (Charts((_curve(series, outcome),)),))]
     if compared is not None:
@@ -99,7 +99,7 @@ def _curve(series: Sequence[Seen], outcome: Ending) -> Chart:
 
 
 def _turns(series: Sequence[Seen]) -> Iterator[tuple[float, float]]:
-    """The points at which the error changes, and the last one."""
+    """The points at which the error changes, and the last point."""
     before: float | None = None
     for second, error_deg, _ in series:
         if error_deg != before:

@@ -1,4 +1,4 @@
-"""What the demonstration leaves behind: pictures, the window that repaired the mount, and a page that shows them."""
+"""Files of the demonstration: pictures, the window that repaired the mount, and a page that shows them."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class Left:
 def write(
     output: Path, first: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen: Seen, outcome: Ending
 ) -> Left:
-    """All of it into the folder.
+    """Writes all files into the folder.
 
     Args:
-        first: the picture of before the drive, which lies there already.
-        window: the recorded window that lies there already; None without one.
+        first: the picture from before the drive, which is there already.
+        window: the recorded window, which is there already; None without one.
         blamed: (4, 4) what was served when the alarm was raised.
 
     Raises:
@@ -70,7 +70,7 @@ def write(
 
 
 def show(moments: Sequence[Moment], outcome: Ending, left: Left) -> None:
-    """The summary in the terminal."""
+    """Prints the summary in the terminal."""
     steps = console.table("elapsed", "drive", "health", "extrinsic", "error", "", right=(0, 1, 4))
     for moment, what in zip(moments, _happenings(moments, outcome), strict=True):
         times = (f"{moment.t_s:.0f} s", f"{moment.drive_s:.1f} s")
@@ -92,7 +92,7 @@ def show(moments: Sequence[Moment], outcome: Ending, left: Left) -> None:
 
 
 def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: Seen) -> tuple[list[Path], Compare]:
-    """Overlays and close-ups, and the latter in one place."""
+    """Writes overlays and close-ups; returns the files, and the close-ups for a slider."""
     window, configuration = read_window(path)
     truth = watch.truth(seen.moment.drive_s)
     before_deg = windows.rotation_error_deg(blamed, truth)
@@ -114,7 +114,7 @@ def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: See
 
 
 def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matrix4) -> NDArray[np.uint8]:
-    """(height, width, 3) BGR: the part of the picture in which the street is, with the points (N, 3) of the sweep."""
+    """(height, width, 3) BGR: the part of the picture that shows the street, with the points (N, 3) of the sweep."""
     pair, rig = pictures.middle(window), window.rig
     left, top, width, height = story.CLOSE_UP_PX
     part = slice(top, top + height), slice(left, left + width)

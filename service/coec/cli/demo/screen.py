@@ -1,4 +1,4 @@
-"""The live view of the demonstration in a terminal; where there is none, a line for each turn of the story."""
+"""The live view of the demonstration in a terminal; without a terminal, a line for each turn of the story."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BAR_WIDTH = 48
 CURVE_WIDTH = 72
 
 FIGURES = ("distance_rotation", "distance_pose", "edges_per_pair", "overlap", "mi")
-"""Of the latest check of the monitor: what it decides by, and mutual information."""
+"""Figures of the latest check of the monitor: those by which it decides, and mutual information."""
 
 
 STARTING = "starting"
@@ -31,7 +31,7 @@ STARTING = "starting"
 
 
 class Screen:
-    """Shows what is seen, while it is open."""
+    """Shows, while it is open, what the client sees."""
 
     def __init__(self) -> None:
         self._live = Live(console=console.err, transient=True, auto_refresh=False)
@@ -47,7 +47,7 @@ class Screen:
         self._live.stop()
 
     def hear(self, kernel: str) -> None:
-        """A kernel is being compiled in this process, as `compile_news` tells it."""
+        """Called by `compile_news` when a kernel is being compiled in this process."""
         self._news.hear(kernel)
         if self._news.lasted_s >= COMPILING_S:
             self._compiling(f"{COMPILING}: {self._news.kernels} so far, {self._news.lasted_s:.0f} s")
@@ -60,12 +60,12 @@ class Screen:
             console.say(f"demo: {COMPILING}; the drive begins then")
 
     def wait(self, what: str) -> None:
-        """Nothing can be seen yet."""
+        """Shows a text while there is nothing to see yet."""
         if console.err.is_terminal:
             self._live.update(Panel(Text(what), title="coec demo", width=CURVE_WIDTH + 30), refresh=True)
 
     def show(self, watch: Watch, seen: Seen) -> None:
-        """The latest."""
+        """Shows the latest answers."""
         if console.err.is_terminal:
             self._live.update(view(watch, seen), refresh=True)
             return
@@ -80,7 +80,7 @@ class Screen:
 
 
 def view(watch: Watch, seen: Seen) -> RenderableType:
-    """Everything about one instant."""
+    """The whole view of one instant."""
     moment, pair = seen.moment, seen.pair
     rows = Table.grid(padding=(0, 2))
     rows.add_column(style="bold")
@@ -97,7 +97,7 @@ def view(watch: Watch, seen: Seen) -> RenderableType:
 
 
 def curve(series: Sequence[tuple[float, float, str]], width: int = CURVE_WIDTH) -> Text:
-    """The error over the drive as a line of bars, 0 to a little more than the knock, in the colours of health."""
+    """The error over the drive as a row of bars, from 0 to a little more than the knock, in the colours of health."""
     latest: dict[int, tuple[float, str]] = {}
     seconds_per_bar = max(1.0, (series[-1][0] + 1.0) / width) if series else 1.0
     for second, error_deg, health in series:
@@ -114,7 +114,7 @@ def curve(series: Sequence[tuple[float, float, str]], width: int = CURVE_WIDTH) 
 
 
 def _before(t_s: float) -> Text:
-    """While the worker starts: the drive waits for it."""
+    """Text while the drive waits for the worker to start."""
     return Text(f"waits: kernels compile, once, for about a minute; {t_s:.0f} s so far")
 
 

@@ -28,46 +28,46 @@ if TYPE_CHECKING:
 
 SEED = 1
 LONGEST_S = 240.0
-"""Of driving: the drive ends as soon as the story is told, and here at the latest."""
+"""Longest drive; it ends as soon as the story is told."""
 
 WORKSHOP = (0.6, -0.5, 0.4, 0.0, 0.0, 0.0)
-"""By how much the calibration of the workshop is wrong: degrees in pitch, yaw, roll, and metres."""
+"""Error of the workshop's calibration: degrees in pitch, yaw, roll, and metres."""
 
 KNOCK_S, KNOCK_DEG = 36.0, 3.0
-"""When and how far the mount is bent, in pitch: after the first window has been judged."""
+"""When and by how much the mount is knocked, in pitch: after the first window has been judged."""
 
 TITLE = f"A mount that is knocked by {KNOCK_DEG:g}° while the vehicle drives"
 REPORT = "report.html"
-"""The page, from the first picture on."""
+"""File of the page, which exists from the first picture on."""
 
 REST_S = 12.0
-"""Of driving after the repair: two more checks of the monitor."""
+"""Driving after the repair: two more checks of the monitor."""
 
 CLOSE_UP_PX = (170, 285, 400, 170)
-"""Left, top, width and height of the part of the picture in which cars and kerbs are."""
+"""Left, top, width and height of the part of the picture that shows cars and kerbs."""
 
 PAIR_HZ, EGO_HZ = 1.0, 50.0
-"""Frames per second of driving: one pair is rendered for every one that the service would choose."""
+"""Frames per second of driving: only as many pairs are rendered as the service would choose."""
 
 WINDOW = WindowConfig(pairs=12, min_pairs=8, slice_s=24.0)
 MONITOR = MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0)
-"""Shorter than on a vehicle, where a window takes three minutes: nobody wants to watch that."""
+"""Shorter than on a vehicle, where a window takes three minutes, which is too long to watch."""
 
 STORY_CORES = 64.0
-"""Budget: the story has a window in seconds, oftener than the default is for."""
+"""Budget of the service: in the story, windows come every few seconds, for which the default is too small."""
 
 MAX_ERROR_DEG = 0.25
-"""What the repair must be within of the truth (geodesic angle)."""
+"""How near the repair must be to the truth (geodesic angle)."""
 
 MIN_FREE_BYTES = 64 * 2**20
-"""Some windows of 20 MB are written; a demonstration need not leave more of the disk free."""
+"""Small, because a demonstration writes only some windows of 20 MB."""
 
 
 def drive_config() -> DriveConfig:
     """A vehicle with a 185° fisheye of 700×700 pixels and a LiDAR of 64 beams, and the knock.
 
     Raises:
-        SourceError: what casts the rays is not installed.
+        SourceError: the library that casts rays is not installed.
     """
     require_extra()
     from coec.simulation.drive import DriveConfig
@@ -87,7 +87,7 @@ def drive_config() -> DriveConfig:
 
 
 def service_config(rig: Rig, mask: Path, endpoint: str) -> Config:
-    """Of the service: everything default, but for the rig, the address, and what is shorter here than on a vehicle."""
+    """Configuration of the service: defaults, except for rig, address, and what is shorter than on a vehicle."""
     streams = Streams.default(rig.pair)
     pair = PairConfig(
         name=rig.pair,
@@ -107,7 +107,7 @@ def service_config(rig: Rig, mask: Path, endpoint: str) -> Config:
         budget=BudgetConfig(cores=STORY_CORES),
         zenoh=ZenohConfig(connect=(endpoint,), listen=(endpoint,)),
         state=StateConfig(directory=Path("state"), min_free_bytes=MIN_FREE_BYTES),
-        # On a vehicle the cameras do not compete with the solver for the processor; here they are drawn on it.
+        # The solver competes with rendering here; on a vehicle cameras take no processor time.
         worker=WorkerConfig(niceness=0),
         pairs=(pair,),
     )

@@ -1,4 +1,4 @@
-"""The vehicle of the demonstration: renders its drive ahead in other processes, and publishes it at a bearable pace."""
+"""The vehicle of the demonstration: renders its drive ahead in other processes, and publishes it at a suitable pace."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 NS_PER_S = 1_000_000_000
 
 RATE = 4.0
-"""Seconds of driving in a second, at most: two pictures with their sweeps to draw in each of half a second."""
+"""Most seconds of driving in a second; each half second, two pictures with their sweeps must be drawn."""
 
 POLL_S = 0.05
 
@@ -31,13 +31,13 @@ class Vehicle:
     """Drives in a thread of its own.
 
     Attributes:
-        stamp_ns: sensor time of the latest frame that was published; that of the first picture before.
+        stamp_ns: sensor time of the latest published frame; before that, of the first picture.
         played: how many frames of each stream were published.
-        failure: why the thread ended before its time; None if it did not.
+        failure: why the thread ended early; None if it did not.
     """
 
     def __init__(self, session: zenoh.Session, drive: SimulatedDrive, may_pass: Callable[[int], bool]) -> None:
-        """`may_pass` is asked whether the drive may go on to a sensor time."""
+        """`may_pass` says whether the drive may go on to a sensor time."""
         self._drive = drive
         self._may_pass = may_pass
         self._player = Player(session, Streams.default(drive.rig.pair), "msgpack")
@@ -54,16 +54,16 @@ class Vehicle:
 
     @property
     def second(self) -> float:
-        """Of the drive."""
+        """The present second of the drive."""
         return max((self.stamp_ns - self._drive.camera_stamps_ns[0]) / NS_PER_S, 0.0)
 
     @property
     def pictures(self) -> int:
-        """How many have been sent."""
+        """How many pictures have been sent."""
         return self.played.frames[CAMERA]
 
     def start(self, wait_s: float) -> list[str]:
-        """Drives off once the service listens; the keys that nobody listens to after `wait_s`."""
+        """Starts the drive once the service listens; returns the keys to which nobody listens after `wait_s`."""
         deaf = self._player.wait_for_listener(wait_s)
         if not deaf:
             self._thread.start()
@@ -82,7 +82,7 @@ class Vehicle:
         try:
             frames = messages_by(self._drive.config, min(os.cpu_count() or 1, RENDERERS))
             self._player.play(paced(frames, self._may_pass, self._stop), 0.0, self._stop, self._heard)
-        except Exception as error:  # told by the thread that watches
+        except Exception as error:  # reported by the thread that watches
             self.failure = error
 
     def _heard(self, frame: Frame, _: Played) -> None:
@@ -92,12 +92,12 @@ class Vehicle:
 def paced(
     frames: Iterable[Frame], may_pass: Callable[[int], bool], stop: threading.Event, rate: float = RATE
 ) -> Iterator[Frame]:
-    """Each frame when it is due after the one before, and when the service has kept up.
+    """Yields each frame when it is due after the one before and the service has kept up.
 
     Args:
         may_pass: whether the drive may go on to a sensor time.
         stop: ends all waiting.
-        rate: seconds of driving in a second, at most.
+        rate: most seconds of driving in a second.
     """
     before_ns, before_s = None, 0.0
     for frame in frames:

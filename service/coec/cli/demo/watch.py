@@ -23,13 +23,13 @@ from coec.sources import windows
 ALARM: Final = "miscalibrated"
 
 ASK_S = 10.0
-"""For one answer, on a machine that also draws the street."""
+"""Timeout of one answer, on a machine that also draws the street."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What the service said at one instant. `drive_s` counts seconds of driving; angles in degrees; errors are those of
-    the extrinsic that is served, which rests on the window `window_id`, against the truth at that time."""
+    """What the service said at one instant. `drive_s` counts seconds of driving. Errors, in degrees, are those of the
+    served extrinsic, which comes from the window `window_id`, against the truth at that time."""
 
     t_s: float
     drive_s: float
@@ -59,7 +59,7 @@ class Seen:
 
     @property
     def T_camera_lidar(self) -> Matrix4:
-        """(4, 4) what is served."""
+        """(4, 4) the served extrinsic."""
         return np.array(self.extrinsic.camera_from_lidar.matrix)
 
 
@@ -72,9 +72,9 @@ class Watch:
         first_ns: sensor time at which the drive begins.
         pace: how far the drive may go on.
         series: everything seen: (second of the drive, error in degrees, health).
-        timeline: the moments at which something was different from before.
-        alarms: how many the service has raised that are in the timeline.
-        latest: None before the first answer.
+        timeline: the moments at which something changed.
+        alarms: number of the service's alarms that are in the timeline.
+        latest: what was seen last; None before the first answer.
     """
 
     session: zenoh.Session
@@ -95,7 +95,8 @@ class Watch:
         return self.latest is not None and self.pace.may_pass(stamp_ns)
 
     def look(self, drive_s: float, sent: int) -> Seen | None:
-        """The state now, or None while the service is not there yet; after so many seconds of driving and pictures."""
+        """The state after so many seconds of driving and `sent` pictures, or None while the service is not there
+        yet."""
         if not ask(self.session, self.keys.status, ASK_S):
             return None
         try:
@@ -116,7 +117,7 @@ class Watch:
         return from_json(replies.EvidenceReply, self._ask(self.keys.evidence(self.pair))).events
 
     def _catch_up(self, seen: Seen) -> None:
-        """On a busy machine an alarm may come and go between two looks: the service tells of it afterwards."""
+        """Adds alarms that came and went between two looks, as on a busy machine; the service keeps them as events."""
         told = seen.health.alarms
         raised = 0 if told is None else told.confirmed + told.withdrawn + told.open
         if raised <= self.alarms:
@@ -157,7 +158,7 @@ class Watch:
 
 
 def with_alarm(timeline: Sequence[Moment], drive_s: float) -> list[Moment]:
-    """A timeline with an alarm that nobody saw, at a second of the drive: what was served is what was served before."""
+    """A timeline with a missed alarm added at a second of the drive, with the extrinsic that was served before it."""
     before = [moment for moment in timeline if moment.drive_s <= drive_s]
     alarm = [replace(moment, drive_s=round(drive_s, 2), health=ALARM) for moment in before[-1:]]
     return [*before, *alarm, *timeline[len(before) :]]

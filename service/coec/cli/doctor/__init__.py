@@ -1,7 +1,7 @@
-"""`coec doctor`: what stands between this computer and a calibration, for the engineer who is with the vehicle.
+"""`coec doctor`: what keeps this computer from a calibration, for the engineer at the vehicle.
 
-One thing after another, in the order in which they depend on each other: the configuration, this computer, the way to
-the router, the streams, the service. It changes nothing that runs, and works with and without a service beside it.
+It examines, in the order in which they depend on each other: the configuration, this computer, the way to the router,
+the streams, the service. It changes nothing that runs, and works with and without a running service.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from coec.runtime.nominal.kept import with_kept
 from coec.schemas.doctor import DoctorReport, Finding, Level
 
 USUAL_FILE = Path("/etc/coec/coec.yaml")
-"""As the unit of systemd names it."""
+"""Configuration that the systemd unit names."""
 
 STYLES: dict[Level, str] = {"ok": "green", "warn": "bold yellow", "fail": "bold red"}
 
 
 def run(options: Options) -> int:
-    """Look at everything and tell it; 1 if something failed."""
+    """Examines everything and prints the findings; returns 1 if something failed."""
     findings: list[Finding] = []
     for finding in examine(options.config or USUAL_FILE, options.seconds):
         findings.append(finding)
@@ -51,9 +51,9 @@ def run(options: Options) -> int:
 
 
 def examine(path: Path, seconds: float) -> Iterator[Finding]:
-    """Everything, one finding after the other; the streams are listened to for so many seconds.
+    """Everything, one finding after the other; listens to the streams for so many seconds.
 
-    What a broken configuration keeps from being looked at is left out.
+    What cannot be examined because the configuration is broken is left out.
     """
     config, complaint = _configuration(path)
     yield complaint
@@ -91,10 +91,10 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
 
 
 def _configuration(path: Path) -> tuple[Config | None, Finding]:
-    """The configuration, if a service could start with it, and what there is to say of it."""
+    """The configuration, if a service could start with it, and the finding on it."""
     advice = "correct it, or name another with --config; `coec check-config FILE` prints what a file comes to"
     try:
-        config = load_config(path.resolve())  # as a service has it, whose paths are complete
+        config = load_config(path.resolve())  # absolute, as paths are in a service
         config = with_kept(config)
         for pair in config.pairs:
             rig_of(pair)
@@ -110,7 +110,7 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
 
 
 def _awaited(pair: OpenPairConfig, there: Topics) -> Finding:
-    """What there is to say of a pair whose calibration no service has found yet."""
+    """The finding on a pair whose nominal calibration no service has found yet."""
     absent = (there.absent(stream.topic, stream.types) for stream in pair.streams.values() if stream.topic)
     told = [sentence for sentence in absent if sentence is not None]
     text = "; ".join(["what its configuration leaves out has not been found yet", *told])
@@ -118,7 +118,7 @@ def _awaited(pair: OpenPairConfig, there: Topics) -> Finding:
 
 
 def _networks(config: Config) -> Iterator[Finding]:
-    """The depth networks, each once."""
+    """Findings on the depth networks, each once."""
     for depth in dict.fromkeys(pair.calibration.depth for pair in config.every_pair):
         try:
             opened = open_depth(depth, config.limits)

@@ -1,4 +1,4 @@
-"""How a finding is written down."""
+"""Makes findings of the doctor."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from coec.schemas.doctor import Finding
 
 
 def ok(check: str, where: str, text: str) -> Finding:
-    """Nothing is to be done."""
+    """A finding that needs no action."""
     return Finding(check=check, level="ok", where=where, text=text)
 
 
 def warn(check: str, where: str, text: str, advice: str) -> Finding:
-    """The service can work; see to it."""
+    """A finding that should be seen to, although the service can work."""
     return Finding(check=check, level="warn", where=where, text=text, advice=advice)
 
 
 def fail(check: str, where: str, text: str, advice: str) -> Finding:
-    """The service cannot do its work so."""
+    """A finding with which the service cannot do its work."""
     return Finding(check=check, level="fail", where=where, text=text, advice=advice)

@@ -1,6 +1,6 @@
-"""Samples of the streams for some seconds: what came, when, and the frames that were made of it.
+"""Listens to the streams for some seconds: which samples came, when, and the frames that they make.
 
-The service is not disturbed: it gets the same samples, and what is heard here comes over a session of its own.
+The service is not disturbed: the doctor has a session of its own, and the service gets the same samples.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from coec.config import Config, PairConfig
 from coec.runtime.ingest.decoder import EGO, Decoder, Frame, StreamCounts
 
 SAMPLES_WAITING = 8
-"""Of a stream; more are counted and not looked into."""
+"""Most samples of a stream that wait to be decoded; further ones are only counted."""
 
 MOTIONS_WAITING = 512
 
@@ -38,10 +38,10 @@ class Heard:
         place: its key or topic.
         arrivals_s: when (steady clock) each sample came.
         sizes: bytes of each.
-        stamps: of the frames: sensor time, and the wall clock when the sample came, ns, in the order of coming.
-        refused: samples of which no frame could be made, by reason.
+        stamps: sensor time of each frame, and the wall clock when its sample came, ns, in the order of arrival.
+        refused: samples that made no frame, by reason.
         latest: the last frame.
-        counts: what there is to say of the senders at the end.
+        counts: counts of the senders, at the end.
     """
 
     place: str
@@ -54,7 +54,7 @@ class Heard:
 
     @property
     def rate_hz(self) -> float | None:
-        """Samples per second; None before the second."""
+        """Samples per second; None with fewer than two samples."""
         if len(self.arrivals_s) < 2:
             return None
         spread_s = self.arrivals_s[-1] - self.arrivals_s[0]
@@ -64,7 +64,7 @@ class Heard:
 def listen(
     session: zenoh.Session, ros: RosSide, config: Config, seconds: float, heard: Callable[[float], None]
 ) -> list[dict[str, Heard]]:
-    """What comes on the streams of each pair; `heard` is told the seconds that have passed, now and then."""
+    """What comes on the streams of each pair; `heard` is called now and then with the seconds that have passed."""
     ears = [_Ear(session, ros, pair, config) for pair in config.pairs]
     begun_s = time.monotonic()
     try:
@@ -79,7 +79,7 @@ def listen(
 
 
 class _Ear:
-    """Of one pair."""
+    """Listens to the streams of one pair."""
 
     def __init__(self, session: zenoh.Session, ros: RosSide, pair: PairConfig, config: Config) -> None:
         inputs = {name: ros.input_of(stream) for name, stream in pair.streams.items()}
@@ -100,7 +100,7 @@ class _Ear:
         self._tokens = [session.liveliness().declare_token(token) for token in tokens]
 
     def close(self) -> None:
-        """Hear no more, and look into what waits."""
+        """Stop listening, and decode what still waits."""
         for token in self._tokens:
             token.undeclare()
         for subscriber in self._subscribers:
@@ -111,7 +111,7 @@ class _Ear:
             heard.counts = self._decoders[name].counts()
 
     def take(self) -> bool:
-        """Look into the next sample of each stream; whether there was one."""
+        """Decode the next sample of each stream; returns whether there was one."""
         found = False
         for name, waiting in self._waiting.items():
             if not waiting:
@@ -127,7 +127,7 @@ class _Ear:
                 {
                     reason: count
                     for (place, reason), count in self._losses.snapshot().items()
-                    if place == name and reason != "sequence_gap"  # what is not looked into leaves gaps, too
+                    if place == name and reason != "sequence_gap"  # samples that are not decoded leave gaps, too
                 }
             )
         return found

@@ -1,4 +1,4 @@
-"""The computer: its disk, its clock, what is compiled."""
+"""The computer: its disk, its clock, and whether kernels are compiled."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ SLOW_MIB_PER_S = 10.0
 """Three times what an urgent window takes: a pair of 4 MB every 1.2 s."""
 
 CLOCK_LIMIT_S = 1.0
-"""By how much the kernel may think its clock wrong."""
+"""Largest error of the clock that the kernel may estimate."""
 
 
 def state_findings(state: StateConfig) -> Iterator[Finding]:
-    """Whether the state directory is there, ours, free, large and fast enough."""
+    """Whether the state directory exists, belongs to this user, is not in use, and is large and fast enough."""
     folder, where = state.directory, str(state.directory)
     try:
         there = folder.exists()
@@ -56,7 +56,7 @@ def state_findings(state: StateConfig) -> Iterator[Finding]:
 
 
 def clock_finding() -> Finding:
-    """Whether the computer's clock is kept right."""
+    """Whether something synchronises the computer's clock."""
     clock = clock_state()
     if clock is None:
         return warn("clock", "", "the system does not say whether its clock is kept right", "ask its NTP or PTP daemon")
@@ -71,7 +71,7 @@ def clock_finding() -> Finding:
 
 
 def kernels_finding() -> Finding:
-    """Whether the first start has to compile."""
+    """Whether the first start has to compile kernels."""
     from numba import config as numba_config
 
     import coec.geometry.compiler  # noqa: F401  says where the cache is

@@ -1,4 +1,4 @@
-"""The way to the router, step by step: somebody there, certificates, Zenoh, rules."""
+"""The way to the router, step by step: whether anything listens, certificates, Zenoh, access rules."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from coec.schemas.doctor import Finding
 from coec.schemas.keys import Keys
 
 CONNECT_S = 3.0
-"""For each step; a router on the same network answers in milliseconds."""
+"""Timeout of each step; a router on the same network answers in milliseconds."""
 
 CLOSE_S = 3.0
 
 ASK_AGAIN_S = 0.05
-"""Between two questions for a token that the router has yet to hand on: nobody announces that it did not."""
+"""Time between two queries for a token that the router may not have forwarded yet; nothing announces a refusal."""
 
 SEEN_S = 3.0
-"""For the own liveliness token to come back from the router."""
+"""Timeout for our own liveliness token to come back from the router."""
 
 EXPIRES_SOON_DAYS = 30.0
 
@@ -47,7 +47,7 @@ DAY_S = 86_400.0
 
 
 def certificate_findings(config: Config) -> Iterator[Finding]:
-    """The certificates that the service shows, on the disk."""
+    """Findings on the certificates that the service shows, read from the disk."""
     settings = settings_of(config.zenoh, config.limits)
     seen: set[str] = set()
     ways: tuple[tuple[Literal["connect", "listen"], tuple[str, ...]], ...] = (
@@ -69,7 +69,7 @@ def certificate_findings(config: Config) -> Iterator[Finding]:
 
 
 def router_findings(config: Config) -> Iterator[Finding]:
-    """Every endpoint of the router, as far as somebody answers."""
+    """Findings on every endpoint of the router, each as far as it answers."""
     settings = settings_of(config.zenoh, config.limits)
     for text in _endpoints(settings, config):
         endpoint = Endpoint.parse(text)
@@ -80,7 +80,7 @@ def router_findings(config: Config) -> Iterator[Finding]:
 
 
 def session_beside(config: Config) -> zenoh.Session | None:
-    """A client of the router with the certificate of the service; None when Zenoh does not come about."""
+    """A session with the router that uses the certificate of the service; None when none comes about."""
     zenoh.init_log_from_env_or("off")
     settings = settings_of(config.zenoh, config.limits)
     endpoints = _endpoints(settings, config)
@@ -93,7 +93,7 @@ def session_beside(config: Config) -> zenoh.Session | None:
 
 
 def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
-    """Whether what answers is a Zenoh router that takes this session."""
+    """Whether what answers is a Zenoh router that accepts this session."""
     where = ", ".join(redacted(text) for text in _endpoints(settings_of(config.zenoh, config.limits), config))
     if session is None:
         return fail(
@@ -108,8 +108,8 @@ def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
 
 
 def rules_finding(config: Config, session: zenoh.Session) -> Finding:
-    """Whether the router lets this session, which has the certificate of the service, say what the service must say: a
-    liveliness token, which nobody else reads, has to come back."""
+    """Whether the router lets this session, which uses the service's certificate, publish what the service must. To
+    test that, a liveliness token that nobody else reads has to come back."""
     keys = Keys(config.prefix, config.vehicle)
     token_key = f"{keys.root}/alive/doctor/{session.info.zid()}/{time.time_ns()}"
     other = session_beside(config)
@@ -137,7 +137,7 @@ def rules_finding(config: Config, session: zenoh.Session) -> Finding:
 
 
 def _endpoints(settings: zenoh.Config, config: Config) -> tuple[str, ...]:
-    """Where a client reaches the router that the service uses, or is."""
+    """Endpoints of the router that the service uses, or that it is itself."""
     if mode_of(settings) != "router":
         return connected_of(settings)
     return tuple(text.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for text in config.zenoh.router)
@@ -184,7 +184,7 @@ def _handshake(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Findin
 
 
 def _dated(check: str, where: str, seen: Certificate) -> Finding:
-    """Whether a certificate is good today, and for how long."""
+    """Whether a certificate is valid today, and for how long."""
     now_s = time.time()
     text = f"{seen.name!r}, good until {_day(seen.not_after_s)}"
     if seen.names:

@@ -1,4 +1,4 @@
-"""The service itself, if one runs: what it says of itself, and what it is still missing."""
+"""The service itself, if one runs: what it says about itself, and what it still needs."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from coec.schemas.replies import HealthReply, StatusReply
 TIMEOUT_S = 3.0
 
 OF_THE_COMMAND_LINE = frozenset({"zenoh.embedded_router", "state.directory"})
-"""Places that options of `coec run` stand over."""
+"""Configuration values that options of `coec run` override."""
 
 PLACES_NAMED = 5
 
 LEVELS: dict[int, Level] = {0: "ok", 1: "warn", 2: "fail", 3: "warn"}
-"""Of ROS to those of findings; not having looked yet is no failure."""
+"""Level of a finding by ROS level; STALE, when nothing was checked yet, is no failure."""
 
 
 def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding]:
-    """What the service of the vehicle answers; one finding when nobody does."""
+    """Findings from the answers of the vehicle's service; a single one if no service answers."""
     keys = Keys(config.prefix, config.vehicle)
     try:
         status = from_json(StatusReply, ask_one(session, f"{keys.status}?format=json", TIMEOUT_S).payload)
@@ -55,7 +55,7 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
 
 
 def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:
-    """Whether it runs with this file."""
+    """Whether the service runs with this file."""
     try:
         served = json.loads(ask_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
         places = [place for place in differing(served, shown(config)) if place not in OF_THE_COMMAND_LINE]

@@ -1,4 +1,4 @@
-"""What the streams of a pair are like, judged by what the service needs of them."""
+"""Findings on the streams of a pair, judged by what the service needs."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from coec.schemas.doctor import Finding
 NS_PER_S = 1_000_000_000
 
 OFF_S = 1.0
-"""Between the stamp of a frame and its arrival: a sweep takes 0.1 s, and its way here as much again."""
+"""Most time between the stamp of a frame and its arrival: a sweep takes 0.1 s, and its way here as much again."""
 
 PACE = 0.1
-"""By which sensor time may run faster or slower than the clock of this computer: a replay does."""
+"""Share by which sensor time may run faster or slower than this computer's clock, as in a replay."""
 
 PARTNERS = 0.9
-"""Share of the camera frames that should have a sweep in time."""
+"""Least share of the camera frames that should have a sweep near in time."""
 
 PERIOD = 0.1
-"""By which the rate of sweeps may differ from what `sweep.period_s` says."""
+"""Share by which the rate of sweeps may differ from `sweep.period_s`."""
 
 LARGE = 0.8
-"""Share of the largest message that is taken at all."""
+"""Share of the largest accepted message from which on there is a warning."""
 
 
 def stream_findings(
     pair: PairConfig, heard: Mapping[str, Heard], config: Config, seconds: float, topics: Topics
 ) -> Iterator[Finding]:
-    """Of one pair."""
+    """Findings on the streams of one pair."""
     for name, one in heard.items():
         yield from _stream(pair, name, one, config, seconds, topics)
     counts = {name: one.counts for name, one in heard.items() if one.counts is not None}
@@ -94,7 +94,7 @@ def _silent(pair: PairConfig, name: str, heard: Heard, seconds: float, topics: T
 
 
 def _rate(pair: PairConfig, name: str, heard: Heard, seconds: float) -> Finding:
-    # Of one sample alone only this much is known: the next one did not come while it was listened.
+    # From a single sample only this much is known: the next one did not come while the doctor listened.
     rate_hz = heard.rate_hz or 2.0 / seconds
     told = f"{rate_hz:.1f} Hz" if heard.rate_hz else f"one sample in {seconds:g} s"
     load = sum(heard.sizes) / seconds / 1e6
@@ -117,7 +117,7 @@ def _rate(pair: PairConfig, name: str, heard: Heard, seconds: float) -> Finding:
 
 
 def _clock(name: str, heard: Heard) -> Finding:
-    """Stamps against the clock of this computer."""
+    """Compares the stamps with the clock of this computer."""
     late_s = median((wall_ns - stamp_ns) / NS_PER_S for stamp_ns, wall_ns in heard.stamps)
     back = sum(b[0] < a[0] for a, b in zip(heard.stamps, heard.stamps[1:], strict=False))
     sensor_s = (heard.stamps[-1][0] - heard.stamps[0][0]) / NS_PER_S
@@ -137,7 +137,7 @@ def _clock(name: str, heard: Heard) -> Finding:
 
 
 def _nearest_ns(stamps_ns: Sequence[int], others_ns: Sequence[int]) -> list[int]:
-    """From each stamp to the nearest of the others, signed."""
+    """Signed distance from each stamp to the nearest of the others."""
     others = sorted(others_ns)
     found = []
     for stamp in stamps_ns:
@@ -147,11 +147,11 @@ def _nearest_ns(stamps_ns: Sequence[int], others_ns: Sequence[int]) -> list[int]
 
 
 def _in_step(pair: PairConfig, camera: Sequence[tuple[int, int]], lidar: Sequence[tuple[int, int]]) -> Finding:
-    """Camera against LiDAR, by their stamps."""
+    """Whether camera and LiDAR are in step, by their stamps."""
     where = pair.name
     away_ns = _nearest_ns([stamp for stamp, _ in camera], [stamp for stamp, _ in lidar])
     tolerance_s = pair.pairing.tolerance_s
-    # At both ends of what was heard a partner may be missing.
+    # At both ends of the recorded time a partner may be missing.
     inside = away_ns[1:-1] or away_ns
     share = sum(abs(away) <= tolerance_s * NS_PER_S for away in inside) / len(inside)
     typical_s = median(away_ns) / NS_PER_S
@@ -178,7 +178,7 @@ def _with_motion(pair: PairConfig, camera: Sequence[tuple[int, int]], ego: Seque
 
 
 def _point_times(pair: PairConfig, cloud: LidarFrame, rate_hz: float | None) -> Finding:
-    """When each point of a sweep was measured."""
+    """The finding on the times of points within a sweep."""
     key, times_s = pair.lidar.place, cloud.time_offset_s
     count = len(cloud.xyz_m)
     if count == 0:
@@ -212,7 +212,7 @@ def _by_azimuth(pair: PairConfig, rate_hz: float | None) -> Finding:
 
 
 def _image(pair: PairConfig, frame: CameraFrame, config: Config) -> Iterator[Finding]:
-    """The picture itself, which the service looks into when a window is cut."""
+    """Findings on the picture itself, which the service inspects when it cuts a window."""
     key, window = pair.camera.place, pair.window
     try:
         quality = Inspector(config.limits).inspect(frame)

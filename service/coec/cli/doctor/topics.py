@@ -1,4 +1,4 @@
-"""What the vehicle's ROS publishes, for whoever writes or corrects a configuration."""
+"""What ROS publishes on the vehicle, for the author of a configuration."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from coec.config import CameraMessage, Config, EgoMessage, LidarMessage
 from coec.schemas.doctor import Finding
 
 TAKEN = frozenset((*get_args(CameraMessage), *get_args(LidarMessage), *get_args(EgoMessage)))
-"""Types that a stream may have."""
+"""Message types that a stream may have."""
 
 NAMED = 40
-"""Topics that are named; a vehicle with more sensors than that is looked at with ROS's own tools."""
+"""Most topics that are named; a vehicle with more sensors is better examined with ROS's own tools."""
 
 
 def topic_findings(topics: Topics, config: Config) -> Iterator[Finding]:
-    """Topics with their types and nodes, first of all those that may be streams."""
+    """Findings on topics: types and nodes of those that may be streams, and the number of others."""
     is_rmw = config.middleware == "rmw_zenoh"
     where = f"domain {config.ros.domain}" if is_rmw else f"bridge {config.ros.namespace}".strip()
     if not topics.publishers:

@@ -1,4 +1,4 @@
-"""`python -m coec.cli.pages docs`: pages of the documentation, from the tables that the code runs on."""
+"""`python -m coec.cli.pages docs`: writes pages of the documentation from the tables that the code runs on."""
 
 from __future__ import annotations
 
@@ -21,4 +21,4 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "python.md": python_page,
     "schemas.md": schemas_page,
 }
-"""What makes each, by its file."""
+"""The function that makes each page, by its file."""

@@ -1,4 +1,4 @@
-"""Writes every page into the folder that is the only argument."""
+"""Writes every page into the folder given as the only argument."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from coec.cli.pages import PAGES
 
 
 def main(arguments: list[str]) -> int:
-    """Exit status."""
+    """Runs the command line; returns the exit status."""
     if len(arguments) != 1:
         sys.stderr.write("usage: python -m coec.cli.pages DIR\n")
         return 2

@@ -23,7 +23,7 @@ is described in [recordings](recordings.md#source).
 
 
 def commands_page() -> str:
-    """Markdown: each command with its arguments and options, each once."""
+    """Markdown: each command, once, with its arguments and options."""
     found = list(_commands(typer.main.get_command(application(())), ()))
     rows = [
         (f"[`{name}`](#{_anchor(name)})", prose(_first_sentence(command.help or "")))
@@ -34,7 +34,7 @@ def commands_page() -> str:
 
 
 def _commands(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """The command itself, unless it is the program or a group that does nothing, and those below it."""
+    """The command itself, unless it is the program or a group without an action of its own, and its subcommands."""
     below = getattr(command, "commands", {})
     if words and (not below or command.invoke_without_command):
         yield words, command
@@ -66,7 +66,7 @@ def _item(term: str, parameter: Any) -> str:
 
 
 def _default(parameter: Any) -> object | None:
-    """What holds where it is not given, as far as that is a value that says something."""
+    """The default of a parameter, if it is a value that tells the reader something."""
     if isinstance(parameter.show_default, str):
         return parameter.show_default
     value = parameter.default

@@ -58,7 +58,7 @@ UNITS = (
     (r"_pixels$|^width$|^height$|^[fc][xy]$", "px"),
     (r"^T_", "m"),
 )
-"""Of a key, by how its name ends: the first that fits."""
+"""Unit of a key by how its name ends; the first pattern that matches counts."""
 
 
 def configuration_page() -> str:
@@ -71,10 +71,10 @@ def configuration_page() -> str:
 def _parts(
     model: type[BaseModel], place: str, *, of_rig: bool = False
 ) -> Iterator[tuple[str, type[BaseModel], list[tuple[str, FieldInfo]]]]:
-    """Each model of the configuration with its place and the keys that are its own, the whole before its parts.
+    """Each model of the configuration with its place and its own keys, the whole before its parts.
 
-    What is said elsewhere is left out: of `awaited` all, as its entries are those of `pairs`; of a rig's sensors what
-    they have in common with those of a pair.
+    What is described elsewhere is left out: all of `awaited`, because its entries are those of `pairs`, and the keys
+    that a rig's sensors share with those of a pair.
     """
     known: set[str] = set().union(*(base.model_fields for base in _SAID if of_rig and issubclass(model, base)))
     changed = {name for name in known if model.model_fields[name].annotation is not _annotation(model, name)}
@@ -93,7 +93,7 @@ _SAID = (OpenCameraConfig, OpenLidarConfig, OpenEgoConfig, RigStages)
 
 
 def _annotation(model: type[BaseModel], name: str) -> Any:
-    """As the model has it from the one that it is made of."""
+    """The annotation of a field in the model from which this model inherits it."""
     base = next(base for base in _SAID if issubclass(model, base))
     return base.model_fields[name].annotation
 
@@ -151,7 +151,7 @@ def _range(field: FieldInfo) -> str:
 
 
 def _flat(annotation: Any) -> Iterator[Any]:
-    """The annotation, and what it is a union or a list of."""
+    """The annotation, and recursively the members of unions and tuples in it."""
     yield annotation
     if get_origin(annotation) in (Union, UnionType, tuple):
         for part in get_args(annotation):

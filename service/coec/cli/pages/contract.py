@@ -1,4 +1,4 @@
-"""The pages on what travels: keys with their parameters and answers, and the models of all messages."""
+"""The pages on communication: keys with their parameters and answers, and the models of all messages."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ is in `schemas/v1/`. Readers ignore fields that they do not know; a field that c
 
 @dataclass(frozen=True)
 class _Resource:
-    """What a key is: its answer, and who reads its parameters."""
+    """What a key answers, and the function that reads its parameters."""
 
     answer: str
     parser: Callable[[str], Any] | Callable[..., Any] | None = None
@@ -91,7 +91,7 @@ RESOURCES: Mapping[str, _Resource] = {
     "alive": _Resource("liveliness token"),
     "claims": _Resource("liveliness tokens"),
 }
-"""By the method of `Keys` that builds the key."""
+"""Resources by the method of `Keys` that builds the key."""
 
 COMMANDS: Mapping[str, str] = {
     "calibrate": "the open window ends now and is solved, if it has pairs enough; else the latest one is solved again",
@@ -101,12 +101,12 @@ COMMANDS: Mapping[str, str] = {
     "commission": "the limits of the rig are learned from the windows that agree with what is served",
     "hold": "what is served stays as it is, whatever is found, until `release` ends that",
 }
-"""What each does."""
+"""What each command does."""
 
 KINDS: Mapping[type, str] = {str: "text", bool: "true or false"}
 
 INSTEAD = {"pair": "<pair>", "window_id": "<id>", "event_id": "<id>", "name": "<name>"}
-"""Of the arguments of those methods."""
+"""Placeholders for the arguments of those methods."""
 
 
 def keys_page() -> str:
@@ -154,7 +154,7 @@ def schemas_page() -> str:
         parts[title] = (schema, way)
         for part, body in schema.get("$defs", {}).items():
             parts.setdefault(part, (body, ""))
-    # What is no message of fields (a matrix, a name from a list) is told where it stands.
+    # What is no message with fields (a matrix, a name from a list) is described where it is used.
     shapes = {name: schema for name, (schema, _) in parts.items() if "properties" not in schema}
     sections = [
         _message(name, schema, way, shapes) for name, (schema, way) in sorted(parts.items()) if name not in shapes
@@ -173,7 +173,7 @@ def _message(name: str, schema: dict[str, Any], way: str, shapes: Mapping[str, d
 
 
 def _type(body: dict[str, Any], shapes: Mapping[str, dict[str, Any]]) -> str:
-    """In a few words."""
+    """The type of a field in a few words."""
     if "$ref" in body:
         name = body["$ref"].rpartition("/")[2]
         return _type(shapes[name], shapes) if name in shapes else f"[{name}](#{name.lower()})"
@@ -192,7 +192,7 @@ def _type(body: dict[str, Any], shapes: Mapping[str, dict[str, Any]]) -> str:
 
 
 def _arguments(command: str) -> str:
-    """What this command takes beside what all take."""
+    """Arguments of this command beyond those of all commands."""
     return "; ".join(map(_argument, commands.OF_PAIR.get(command, ()))) or "–"
 
 
@@ -205,8 +205,8 @@ def _grammar(parser: Callable[..., Any]) -> str:
 
 
 def _errors() -> Mapping[str, list[str]]:
-    """When each error code is replied: of every class of the package that has one, as it stands in its source, for
-    what of it is imported depends on who asks."""
+    """When each error code is replied, from every class of the package that has one. Read from the source, because what
+    is imported depends on the caller."""
     found: dict[str, list[str]] = {}
     for path in sorted(Path(coec.__file__).parent.rglob("*.py")):
         source = path.read_text(encoding="utf-8")

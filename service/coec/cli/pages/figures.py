@@ -1,4 +1,4 @@
-"""The page on the figures of self-diagnosis, from the table that words verdicts and explains reports."""
+"""The page on the figures of self-diagnosis, from the table that also explains them in verdicts and reports."""
 
 from __future__ import annotations
 

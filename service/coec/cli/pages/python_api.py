@@ -1,4 +1,4 @@
-"""The page on the package, from the names that it offers; their docstrings are read where the page is built."""
+"""The page on the package, from its public names; their docstrings are read when the site is built."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ HEAD = """\
 
 
 def python_page() -> str:
-    """Markdown: an entry for each name in `coec.__all__`, and what the package says of itself."""
+    """Markdown: the docstring of the package, and an entry for each name in `coec.__all__`."""
     public = sorted(getattr(coec, "__all__", ("__version__",)), key=str.lower)
     return HEAD.format(written=WRITTEN, doc=(coec.__doc__ or "").strip(), entries="\n".join(map(_entry, public)))
 
 
 def _entry(name: str) -> str:
-    """Data have no docstring at run time: they are told by value."""
+    """The entry of a name. Data have no docstring at run time, so their value is shown."""
     value = getattr(coec, name)
     heading = f'<a id="coec.{name}"></a>\n\n## `coec.{name}`\n\n'
     home = getattr(value, "__module__", None)

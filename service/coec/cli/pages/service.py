@@ -1,4 +1,4 @@
-"""The pages on a running service: its metrics; how it ends, what may ail it, what it takes while it runs."""
+"""The pages on a running service: its metrics; its exit codes, its troubles, and what a reload takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`coec view`: a vehicle, or a recording, for viewers that speak Foxglove's protocol. It gives no command."""
+"""`coec view`: serves a vehicle or a recording to viewers with Foxglove's protocol. It never gives a command."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]+):(\d{1,5})")
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where viewers are served: a host, without brackets, and a port; 0: one that is free."""
+    """Where viewers are served: a host, without brackets, and a port; 0 means any free port."""
 
     host: str
     port: int
@@ -41,7 +41,8 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class VehicleOptions:
-    """Which pair of a configuration's vehicle (None: its only one), asked how; the router is waited for `timeout_s`."""
+    """Which pair of a configuration's vehicle (None: its only one), and how its service is asked; `timeout_s` is the
+    wait for the router."""
 
     config: Path
     service: Asked
@@ -51,7 +52,7 @@ class VehicleOptions:
 
 @dataclass(frozen=True, slots=True)
 class RecordingOptions:
-    """What is played: `rate` times as fast as it was recorded, again and again if `repeat`; `result` is the file of the
+    """What is played: `rate` times as fast as recorded, again and again if `repeat`; `result` is the file of the
     candidate, None: there is none."""
 
     source: str
@@ -61,10 +62,10 @@ class RecordingOptions:
 
 
 def place_of(address: str, *, insecure: bool) -> Place:
-    """Where HOST:PORT is.
+    """The place that HOST:PORT names.
 
     Raises:
-        UsageError: it is none, or one that other computers may reach and `insecure` is not set.
+        UsageError: the text names none, or one that other computers may reach although `insecure` is not set.
     """
     found = ADDRESS.fullmatch(address)
     if found is None or int(found[2]) > 65535:
@@ -79,19 +80,19 @@ def place_of(address: str, *, insecure: bool) -> Place:
 
 
 def require_extra() -> None:
-    """Raises UsageError, which says what to install, where the library that serves viewers is not."""
+    """Raises UsageError, which says what to install, if the library that serves viewers is missing."""
     if importlib.util.find_spec("foxglove") is None:
         raise UsageError("coec view needs the optional extra `foxglove`: pip install 'coec[foxglove]'")
 
 
 def show_vehicle(options: VehicleOptions, place: Place, *, as_json: bool) -> int:
-    """Serves what a running vehicle's sensors and service send, until told to stop.
+    """Serves what the sensors and the service of a running vehicle send, until told to stop.
 
     Raises:
-        UsageError: no such pair, or no library to serve with.
+        UsageError: no such pair, or the library that serves viewers is missing.
         ConfigError: the pair's rig, or the session's configuration, cannot be used.
         ConnectionFailedError: no router answered.
-        UnavailableError: nobody can listen there.
+        UnavailableError: the address cannot be listened on.
     """
     require_extra()
     from coec.cli.view.live import Vehicle, watch
@@ -115,8 +116,8 @@ def show_recording(options: RecordingOptions, place: Place, *, as_json: bool) ->
     """Serves a recording, until told to stop.
 
     Raises:
-        UsageError, SourceError, WindowError: no such recording or result, or no library to serve with.
-        UnavailableError: nobody can listen there.
+        UsageError, SourceError, WindowError: no such recording or result, or the library is missing.
+        UnavailableError: the address cannot be listened on.
     """
     require_extra()
     from coec.cli.view.recorded import Show, play
@@ -146,7 +147,7 @@ def _screen(place: Place, rig: Rig) -> Screen:
 
 
 def _announce(screen: Screen, rig: Rig, shown: str, *, as_json: bool) -> None:
-    """Where it is served, and what."""
+    """Prints where viewers are served, and what."""
     if as_json:
         frames = {pose.value: frame_of(rig.camera_frame, pose) for pose in Pose}
         console.print_json(

@@ -1,4 +1,4 @@
-"""A calibration that was found and is not served, from the file of `coec calibrate --json`."""
+"""A candidate: a calibration that was found but is not served, read from a file of `coec calibrate --json`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coec.schemas.replies import CalibrationResult
 from coec.sources.reading import read_bytes
 
 MAX_BYTES = 2**20
-"""Of a result: some 5 kB."""
+"""Most bytes of a result, which has some 5 kB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +29,7 @@ def candidate_in(path: Path) -> Candidate:
     """The result in a file.
 
     Raises:
-        SourceError: it cannot be read, or holds no result, or one that is no rigid transform.
+        SourceError: the file cannot be read, or holds no result, or one that is no rigid transform.
     """
     try:
         result = from_json(CalibrationResult, read_bytes(path, MAX_BYTES))

@@ -1,4 +1,4 @@
-"""A running vehicle on the screen: its sensors while somebody looks, and what its service says."""
+"""Shows a running vehicle: its sensors while somebody looks, and what its service says."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from coec.runtime.ingest.decoder import CAMERA
 from coec.schemas.keys import Keys
 
 TELL_S = 1.0
-"""Between two lines of the timeline, where nothing changes."""
+"""Time between two lines of the timeline while nothing changes."""
 
 WAIT_S = 0.05
-"""For frames, between two looks at everything else."""
+"""How long to wait for frames before everything else is looked at again."""
 
 MUTE = (
     "Nothing comes on {}: see that somebody publishes it, and that the router's rules let this session subscribe to it."
 )
 
 SERVICE = "service"
-"""Where refused documents of the service are counted."""
+"""Name under which refused documents of the service are counted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +47,7 @@ class Vehicle:
 
 
 def watch(session: zenoh.Session, vehicle: Vehicle, screen: Screen, stop: threading.Event) -> None:
-    """Show the pair until told to stop."""
+    """Shows the pair until told to stop."""
     name = vehicle.pair.name
     streams = Streams(session, vehicle.pair, vehicle.config)
     service = ServiceWatch(session, vehicle.keys, name, lambda cause: streams.refused(SERVICE, cause))
@@ -70,7 +70,7 @@ def watch(session: zenoh.Session, vehicle: Vehicle, screen: Screen, stop: thread
 
 
 class _Teller:
-    """The timeline and the log: what has changed at once, what has not once a second."""
+    """Writes the timeline and the log: changes at once, and an unchanged state once a second."""
 
     def __init__(self, screen: Screen, pair: str) -> None:
         self._screen = screen
@@ -80,7 +80,7 @@ class _Teller:
         self._mute: tuple[str, ...] = ()
 
     def tell(self, moment: Moment, mute: tuple[str, ...]) -> None:
-        """How things are; `mute`: keys on which nothing comes that is looked for."""
+        """Tell the present state; `mute` are wanted keys on which nothing comes."""
         changed = self._told is None or _essence(self._told) != _essence(moment)
         if changed or time.monotonic() - self._told_s >= TELL_S:
             self._screen.tell(moment)
@@ -99,5 +99,5 @@ def _picture(pair: FramePair, vehicle: Vehicle, said: Said, wanted: frozenset[st
 
 
 def _essence(moment: Moment) -> tuple[object, ...]:
-    """What is worth a line in the log when it is another."""
+    """The part of a moment whose change is worth a line in the log."""
     return moment.state, moment.reasons, moment.provenance, moment.candidate

@@ -1,4 +1,4 @@
-"""Lines of the timeline, and what is drawn on the image: of a service that answers or does not, and of a recording."""
+"""Lines of the timeline, and extrinsics drawn on the image: for a service, answering or not, and for a recording."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from coec.geometry import se3
 from coec.schemas.replies import AxisReply, ExtrinsicReply, HealthReply, MetricReply
 
 STALE: Final = 3
-"""ROS level of whatever is not known."""
+"""ROS level of an unknown state."""
 
 SILENT_S = 10.0
-"""Without an answer for so long a service counts as silent: five questions."""
+"""A service without an answer for so long, five queries, counts as silent."""
 
 SENTENCES = {
     NOT_SERVED: "Nobody serves the pair: its service is down, or its router is.",
     SILENT: "The service is there, and does not answer.",
     RECORDED: "A recording: no service looks at it.",
 }
-"""By states that are none of the health's."""
+"""Explanations of the states that are not states of health."""
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What a service last said of a pair.
+    """What a service last said about a pair.
 
     Attributes:
         alive: whether its liveliness token is there.
-        answer_age_s: since it last said anything; None: it never did.
-        served, candidate: (4, 4) T_camera_lidar of `extrinsic`, certain to be rigid.
+        answer_age_s: time since it last said anything; None: it never did.
+        served, candidate: (4, 4) T_camera_lidar of `extrinsic`, checked to be rigid.
     """
 
     alive: bool = False
@@ -51,7 +51,7 @@ class Said:
 
     @property
     def state(self) -> str:
-        """Of the pair: that of its health, as long as somebody stands for it."""
+        """State of the pair: that of its health, as long as the service is there and answers."""
         if not self.alive:
             return NOT_SERVED
         if self.health is None or self.answer_age_s is None or self.answer_age_s > SILENT_S:
@@ -62,9 +62,8 @@ class Said:
 def moment_of_service(
     pair: str, said: Said, ages_s: Mapping[str, float | None], not_shown: Counter[tuple[str, str]]
 ) -> Moment:
-    """What a service says, and what came of its sensors: `ages_s` by stream, since a frame came; `not_shown` counts
-    frames by stream and cause. The figures are the last that are known, whatever the state: `answer_s` tells their
-    age."""
+    """The line for a service and its sensors. `ages_s` is the time since a frame came, by stream; `not_shown` counts
+    frames by stream and cause. Figures are the last known ones, whatever the state; `answer_s` is their age."""
     health, extrinsic = said.health, said.extrinsic
     current = health is not None and said.state == health.state
     return Moment(
@@ -97,7 +96,7 @@ def moment_of_service(
 
 
 def extrinsics_of_service(rig: Rig, said: Said) -> dict[Pose, Extrinsic]:
-    """What is drawn while a service is watched."""
+    """The extrinsics that are drawn while a service is watched."""
     provenance = said.extrinsic.provenance if said.extrinsic else "not known"
     pending = said.extrinsic.pending if said.extrinsic else None
     waits = pending.waits.code if pending and pending.waits else "waits for apply"
@@ -111,7 +110,7 @@ def extrinsics_of_service(rig: Rig, said: Said) -> dict[Pose, Extrinsic]:
 
 
 def moment_of_recording(rig: Rig, served: Matrix4, found: Candidate | None) -> Moment:
-    """What a recording holds, and the result that was found with it."""
+    """The line for a recording and the result that was found with it."""
     result = found.result if found else None
     return Moment(
         pair=rig.pair,
@@ -130,7 +129,7 @@ def moment_of_recording(rig: Rig, served: Matrix4, found: Candidate | None) -> M
 
 
 def extrinsics_of_recording(rig: Rig, served: Matrix4, found: Candidate | None) -> dict[Pose, Extrinsic]:
-    """What is drawn while a recording is played."""
+    """The extrinsics that are drawn while a recording is played."""
     return {
         Pose.SERVED: Extrinsic(served, "served: when this was recorded"),
         Pose.NOMINAL: Extrinsic(rig.T_camera_lidar_nominal, "nominal: of the recording"),
@@ -150,7 +149,7 @@ def _replies(extrinsic: ExtrinsicReply | None) -> Iterable[AxisReply]:
 
 
 def _axes(values: Sequence[float | None]) -> Axes:
-    """Of six values, in degrees and metres; or of none."""
+    """Axes from six values, degrees and metres, or from none."""
     return Axes(**dict(zip(Axes.model_fields, values, strict=False)))
 
 

@@ -1,4 +1,4 @@
-"""A recording on the screen, at the cadence at which it was recorded, for as long as somebody may look."""
+"""Shows a recording at the cadence at which it was recorded, for as long as somebody may look."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from coec.sources.windows import RECORDED_GAP_S
 NS_PER_S = 1_000_000_000
 
 AGAIN_S = 1.0
-"""Between two lines of the timeline; and after so long, whoever has come meanwhile is shown what is to be seen."""
+"""Time between two lines of the timeline, and between two redraws of the pair for viewers who have come since."""
 
 LOOK_S = 0.05
-"""Between two looks whether somebody has come."""
+"""Time between two checks whether a viewer has come."""
 
 DEFAULT_PERIOD_NS = 100_000_000
-"""Between two passes of a recording with a single frame: 10 Hz."""
+"""Time between two passes of a recording with a single frame: 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
 class Show:
-    """What is played, and how. `rate`: times recorded speed, above zero. `found`: the candidate, if there is one."""
+    """What is played, and how. `rate`: multiple of the recorded speed, above zero. `found`: the candidate, if any."""
 
     recording: Recording
     found: Candidate | None
@@ -48,7 +48,7 @@ class Show:
 
 
 class Stage:
-    """The pair that is on the screen, and what is told beside it."""
+    """The pair that is on the screen, and the state beside it."""
 
     def __init__(self, show: Show, screen: Screen) -> None:
         rig, served = show.recording.rig, show.recording.T_camera_lidar_start
@@ -68,7 +68,7 @@ class Stage:
         self._draw()
 
     def rest(self, until: Callable[[], bool], stop: threading.Event) -> None:
-        """Until something holds, or told to stop: tell and show again what is to be seen, now and then."""
+        """Wait until a condition holds, or until told to stop; meanwhile tell and draw again now and then."""
         while not stop.is_set():
             now_s = time.monotonic()
             if now_s - self._told_s >= AGAIN_S:
@@ -81,7 +81,7 @@ class Stage:
             stop.wait(LOOK_S)
 
     def rest_until(self, due_s: float, stop: threading.Event) -> None:
-        """Until a time of the steady clock."""
+        """Wait until a time of the steady clock."""
         self.rest(lambda: time.monotonic() >= due_s - LOOK_S, stop)
         stop.wait(min(max(due_s - time.monotonic(), 0.0), LOOK_S))
 
@@ -102,17 +102,17 @@ class Stage:
 
 
 def play(show: Show, screen: Screen, stop: threading.Event) -> Counter[str]:
-    """Play it to who looks, from when somebody does; its last pair stays to be seen until told to stop. Returns pairs
-    that could not be shown, by cause.
+    """Plays the recording from when the first viewer looks; its last pair stays on the screen until told to stop.
+    Returns the number of pairs that could not be shown, by cause.
 
     Raises:
-        SourceError: a file cannot be read; no camera frame found a sweep.
+        SourceError: a file cannot be read, or no camera frame found a sweep.
     """
     stage = Stage(show, screen)
     stage.rest(lambda: bool(screen.wanted & PICTURES), stop)
     due_s, before_ns = time.monotonic(), None
     for pair in _pairs(show):
-        # A recording that cannot be read as fast as it was taken takes longer; nothing of it is left out.
+        # A recording that cannot be read as fast as it was recorded takes longer; nothing is left out.
         step_ns = 0 if before_ns is None else pair.stamp_ns - before_ns
         due_s, before_ns = max(due_s + step_ns / NS_PER_S / show.rate, time.monotonic()), pair.stamp_ns
         stage.rest_until(due_s, stop)
@@ -124,7 +124,7 @@ def play(show: Show, screen: Screen, stop: threading.Event) -> Counter[str]:
 
 
 def _pairs(show: Show) -> Iterator[FramePair]:
-    """One after the other, again and again if it is to be repeated; sensor time goes on."""
+    """All pairs in order, again and again if the recording is repeated; sensor time goes on."""
     recording = show.recording
     expects_motion = len(recording.motion_stamps_ns) > 0
     pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=expects_motion)

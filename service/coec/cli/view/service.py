@@ -1,4 +1,4 @@
-"""What a running service says of a pair: as it changes, and every other second, so that its silence is heard."""
+"""What a running service says about a pair: on every change, and every two seconds, so that silence is noticed."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from coec.schemas.replies import ExtrinsicReply, HealthReply, Transform
 T = TypeVar("T")
 
 ASK_S = 2.0
-"""Between two questions, and how long an answer is waited for."""
+"""Time between two queries, and the timeout of an answer."""
 
 MAX_BYTES = 2**20
-"""Of a document of the service: some 10 kB."""
+"""Most bytes of a document of the service; they have some 10 kB."""
 
 WAITING = 64
-"""Documents that may wait to be read; the oldest go."""
+"""Documents that may wait to be read; the oldest are dropped."""
 
 HEALTH, EXTRINSIC = "health", "extrinsic"
 
 
 @dataclass(frozen=True, slots=True)
 class _Heard:
-    """A document that came: which, when it was asked for (steady clock; None: it was published), and its bytes; None
-    where it is larger than any of ours."""
+    """A document that came: its kind, when it was requested (steady clock; None: it was published), when it came, and
+    its bytes (None: it is larger than any of ours)."""
 
     kind: str
     asked_s: float | None
@@ -46,10 +46,10 @@ class _Heard:
 
 
 class ServiceWatch:
-    """What is known of one pair. One thread uses it; Zenoh's threads only put down what came."""
+    """What is known about one pair. One thread uses it; Zenoh's threads only store what came."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, pair: str, refused: Callable[[str], None]) -> None:
-        """`refused` is told the cause of each document that is none."""
+        """`refused` is called with the cause for each document that cannot be read."""
         self._session = session
         self._keys = {HEALTH: keys.health(pair), EXTRINSIC: keys.extrinsic(pair)}
         self._alive_key = keys.alive(pair)
@@ -66,7 +66,7 @@ class ServiceWatch:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Hear of changes, and whether somebody serves the pair."""
+        """Subscribe to changes, and to whether a service serves the pair."""
         subscribers = [
             self._session.declare_subscriber(key, _directly(self._listener(kind, None)))
             for kind, key in self._keys.items()
@@ -82,7 +82,7 @@ class ServiceWatch:
             token.undeclare()
 
     def look(self) -> Said:
-        """What it said last; asks again when it is time to."""
+        """What the service said last; asks again when it is time to."""
         now_s = time.monotonic()
         if now_s - self._asked_s >= ASK_S:
             self._asked_s = now_s
@@ -103,7 +103,7 @@ class ServiceWatch:
         if heard.asked_s is None:
             self._published_s[heard.kind] = heard.came_s
         elif heard.asked_s <= self._published_s[heard.kind]:
-            return  # what was published meanwhile is newer than this answer, or the same
+            return  # what was published in the meantime is newer than this answer, or the same
         try:
             if heard.payload is None:
                 raise DecodeError("message_too_large", f"more than {MAX_BYTES} bytes")

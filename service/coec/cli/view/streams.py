@@ -1,4 +1,4 @@
-"""The frames of a running pair's sensors, for somebody who looks: the newest pair, and none while nobody looks."""
+"""The frames of a running pair's sensors for a viewer: the newest pair, and none while nobody looks."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
 from coec.runtime.ingest.inbox import Inbox, Parcel
 
 DEPTHS = {CAMERA: 4, LIDAR: 4, EGO: 512}
-"""Samples that may wait; the oldest go. A pair needs its neighbours in time, and two seconds of ego-motion."""
+"""Samples that may wait; the oldest are dropped. A pair needs its neighbours in time, and two seconds of ego-motion."""
 
 PATIENCE_S = 5.0
-"""After which a stream on which nothing came is worth a word."""
+"""Time after which a stream without samples is reported."""
 
 BUSY_S = 0.2
-"""After which what was found is shown, however much more there is."""
+"""Time after which the newest pair so far is shown, even if more samples wait."""
 
 _SILENT = logging.Logger("view")
 _SILENT.addHandler(logging.NullHandler())
 
 
 class Streams:
-    """The sensors of one pair. They are subscribed to only while somebody looks, so nobody's looking costs the vehicle
-    nothing; and who looks slowly loses frames here, not there."""
+    """The sensors of one pair. Subscriptions exist only while somebody looks, so that an unwatched viewer costs the
+    vehicle nothing. A slow viewer loses frames here, not on the vehicle."""
 
     def __init__(self, session: zenoh.Session, pair: PairConfig, config: Config) -> None:
         self._session = session
@@ -54,7 +54,7 @@ class Streams:
     @property
     def not_shown(self) -> Counter[tuple[str, str]]:
         """Frames that came and were not shown, by stream and cause: refused, or without a partner since somebody looks.
-        Gaps in their numbers say nothing here, where most frames are passed over."""
+        Gaps in sequence numbers do not count, because most frames are skipped here anyway."""
         counts = {cause: count for cause, count in self._losses.snapshot().items() if cause[1] != "sequence_gap"}
         for name, count in self._pairer.losses.items():
             stream, _, cause = name.partition("_")
@@ -63,7 +63,7 @@ class Streams:
 
     @property
     def ages_s(self) -> dict[str, float | None]:
-        """By stream, since a sample came; None: none did since somebody looks. Empty while nobody does."""
+        """Time since a sample came, by stream; None: none since somebody looks. Empty while nobody looks."""
         if not self._subscribers:
             return {}
         arrivals = self._inbox.arrivals(time.monotonic())
@@ -77,7 +77,7 @@ class Streams:
         return tuple(self._pair.streams[stream].place for stream, age_s in self.ages_s.items() if age_s is None)
 
     def listen(self, *, wanted: bool) -> None:
-        """Subscribe, or no longer."""
+        """Subscribe if frames are wanted, else unsubscribe."""
         if wanted and not self._subscribers:
             self._begin()
             self._subscribers = [
@@ -89,8 +89,8 @@ class Streams:
             self.close()
 
     def newest(self, wait_s: float) -> FramePair | None:
-        """The newest pair of what has come; older ones are passed over. None: nothing came within `wait_s`, or no pair
-        of it."""
+        """The newest pair of the samples that have come; older pairs are skipped. None: nothing came within `wait_s`,
+        or it made no pair."""
         pair = None
         parcel = self._inbox.take(wait_s)
         end_s = time.monotonic() + BUSY_S
@@ -102,7 +102,7 @@ class Streams:
         return pair
 
     def refused(self, stream: str, cause: str) -> None:
-        """Count what could not be shown, or be understood."""
+        """Count something that could not be shown or understood."""
         self._losses.add(stream, cause)
 
     def _overrun(self, parcel: Parcel) -> None:

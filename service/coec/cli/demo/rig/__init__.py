@@ -1,4 +1,4 @@
-"""`coec demo --rig`: a knocked LiDAR and a knocked camera, told apart, as pictures of the rig seen from above."""
+"""`coec demo --rig`: tells a knocked LiDAR from a knocked camera, and shows the rig from above."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from coec.simulation.source import require_extra
 
 
 def run(output: Path, *, as_json: bool) -> int:
-    """Runs the demonstration; 1 if the story did not come true: the sensor that was knocked is not named, or another.
+    """Runs the demonstration; returns 1 if the knocked sensor was not named, or another one was.
 
     Raises:
-        SourceError: what casts the rays is not installed.
+        SourceError: the library that casts rays is not installed.
         OutputError: a file cannot be written.
     """
     require_extra()

@@ -1,4 +1,4 @@
-"""Whether an act came true: the sensor that was knocked is named, and no other ever."""
+"""Whether an act came true: the knocked sensor is named, and no other ever is."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from coec.cli.demo.rig.told import Told
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Of one act.
+    """Outcome of one act.
 
     Attributes:
-        named_s: second of the drive at which the knocked sensor alone was named; None: never, or it did not stay so.
-        wrong: sensors that were named at any time and had not moved.
+        named_s: second of the drive from which the knocked sensor alone was named to the end; None: never.
+        wrong: sensors that were named at any time although they had not moved.
     """
 
     act: Act
@@ -25,11 +25,11 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        """Whether it came true."""
+        """Whether the act came true."""
         return not self.objections()
 
     def objections(self) -> tuple[str, ...]:
-        """What did not, one sentence each."""
+        """What did not come true, one sentence each."""
         said = [f"{name} was said to have moved, and had not." for name in self.wrong]
         if self.named_s is None:
             said.append(f"{self.act.sensor} was knocked, and is not named at the end.")
@@ -37,7 +37,7 @@ class Outcome:
 
 
 def outcome_of(act: Act, heard: Sequence[Told]) -> Outcome:
-    """Of all that was told, in order."""
+    """The outcome from everything that was said, in order."""
     wrong: set[str] = set()
     named_s: float | None = None
     for told in heard:
@@ -51,5 +51,5 @@ def outcome_of(act: Act, heard: Sequence[Told]) -> Outcome:
 
 
 def is_over(outcome: Outcome, told: Told) -> bool:
-    """Whether nothing more is to be seen: what was told has lasted."""
+    """Whether the act may end, because the right name has lasted for `REST_S`."""
     return outcome.named_s is not None and told.second >= outcome.named_s + story.REST_S

@@ -17,7 +17,7 @@ from coec.reports import console
 
 
 def run(output: Path, *, as_json: bool) -> int:
-    """Plays all of it; 1 if an act did not come true.
+    """Plays all acts; returns 1 if one did not come true.
 
     Raises:
         DemoError: the service does not start, answer or end.
@@ -41,11 +41,11 @@ def run(output: Path, *, as_json: bool) -> int:
 
 
 def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[Outcome, list[Told]]:
-    """With a service of its own, which knows nothing of other acts: until the story is told, or the drive is over.
-    `heard` is told of every instant.
+    """Plays an act, with a service of its own that knows nothing of other acts, until the story is told or the drive is
+    over. `heard` is called for every instant.
 
     Raises:
-        DemoError: the service does not start, answer or end, or tells nothing.
+        DemoError: the service does not start, answer or end, or looks at nothing.
     """
     said: list[Told] = []
     with serving(vehicle.as_built, story.LIDAR) as service:
@@ -65,7 +65,7 @@ def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[
 
 
 def _hear(act: Act, said: list[Told], new: list[Told]) -> None:
-    """Keep what is new, and say who is named anew."""
+    """Keeps what is new, and says when the named sensors change."""
     for told in new:
         before = said[-1].named if said else None
         said.append(told)

@@ -1,4 +1,4 @@
-"""What the demonstration of a rig leaves behind: the rig from above, act by act, and a page of what was told when."""
+"""Files of the demonstration of a rig: the rig from above, act by act, and a page of what was named when."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ BELIEVED = (
 )
 
 Performance = tuple[Outcome, Sequence[Told]]
-"""An act: what became of it, and all that was told."""
+"""An act: its outcome, and everything that the service said."""
 
 
 def write(output: Path, drive: RigDrive, acts: Sequence[Performance]) -> list[Path]:
-    """All of it into the folder.
+    """Writes all files into the folder.
 
     Args:
         drive: as the vehicle was built.
@@ -59,7 +59,7 @@ def write(output: Path, drive: RigDrive, acts: Sequence[Performance]) -> list[Pa
 
 
 def picture(drive: RigDrive, act: Act, told: Told) -> bytes:
-    """PNG of the rig from above, as it is believed to be."""
+    """PNG of the rig from above, in the state that the service believes."""
     half_deg = drive.config.layout.half_view_deg
     seen = [
         SensorSeen(
@@ -75,7 +75,7 @@ def picture(drive: RigDrive, act: Act, told: Told) -> bytes:
 
 
 def turns(heard: Sequence[Told]) -> list[Told]:
-    """Those at which something was told that had not been told just before, the first among them."""
+    """The first of what was said, and each that differs from the one before."""
     kept: list[Told] = []
     for told in heard:
         if not kept or _states(told) != _states(kept[-1]):
@@ -94,7 +94,7 @@ def summary(outcome: Outcome) -> str:
 
 
 def show(acts: Sequence[Performance], files: Sequence[Path]) -> None:
-    """The summary in the terminal."""
+    """Prints the summary in the terminal."""
     for outcome, heard in acts:
         order = _order(outcome.act, heard[0])
         rows = console.table("drive", *order, "looked at", right=(0,))
@@ -137,10 +137,10 @@ def document(acts: Sequence[Performance], files: Sequence[Path], elapsed_s: floa
 
 
 def page(pictures: Sequence[Path], acts: Sequence[Performance], made: Made) -> Page:
-    """All acts.
+    """The page of all acts.
 
     Raises:
-        OutputError: a picture cannot be read any more.
+        OutputError: a picture can no longer be read.
     """
     sections = [
         Section(
@@ -178,7 +178,7 @@ def _the(act: Act) -> str:
 
 
 def _order(act: Act, told: Told) -> tuple[str, ...]:
-    """Sensors, the knocked one first: on a narrow screen it is the one that is seen."""
+    """Sensors, the knocked one first, so that it is visible on a narrow screen."""
     return (act.sensor, *(name for name in told.sensors if name != act.sensor))
 
 

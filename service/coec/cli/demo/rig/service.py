@@ -28,24 +28,24 @@ if TYPE_CHECKING:
     from coec.simulation.rig_drive import RigDrive
 
 START_S = 600.0
-"""To come up. The first run on a machine compiles the kernels, for about a minute of two quiet cores and many of busy
-ones; a service that ends meanwhile is noticed at once."""
+"""Time limit of the start. The first run on a machine compiles the kernels, for about a minute on two idle cores and
+many on busy ones; if the service ends in the meantime, that is noticed at once."""
 
 ASK_S = 10.0
-"""For one answer, on a machine that also draws the street."""
+"""Timeout of one answer, on a machine that also draws the street."""
 
 ANSWERED_S = 120.0
-"""For what was sent to be looked at."""
+"""Time limit for the service to look at what was sent."""
 
 REST_S = 8.0
-"""Without anything to do, after which nothing comes any more: twice as long as the rig waits for what may be under way
+"""Idle time after which nothing more comes: twice as long as the rig waits for looks that may be in transit
 (`runtime.rig.keeper.QUIET_TICKS`)."""
 
 POLL_S = 0.1
 
 
 class Service:
-    """A running one, as a client sees it.
+    """A running service, as a client sees it.
 
     Attributes:
         sensors: keys on which it listens.
@@ -60,42 +60,42 @@ class Service:
         self._daemon = daemon
 
     def rig(self) -> RigReply:
-        """What it says of the rig."""
+        """What the service says about the rig."""
         return from_json(RigReply, self._ask(self._keys.rig))
 
     def health(self) -> Mapping[str, HealthReply]:
-        """Of each pair."""
+        """Health of each pair."""
         return {pair: from_json(HealthReply, self._ask(self._keys.health(pair))) for pair in self.sensors_of}
 
     def status(self) -> StatusReply:
-        """Of the service."""
+        """Status of the service."""
         return from_json(StatusReply, self._ask(self._keys.status))
 
     def until_ready(self) -> None:
-        """Until it runs and its worker is warm.
+        """Waits until the service runs and its worker is warm.
 
         Raises:
-            DemoError: it ends before, or it takes too long.
+            DemoError: the service ends before, or it takes too long.
         """
         deadline_s = time.monotonic() + START_S
         while not (ask(self.session, self._keys.status, ASK_S) and self.status().state == "running"):
             self._go_on(deadline_s, "is not ready")
 
     def until_taken(self, pictures: int, most_held: int) -> None:
-        """Until it has so many pictures of every camera, and at most so many pairs wait to be looked at.
+        """Waits until the service has so many pictures of every camera, and at most `most_held` frame pairs wait.
 
         Raises:
-            DemoError: it ends before, or it takes too long.
+            DemoError: the service ends before, or it takes too long.
         """
         deadline_s = time.monotonic() + ANSWERED_S
         while any(pair.camera.received < pictures or pair.held > most_held for pair in self.status().pairs):
             self._go_on(deadline_s, f"has not looked at {pictures} pictures of each camera")
 
     def until_at_rest(self) -> None:
-        """Until nothing waits and nothing is under way, for as long as the rig takes to see that nothing comes.
+        """Waits until nothing has been waiting or in progress for `REST_S`, so that the rig knows that nothing comes.
 
         Raises:
-            DemoError: it ends before, or it takes too long.
+            DemoError: the service ends before, or it takes too long.
         """
         deadline_s = time.monotonic() + ANSWERED_S
         quiet_s = time.monotonic()
@@ -116,10 +116,10 @@ class Service:
 
 @contextmanager
 def serving(drive: RigDrive, lidar: str) -> Iterator[Service]:
-    """One that knows nothing but where the rig was built, as it starts.
+    """A starting service that knows nothing but how the rig was built.
 
     Raises:
-        DemoError: it does not start or answer, or ends before its time.
+        DemoError: the service does not start or answer, or ends early.
         OutputError: its configuration cannot be written.
     """
     with tempfile.TemporaryDirectory(prefix="coec-demo-") as temporary:
@@ -127,7 +127,7 @@ def serving(drive: RigDrive, lidar: str) -> Iterator[Service]:
         endpoint = free_endpoint()
         document: dict[str, Any] = {
             **document_of(drive, (lidar,), folder),
-            # The drive passes faster than on a road, and the cameras are drawn on the processor that looks.
+            # The drive is faster than on a road, and the pictures are drawn on the same processor.
             "budget": {"cores": STORY_CORES},
             "worker": {"niceness": 0},
             "zenoh": {"connect": [endpoint], "listen": [endpoint]},

@@ -1,4 +1,4 @@
-"""What `coec demo --rig` plays: one street, driven twice. Once the LiDAR on the roof is knocked, once a camera."""
+"""What `coec demo --rig` plays: one street, driven twice. In one drive the roof LiDAR is knocked, in one a camera."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ if TYPE_CHECKING:
 SEED = 2
 
 CAMERA_PX = 700
-"""Side of the pictures: those of 1400 take four times as long to draw. With half as many pixels a degree is within what
-pixels leave open, and a single camera that is off by it stays undecided."""
+"""Side of the pictures. Pictures of 1400 px take four times as long to draw. With half as many pixels, one degree is
+within the uncertainty of the pixels, and a single camera that is off by it stays undecided."""
 
 LIDAR = "roof"
-"""That all four cameras see: the short-range ones of the rig are left out."""
+"""The LiDAR whose view all four cameras share; the rig's short-range LiDARs are left out."""
 
 KNOCK_S = 16.0
-"""Of driving: every pair has been looked at twice."""
+"""Time of the knock: by then every pair has been looked at twice."""
 
 LONGEST_S = KNOCK_S + 60.0
-"""Of driving, should nobody be named: an alarm has to come within a minute."""
+"""Length of the drive if no sensor is named: an alarm has to come within a minute."""
 
 REST_S = 6.0
-"""Of driving after it was told who moved: every pair is looked at once more."""
+"""Driving after the sensor was named, in which every pair is looked at once more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +36,8 @@ class Act:
 
     Attributes:
         name: of its files.
-        sensor: that is knocked.
-        turn_deg: about its own axes.
+        sensor: the knocked one.
+        turn_deg: of the sensor about its own axes.
     """
 
     name: str
@@ -46,19 +46,19 @@ class Act:
 
     @property
     def knock_deg(self) -> float:
-        """By how much."""
+        """Angle of the knock."""
         return hypot(*self.turn_deg)
 
 
 ACTS = (Act("lidar", LIDAR, (0.0, 1.0, 0.0)), Act("camera", "left", (0.0, 1.0, 0.0)))
-"""The LiDAR nods, the camera looks aside: either by a degree."""
+"""The LiDAR nods and the camera looks aside, each by one degree."""
 
 
 def drive_config(act: Act | None) -> RigConfig:
-    """Of the drive of an act; None: nobody is knocked.
+    """Configuration of the drive of an act; None: no sensor is knocked.
 
     Raises:
-        SourceError: what casts the rays is not installed.
+        SourceError: the library that casts rays is not installed.
     """
     require_extra()
     from coec.evaluation.rig_looks import ROWS

@@ -1,4 +1,4 @@
-"""The last hop of the demonstration of a rig: frames in, what the service believes of every sensor out."""
+"""The last step of the demonstration of a rig: sends frames, and gets what the service believes about every sensor."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from coec.simulation.journey import START_NS
 NS_PER_S = 1_000_000_000
 
 LISTEN_S = 30.0
-"""For a service that runs to listen to all its sensors."""
+"""Time limit for a running service to listen to all its sensors."""
 
 MOST_HELD = 4
-"""Pairs of frames that may wait in the service before more are sent: it goes on while these are drawn."""
+"""Frame pairs that may wait in the service when more are sent, so that it has work while these are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorTold:
-    """What is believed of a sensor, see `SensorReply`; `moved_deg` is None where it did not move."""
+    """What the service believes about a sensor, see `SensorReply`; `moved_deg` is None if it did not move."""
 
     name: str
     kind: str
@@ -39,13 +39,13 @@ class SensorTold:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """After looks at some pairs.
+    """What the service believes after looks at some pairs.
 
     Attributes:
-        second: of the drive, up to which all is in it.
+        second: of the drive, up to which everything is included.
         looked_at: the pairs.
         sensors: by name.
-        edges: what the latest look at each pair says, by pair; pairs that were never looked at are not there.
+        edges: what the latest look at each pair says, by pair, without pairs that were never looked at.
     """
 
     second: float
@@ -60,7 +60,7 @@ class Told:
 
 
 class Asker:
-    """Sends the frames to a service, and asks it."""
+    """Sends frames to a service, and asks it."""
 
     def __init__(self, service: Service) -> None:
         """Raises DemoError: the service does not listen to its sensors."""
@@ -73,12 +73,12 @@ class Asker:
         self._looks: Mapping[str, int] = {}
 
     def hear(self, frames: Frames) -> list[Told]:
-        """After frames of one more instant: what is new since.
+        """Sends the frames of one more instant; returns what is new since the last call.
 
         Raises:
             DemoError: the service ends, or does not look.
         """
-        # Motion around two instants may be the same.
+        # Two instants may share motion.
         motions = [motion for motion in frames.motions if motion.stamp_ns > self._motion_ns]
         self._motion_ns = max((motion.stamp_ns for motion in motions), default=self._motion_ns)
         ordered = sorted((frames.sweep, *frames.pictures.values(), *motions), key=lambda frame: frame.stamp_ns)
@@ -88,7 +88,7 @@ class Asker:
         return self._new()
 
     def rest(self) -> list[Told]:
-        """After the last frames: what is new once all of them were looked at.
+        """After the last frames, waits until all were looked at; returns what is new.
 
         Raises:
             DemoError: the service ends, or does not look.
@@ -114,7 +114,8 @@ def told_of(
     checks: Mapping[str, CheckReply],
     sensors_of: Mapping[str, tuple[str, str]],
 ) -> Told:
-    """What a reply, by all up to a stamp, and the latest checks say. `sensors_of` are camera and LiDAR of each pair."""
+    """What a reply about everything up to a stamp, and the latest checks, say. `sensors_of` names camera and LiDAR of
+    each pair."""
     return Told(
         second=(stamp_ns - START_NS) / NS_PER_S,
         looked_at=", ".join(looked_at),
@@ -129,7 +130,7 @@ def _sensor(of: SensorReply) -> SensorTold:
 
 
 def _edge(camera: str, lidar: str, told: CheckReply) -> EdgeSeen:
-    """By how much the pair is turned; its σ such that the turn has as many of it as all three axes together."""
+    """How much the pair is turned. Its σ is chosen so that the turn is as many σ as all three axes together."""
     pairs = zip(told.offset[:3], told.sigma[:3], strict=True)
     axes = [(turn, sigma) for turn, sigma in pairs if turn is not None and sigma is not None and sigma > 0.0]
     turn_deg, sigmas = hypot(*(turn for turn, _ in axes)), hypot(*(turn / sigma for turn, sigma in axes))

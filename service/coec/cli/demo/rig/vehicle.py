@@ -1,7 +1,7 @@
-"""The vehicle of the demonstration of a rig: what its sensors see at the instants that are looked at, act by act.
+"""The vehicle of the demonstration of a rig: what its sensors see at the instants of looks, act by act.
 
-A frame of a sensor that stands where it was built is the same in every act, and drawn once. Frames are drawn in other
-processes, some instants ahead: while the service starts, and while it looks.
+A frame of a sensor that did not move is the same in every act and is drawn once. Other processes draw frames some
+instants ahead, while the service starts and while it looks.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from coec.sources.recording import Message
 NS_PER_S = 1_000_000_000
 
 AHEAD = 6
-"""Instants that are drawn, or wait for that, before the one that is sent: four seconds of a core each that nobody looks
-at when an act is over, and enough for the drawers while the service starts."""
+"""Instants that are drawn, or wait to be, ahead of the one that is sent. Each costs four seconds of a core, which are
+wasted when an act ends; so many keep the drawers busy while the service starts."""
 
 AS_BUILT = 0
-"""Number of the drive in which nobody is knocked; those of the acts follow it in their order."""
+"""Number of the drive in which no sensor is knocked; the drives of the acts follow in their order."""
 
 
 class Draws(Protocol):
     """Draws frames, see `simulation.drawing`."""
 
     def draw(self, drive: int, entry: Arrival) -> Future[Message]:
-        """An entry of the plan of a drive, by its number."""
+        """Draws an entry of the plan of the drive with this number."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
-    """Of one instant: a sweep, a picture by camera, and the motion around them."""
+    """Frames of one instant: a sweep, a picture by camera, and the motion around them."""
 
     sweep: Message
     pictures: Mapping[str, Message]
@@ -54,7 +54,7 @@ class Frames:
 
     @property
     def second(self) -> float:
-        """Of the drive."""
+        """Second of the drive."""
         return (self.sweep.stamp_ns - START_NS) / NS_PER_S
 
 
@@ -62,18 +62,18 @@ class RigVehicle:
     """Drives the same street in every act."""
 
     def __init__(self, drawers: Draws) -> None:
-        """Raises SourceError: what casts the rays is not installed."""
+        """Raises SourceError: the library that casts rays is not installed."""
         self.as_built = RigDrive(story.drive_config(None))
         self._drawers = drawers
         self._begun: dict[tuple[int, Arrival], Future[Message]] = {}
 
     @cached_property
     def plan(self) -> list[Instant]:
-        """Instants of every act."""
+        """The instants, which are the same in every act."""
         return instants(self.as_built, story.LIDAR, TURN_S)
 
     def frames(self, act: Act) -> Iterator[Frames]:
-        """All of them, in order. The first are being drawn when this returns."""
+        """All frames of an act, in order. The first are already being drawn when this returns."""
         if not self._begun:
             self._draw_first()
         begun = ((instant, self._begin(act, instant)) for instant in self.plan)
@@ -92,15 +92,15 @@ class RigVehicle:
             yield Frames(sweep, dict(zip(instant.pictures, pictures, strict=True)), motions)
 
     def _draw_first(self) -> None:
-        """Draw the first instant in this process: what is compiled for that, once on a machine, is told to who waits,
-        and every drawer finds it compiled."""
+        """Draw the first instant in this process. What this compiles, once per machine, is reported to the waiting
+        user, and every drawer finds it compiled."""
         for entry in (self.plan[0].sweep, *self.plan[0].pictures.values()):
             drawn: Future[Message] = Future()
             drawn.set_result(self.as_built.message(entry))
             self._begun[AS_BUILT, entry] = drawn
 
     def _begin(self, act: Act, instant: Instant) -> Sequence[Future[Message]]:
-        """Have the sweep and the pictures of an instant drawn, unless an earlier act has."""
+        """Begin to draw the sweep and the pictures of an instant, unless an earlier act has."""
         entries = (instant.sweep, *instant.pictures.values())
         numbered = [(self._drive_of(act, entry), entry) for entry in entries]
         for drive, entry in numbered:
@@ -109,7 +109,8 @@ class RigVehicle:
         return [self._begun[one] for one in numbered]
 
     def _drive_of(self, act: Act, entry: Arrival) -> int:
-        """Of an act where its sensor sees after the knock; what else there is to see is as it was built."""
+        """Number of the drive that an entry is drawn from: the act's, for its knocked sensor after the knock, else the
+        drive as built."""
         moved = self.as_built.stream(act.sensor)
         knocked = entry.stream == moved and entry.stamp_ns - START_NS >= story.KNOCK_S * NS_PER_S
         return 1 + story.ACTS.index(act) if knocked else AS_BUILT
@@ -120,7 +121,7 @@ def driving() -> Iterator[RigVehicle]:
     """The vehicle, with processes that draw what it sees.
 
     Raises:
-        SourceError: what casts the rays is not installed.
+        SourceError: the library that casts rays is not installed.
     """
     configs = [story.drive_config(act) for act in (None, *story.ACTS)]
     with drawing(configs, RENDERERS) as drawers:
