@@ -30,7 +30,7 @@ Connect = Annotated[
 ]
 
 Jobs = Annotated[
-    int | None, typer.Option(help="Processes, of one core and 1 GB each.", min=1, show_default="the cores")
+    int | None, typer.Option(help="Number of processes, of one core and 1 GB each.", min=1, show_default="the cores")
 ]
 """Option of commands that draw many drives."""
 
@@ -40,8 +40,8 @@ DegreesOfFreedom = Literal["3", "6"]
 Depth = Annotated[
     str | None,
     typer.Option(
-        help="An ONNX file, a built-in name (`coec models`), or `stereo`: the maps of the source. Without it, what a "
-        "recorded window names, else the network that comes with coec.",
+        help="An ONNX file, a built-in name (`coec models`), or `stereo` for the depth maps of the source. Default: "
+        "the network that a recorded window names, else the one that comes with coec.",
         metavar="MODEL",
         autocompletion=completing.depth_models,
     ),
@@ -49,7 +49,7 @@ Depth = Annotated[
 Objective = Annotated[
     str | None,
     typer.Option(
-        help="What is maximised: fused (edges and depth), mi (the paper), intensity.",
+        help="Objective to maximise: fused (edges and depth), mi (the paper) or intensity.",
         metavar="NAME",
         autocompletion=completing.objectives,
     ),
@@ -57,25 +57,27 @@ Objective = Annotated[
 CameraModel = Annotated[
     str | None,
     typer.Option(
-        help="Fit this model to the camera, and use it instead: double_sphere. Refused where it does not fit the lens.",
+        help="Fit this model to the camera and use it: double_sphere. Refused if it does not fit the lens.",
         metavar="NAME",
         autocompletion=completing.camera_models,
     ),
 ]
 Frames = Annotated[
-    int | None, typer.Option(help="Use at most so many camera frames, evenly chosen.", min=1, show_default="25")
+    int | None, typer.Option(help="Use at most this many camera frames, evenly chosen.", min=1, show_default="25")
 ]
 NoMotionCompensation = Annotated[
-    bool, typer.Option("--no-motion-compensation", help="Take the clouds as they were recorded.")
+    bool, typer.Option("--no-motion-compensation", help="Use the clouds as they were recorded.")
 ]
 
 # Options about a running service.
 ServiceConfig = Annotated[
     Path | None,
-    typer.Option("--config", help="Of the service: names the vehicle, the prefix and the router.", metavar="FILE"),
+    typer.Option(
+        "--config", help="Configuration of the service; names the vehicle, the prefix and the router.", metavar="FILE"
+    ),
 ]
 Vehicle = Annotated[str | None, typer.Option(help="Name of the vehicle.", show_default="vehicle")]
-Prefix = Annotated[str | None, typer.Option(help="What all keys begin with.", show_default="coec")]
+Prefix = Annotated[str | None, typer.Option(help="Prefix of all keys.", show_default="coec")]
 SessionFile = Annotated[
     Path | None,
     typer.Option("--zenoh", help="Zenoh configuration of the session (JSON5): endpoint, certificate.", metavar="FILE"),
@@ -83,7 +85,7 @@ SessionFile = Annotated[
 RouterTimeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the router.", min=0.01)]
 
 # Options about a simulated vehicle.
-Seed = Annotated[int, typer.Option(help="Same seed, same bytes.", min=0)]
+Seed = Annotated[int, typer.Option(help="Seed of the drive: the same seed gives the same bytes.", min=0)]
 SimCamera = Annotated[
     str,
     typer.Option(
@@ -93,7 +95,7 @@ SimCamera = Annotated[
 SimScene = Annotated[str, typer.Option(help="street, highway, garage or room.", metavar="SCENE")]
 SimSpeed = Annotated[
     float | None,
-    typer.Option("--speed", help="Mean speed, m/s; 0 stands. Without it, as usual in the scene.", min=0, max=45),
+    typer.Option("--speed", help="Mean speed, m/s; 0 stands still. Default: as usual in the scene.", min=0, max=45),
 ]
 Faults = Annotated[
     list[str] | None,

@@ -16,9 +16,9 @@ class Options:
     """The arguments of the command; None = not given."""
 
     hours: Annotated[float, typer.Option(help="Hours of driving with a right mount.", min=0.1)] = 100.0
-    steps: Annotated[int, typer.Option(help="Drawn steps of every size.", min=1)] = 20
+    steps: Annotated[int, typer.Option(help="Number of drawn steps of each size.", min=1)] = 20
     period_s: Annotated[float, typer.Option("--period", help="Seconds between checks.")] = 5.0
-    between_h: Annotated[float, typer.Option("--between", help="Hours between false alarms, as configured.")] = 100.0
+    between_h: Annotated[float, typer.Option("--between", help="Configured hours between false alarms.")] = 100.0
     output: Annotated[
         Path | None, typer.Option(help="Folder for alarms.json and delay.png.", metavar="DIR", show_default=False)
     ] = None
@@ -26,7 +26,7 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """How often the monitor accuses a mount that is right, and how soon it notices one that moved (drawn checks)."""
+    """Estimate from drawn checks how often the monitor accuses a right mount, and how soon it notices a moved one."""
     from coec.cli import alarms as work
 
     return work.run(options)

@@ -21,21 +21,28 @@ class Options:
             metavar="WINDOW...", help="Windows (.mcap), folders or patterns, as paths or URLs.", show_default=False
         ),
     ]
-    output: Annotated[Path, typer.Option(help="Folder of the tables (Parquet).", metavar="DIR", show_default=False)]
-    engine: Annotated[Literal["local", "ray"], typer.Option(help="Processes here, or of a Ray cluster.")] = "local"
+    output: Annotated[Path, typer.Option(help="Folder for the tables (Parquet).", metavar="DIR", show_default=False)]
+    engine: Annotated[
+        Literal["local", "ray"], typer.Option(help="local: processes on this machine; ray: a Ray cluster.")
+    ] = "local"
     with_config: Annotated[
         Path | None,
-        typer.Option("--with-config", help="Judge by this configuration, not by each window's own.", metavar="FILE"),
+        typer.Option("--with-config", help="Judge by this configuration instead of each window's own.", metavar="FILE"),
     ] = None
     rig: Annotated[Path | None, typer.Option(help="Judge with this rig (JSON).", metavar="FILE")] = None
     depth: Annotated[
         str | None,
-        typer.Option(help="Where the depth network is now, if not where it was; or another one.", metavar="MODEL"),
+        typer.Option(
+            help="Depth network to use, if it has moved since the window was recorded or should be another.",
+            metavar="MODEL",
+        ),
     ] = None
-    jobs: Annotated[int | None, typer.Option(help="Windows at a time.", min=1, show_default="the cores")] = None
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the batch that is in the folder.")] = False
-    deadline_s: Annotated[float, typer.Option("--deadline", help="For one window, s.", min=1.0)] = 600.0
-    memory_mib: Annotated[int, typer.Option("--memory", help="For one process, MiB.", min=256)] = 2048
+    jobs: Annotated[int | None, typer.Option(help="Number of windows at a time.", min=1, show_default="the cores")] = (
+        None
+    )
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the batch that is in the folder.")] = False
+    deadline_s: Annotated[float, typer.Option("--deadline", help="Time limit for one window, s.", min=1.0)] = 600.0
+    memory_mib: Annotated[int, typer.Option("--memory", help="Memory limit for one process, MiB.", min=256)] = 2048
     as_json: Json = False
 
 

@@ -35,7 +35,7 @@ class Options:
         Path | None,
         typer.Option(
             help="Write report.html, overlay_before.png, overlay_after.png, close_ups.png, residuals.png and "
-            "result.json; with --camera-model lens_residual.png, too, which is also left where the model is refused.",
+            "result.json; with --camera-model also lens_residual.png, even if the model is refused.",
             metavar="DIR",
         ),
     ] = None

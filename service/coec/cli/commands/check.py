@@ -17,7 +17,7 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """What a recording holds, and what it is good for: exit 1 if no calibration can come of it."""
+    """Show what a recording holds and what it is good for: exit 1 if it allows no calibration."""
     from coec.cli import check as work
 
     return work.run(options.source, depth=options.depth, as_json=options.as_json)

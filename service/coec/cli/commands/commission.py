@@ -18,19 +18,24 @@ class Options:
     sources: Annotated[list[str], typer.Argument(metavar="SOURCE...", help=SOURCE_HELP, show_default=False)]
     output: Annotated[
         Path,
-        typer.Option(help="Baseline to write, or to add the pair to; a page of it lies beside it.", metavar="FILE"),
+        typer.Option(
+            help="Baseline to write, or to add the pair to; a report page is written beside it.", metavar="FILE"
+        ),
     ] = Path("rig.json")
     depth: Depth = None
     objective: Objective = None
     dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None
     frames: Frames = None
     false_alarm_rate: Annotated[
-        float, typer.Option(help="Share of checks at a right extrinsic that may be flagged.", min=1e-4, max=0.2)
+        float, typer.Option(help="Fraction of checks at a right extrinsic that may be flagged.", min=1e-4, max=0.2)
     ] = 0.01
     sensors: Annotated[
         list[str] | None,
         typer.Option(
-            "--sensor", help="camera=SERIAL or lidar=SERIAL; repeatable.", metavar="STREAM=SERIAL", show_default=False
+            "--sensor",
+            help="Serial number of a sensor: camera=SERIAL or lidar=SERIAL; repeatable.",
+            metavar="STREAM=SERIAL",
+            show_default=False,
         ),
     ] = None
     as_json: Json = False

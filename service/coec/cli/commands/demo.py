@@ -22,15 +22,15 @@ class Options:
         bool,
         typer.Option(
             "--rig",
-            help="Of a vehicle with four cameras: a knocked LiDAR and a knocked camera, told apart. Pictures have 700 "
-            "pixels a side; what looks and tells is the service's, here without the service around it.",
+            help="Show a vehicle with four cameras instead: a running service tells a knocked LiDAR from a knocked "
+            "camera. Pictures have 700 pixels a side.",
         ),
     ] = False
     as_json: Json = False
 
 
 def run(options: Options) -> int:
-    """A simulated vehicle whose mount is knocked, and the service that notices and repairs it: no data, two minutes."""
+    """Knock the mount of a simulated vehicle and show the service notice and repair it: no data, two minutes."""
     if options.rig:
         from coec.cli.demo import rig
 

@@ -27,7 +27,9 @@ class Options:
     detection: Annotated[
         int,
         typer.Option(
-            help="Instead, print how well moved extrinsics are seen, over N splits of the pairs.", metavar="N", min=0
+            help="Instead, print how well moved extrinsics are detected, over N splits of the pairs.",
+            metavar="N",
+            min=0,
         ),
     ] = 0
     checks: Annotated[int, typer.Option(help="Checks per split and move, with --detection.", min=1)] = 10
@@ -39,8 +41,7 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Take one check of the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong,
-    or cannot be told from a wrong one."""
+    """Check the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong or undecided."""
     from coec.cli import diagnose as work
 
     return work.run(options)

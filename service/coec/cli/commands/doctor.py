@@ -24,10 +24,10 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Find what stands between this computer and a calibration: exit 1 if something must be done first.
+    """Find what keeps this computer from a calibration: exit 1 if something must be done first.
 
-    Looks at the configuration, disk, clock, certificates, router, its rules, streams and the running service, if there
-    is one; changes and disturbs nothing.
+    Looks at the configuration, disk, clock, certificates, router and its rules, streams, and the running service if
+    there is one; changes and disturbs nothing.
     """
     from coec.cli import doctor as work
 

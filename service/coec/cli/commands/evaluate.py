@@ -24,7 +24,7 @@ class Options:
     closure: Annotated[
         tuple[str, str] | None,
         typer.Option(
-            help="Instead of SOURCE: two cameras (or LiDARs) of one vehicle, each calibrated by itself; tells how "
+            help="Instead of SOURCE: two cameras (or LiDARs) of one vehicle, each calibrated by itself; reports how "
             "far their results miss the pose between them.",
             metavar="A B",
         ),
@@ -32,8 +32,8 @@ class Options:
     relative: Annotated[
         str | None,
         typer.Option(
-            help="With --closure: pose of sensor A in the frame of B, degrees and metres; without it, as the "
-            "calibrations of both recordings tell.",
+            help="With --closure: pose of sensor A in the frame of B, degrees and metres. Default: from the "
+            "calibrations of both recordings.",
             metavar="RX,RY,RZ,TX,TY,TZ",
         ),
     ] = None
@@ -45,7 +45,7 @@ class Options:
     objective: Annotated[
         str | None,
         typer.Option(
-            help="What is maximised: fused, mi, intensity as for calibrate, or all: the three side by side.",
+            help="Objective to maximise: fused, mi, intensity as for calibrate, or all three side by side: all.",
             metavar="NAME",
         ),
     ] = None
@@ -73,8 +73,8 @@ class Options:
     nees: Annotated[
         int,
         typer.Option(
-            help="Also hold errors against claimed standard deviations: N windows one after the other against the "
-            "truth (of a recording: its own calibration), and N splits into halves: normalised.png.",
+            help="Also compare errors with claimed standard deviations: N consecutive windows against the truth (for a "
+            "recording: its own calibration), and N splits into halves: normalised.png.",
             metavar="N",
             min=0,
         ),
@@ -82,7 +82,7 @@ class Options:
     detection: Annotated[
         int,
         typer.Option(
-            help="Also say how well moved extrinsics are seen, over N splits of the frames, as diagnose does.",
+            help="Also report how well moved extrinsics are detected, over N splits of the frames, as diagnose does.",
             metavar="N",
             min=0,
         ),
@@ -90,8 +90,8 @@ class Options:
     steps: Annotated[
         int,
         typer.Option(
-            help="Also lay knocks of several sizes into the recording, N of each at drawn times: is it refused, is the "
-            "time told?",
+            help="Also simulate knocks of several sizes in the recording, N of each at random times: is the window "
+            "refused, and is the time right?",
             metavar="N",
             min=0,
         ),

@@ -34,8 +34,10 @@ class Options:
             show_default=False,
         ),
     ]
-    parent: Annotated[str | None, typer.Option(help="Frame to write it in.", show_default="the LiDAR's")] = None
-    child: Annotated[str | None, typer.Option(help="Frame of the camera.", show_default="the camera's")] = None
+    parent: Annotated[str | None, typer.Option(help="Parent frame in the file.", show_default="the LiDAR's")] = None
+    child: Annotated[
+        str | None, typer.Option(help="Name of the camera's frame in the file.", show_default="the camera's")
+    ] = None
     parent_pose: Annotated[
         str | None,
         typer.Option(
@@ -44,19 +46,21 @@ class Options:
             show_default="the LiDAR is the parent",
         ),
     ] = None
-    pair: Annotated[str | None, typer.Option(help="Which pair, where there are several.")] = None
+    pair: Annotated[str | None, typer.Option(help="Pair, if there are several.")] = None
     config: Annotated[
         Path | None, typer.Option(help="Configuration of the daemon, for intrinsics and frames.", metavar="FILE")
     ] = None
     output: Annotated[
         Path | None,
         typer.Option(
-            help="Write there, at once or not at all; of a file that holds others, this entry alone is changed. "
-            "Otherwise it is printed.",
+            help="File to write, completely or not at all; in a file with several entries only this one changes. "
+            "Default: print it.",
             metavar="FILE",
         ),
     ] = None
-    force: Annotated[bool, typer.Option("--force", help="Also what is not accepted; the file says so.")] = False
+    force: Annotated[
+        bool, typer.Option("--force", help="Write a calibration that is not accepted, too; the file says so.")
+    ] = False
     as_json: Json = False
 
 

@@ -15,35 +15,37 @@ from coec.cli.options import Connect, Json, Prefix, SessionFile
 class Options:
     """The arguments of the command; None = not given."""
 
-    vehicle: Annotated[str, typer.Argument(metavar="VEHICLE", help="Its name.", show_default=False)]
+    vehicle: Annotated[str, typer.Argument(metavar="VEHICLE", help="Name of the vehicle.", show_default=False)]
     event: Annotated[
         str | None,
         typer.Argument(
             metavar="EVENT",
-            help="Id of a red event, or `latest`; without it, those that the vehicle keeps are listed.",
+            help="Id of a red event, or `latest`; without it, the vehicle's red events are listed.",
             show_default=False,
         ),
     ] = None
-    pair: Annotated[str | None, typer.Option(help="Of which pair events are looked for.", show_default="all")] = None
+    pair: Annotated[str | None, typer.Option(help="Pair whose events are searched.", show_default="all")] = None
     prefix: Prefix = None
     connect: Connect = None
     zenoh: SessionFile = None
-    output: Annotated[Path | None, typer.Option(help="Folder.", metavar="DIR", show_default="VEHICLE-EVENT")] = None
-    no_windows: Annotated[bool, typer.Option("--no-windows", help="Leave the recordings where they are.")] = False
+    output: Annotated[
+        Path | None, typer.Option(help="Folder to write.", metavar="DIR", show_default="VEHICLE-EVENT")
+    ] = None
+    no_windows: Annotated[bool, typer.Option("--no-windows", help="Do not download the recordings.")] = False
     timeout_s: Annotated[
-        float, typer.Option("--timeout", help="Seconds to wait, for the router and for each answer.", min=0.1)
+        float, typer.Option("--timeout", help="Seconds to wait for the router and for each answer.", min=0.1)
     ] = 10.0
     patience_s: Annotated[
         float,
-        typer.Option("--patience", help="Seconds without a piece of a window before it is given up.", min=0.1),
+        typer.Option("--patience", help="Seconds without a piece of a window before giving up.", min=0.1),
     ] = 120.0
     as_json: Json = False
 
 
 def run(options: Options) -> int:
-    """Bring a red event home: one folder with pictures, recordings, history, and a page that tells its story.
+    """Fetch a red event as one folder with pictures, recordings, history, and a page that tells its story.
 
-    What has come is kept: the same command goes on where the link broke.
+    What has arrived is kept: the same command resumes where the link broke.
     """
     from coec.cli import fetch as work
 

@@ -18,15 +18,17 @@ class Options:
     baselines: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RIG...", help="rig.json of commissioned vehicles of one model, a file each.", show_default=False
+            metavar="RIG...", help="rig.json files of commissioned vehicles of one model.", show_default=False
         ),
     ]
-    output: Annotated[Path, typer.Option(help="Baselines of the model to write.", metavar="FILE")] = Path("model.json")
+    output: Annotated[Path, typer.Option(help="File to write: the baselines of the model.", metavar="FILE")] = Path(
+        "model.json"
+    )
     as_json: Json = False
 
 
 def run(options: Options) -> int:
-    """Learn from commissioned vehicles what one of the same model starts from (`state.model`): bias, spread, limits."""
+    """Learn from commissioned vehicles what others of their model start from (`state.model`): bias, spread, limits."""
     from coec.cli import fleet_commission as work
 
     return work.run(options)

@@ -16,7 +16,7 @@ class Options:
     """The arguments of the command; None = not given."""
 
     results: Annotated[
-        Path, typer.Argument(metavar="RESULTS", help="Folder of `coec batch` (--output).", show_default=False)
+        Path, typer.Argument(metavar="RESULTS", help="Output folder of `coec batch`.", show_default=False)
     ]
     output: Annotated[Path | None, typer.Option(help="Write report.html and report.json.", metavar="DIR")] = None
     against: Annotated[
@@ -24,16 +24,14 @@ class Options:
     ] = None
     now: Annotated[
         Path | None,
-        typer.Option(help="What `coec watch --once --json` printed: count false alarms, too.", metavar="FILE"),
+        typer.Option(help="Output of `coec watch --once --json`: also count false alarms.", metavar="FILE"),
     ] = None
-    sql: Annotated[
-        bool, typer.Option("--sql", help="Print the columns, and queries that answer questions; nothing else.")
-    ] = False
+    sql: Annotated[bool, typer.Option("--sql", help="Print only the columns and useful queries.")] = False
     as_json: Json = False
 
 
 def run(options: Options) -> int:
-    """Drift of every pair, what is refused and why, and what an earlier batch decided otherwise."""
+    """Report drift of every pair, what is refused and why, and what an earlier batch decided otherwise."""
     from coec.cli import fleet as work
 
     return work.run(options)

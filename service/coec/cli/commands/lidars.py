@@ -19,15 +19,22 @@ class Options:
         typer.Argument(help="A ROS 2 bag, or sim:rig=four-fisheyes&seconds=60.", metavar="SOURCE", show_default=False),
     ]
     a: Annotated[
-        str, typer.Argument(help="Topic (of a rig, name) of the denser LiDAR.", metavar="A", show_default=False)
+        str,
+        typer.Argument(
+            help="Topic of the denser LiDAR; for a simulated rig, its name.", metavar="A", show_default=False
+        ),
     ]
-    b: Annotated[str, typer.Argument(help="Of the one whose pose in A is told.", metavar="B", show_default=False)]
-    pairs: Annotated[int, typer.Option(help="Pairs of sweeps, evenly over the recording.", min=1, max=200)] = 12
+    b: Annotated[
+        str, typer.Argument(help="The same of the LiDAR whose pose in A is estimated.", metavar="B", show_default=False)
+    ]
+    pairs: Annotated[
+        int, typer.Option(help="Number of pairs of sweeps, spread evenly over the recording.", min=1, max=200)
+    ] = 12
     as_json: Json = False
 
 
 def run(options: Options) -> int:
-    """Where one LiDAR of a vehicle sits from another, of the surfaces that both see: exit 1 if those are too few."""
+    """Find the pose of one LiDAR in another from the surfaces that both see: exit 1 if those are too few."""
     from coec.cli import lidars as work
 
     return work.run(options)

@@ -28,7 +28,7 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Hold a depth network against the LiDAR of a calibrated recording: exit 1 if it is of no use there."""
+    """Compare a depth network with the LiDAR of a calibrated recording: exit 1 if it is of no use there."""
     from coec.cli import assess as work
 
     return work.run(options)

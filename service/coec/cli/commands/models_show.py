@@ -20,7 +20,7 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Show the model card that a network file is run by."""
+    """Show the model card with which a network file is run."""
     from coec.cli import models as work
 
     return work.show(options.file, as_json=options.as_json)

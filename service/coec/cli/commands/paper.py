@@ -21,11 +21,11 @@ class Options:
     ] = Path("coec-paper")
     depth: Depth = None
     objective: Annotated[str, typer.Option(help="mi (the paper's) or fused.", metavar="NAME")] = "mi"
-    runs: Annotated[int, typer.Option(help="Solves per experiment.", min=1)] = 100
-    samples: Annotated[int, typer.Option(help="Samples of pairs for the failure metrics.", min=3)] = 100
+    runs: Annotated[int, typer.Option(help="Number of solves per experiment.", min=1)] = 100
+    samples: Annotated[int, typer.Option(help="Number of samples of pairs for the failure metrics.", min=3)] = 100
     frames: Frames = None
     slice_s: Annotated[
-        float | None, typer.Option(help="Cut the drive into windows of 25 pairs over so many seconds.", min=1.0)
+        float | None, typer.Option(help="Cut the drive into windows of 25 pairs, each over this many seconds.", min=1.0)
     ] = None
     as_json: Json = False
 

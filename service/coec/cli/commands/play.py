@@ -27,7 +27,9 @@ class Options:
     )
     pair: Annotated[
         str | None,
-        typer.Option(help="Pair of the configuration; without one, name in `sensors/<pair>/camera|lidar|ego`."),
+        typer.Option(
+            help="Pair of the configuration; without --config, the name in `sensors/<pair>/camera|lidar|ego`."
+        ),
     ] = None
     middleware: Annotated[
         Middleware | None,
@@ -39,17 +41,19 @@ class Options:
     ] = None
     topics: Annotated[
         list[str] | None,
-        typer.Option("--topics", help="Of ROS 2, only these; comma between, or several times.", show_default="all"),
+        typer.Option(
+            "--topics", help="Play only these ROS 2 topics; separated by commas, or repeatable.", show_default="all"
+        ),
     ] = None
     domain: Annotated[
         int | None,
         typer.Option(help="ROS_DOMAIN_ID (rmw_zenoh).", min=0, max=232, show_default="that of --config, else 0"),
     ] = None
-    rate: Annotated[float, typer.Option(help="Times recorded speed; 0 = without waiting.", min=0)] = 1.0
-    loop: Annotated[bool, typer.Option("--loop", help="Again and again; sensor time goes on.")] = False
+    rate: Annotated[float, typer.Option(help="Factor on the recorded speed; 0 = without waiting.", min=0)] = 1.0
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat for ever; sensor time goes on.")] = False
     connect: Connect = None
-    encoding: Annotated[Encoding, typer.Option(help="Of the frames.")] = "msgpack"
-    start_now: Annotated[bool, typer.Option("--start-now", help="Shift the stamps so that they begin now.")] = False
+    encoding: Annotated[Encoding, typer.Option(help="Encoding of the frames.")] = "msgpack"
+    start_now: Annotated[bool, typer.Option("--start-now", help="Shift all stamps so that the first is now.")] = False
     as_json: Json = False
 
 

@@ -53,7 +53,7 @@ class Options:
         ),
     ]
     pair: Annotated[
-        str | None, typer.Option(help="All pairs if not given; needed for commands if there are several.")
+        str | None, typer.Option(help="Pair to ask; default: all. A command needs it if there are several pairs.")
     ] = None
     config: ServiceConfig = None
     vehicle: Vehicle = None
@@ -62,7 +62,7 @@ class Options:
     zenoh: Annotated[
         Path | None,
         typer.Option(
-            help="Zenoh configuration (JSON5) to connect with; with its certificate commands are proven.",
+            help="Zenoh configuration (JSON5) to connect with; its certificate proves commands.",
             metavar="FILE",
         ),
     ] = None
@@ -75,29 +75,35 @@ class Options:
     ] = None
     to: Annotated[
         str | None,
-        typer.Option(help="Of command/rollback: window or sha256 of `query history` to serve again.", metavar="HASH"),
+        typer.Option(
+            help="For command/rollback: window or sha256 from `query history` to serve again.", metavar="HASH"
+        ),
     ] = None
-    release: Annotated[bool, typer.Option("--release", help="Of command/hold: let go of what is held.")] = False
+    release: Annotated[bool, typer.Option("--release", help="For command/hold: end the hold.")] = False
     reason: Annotated[
         str | None,
         typer.Option(
-            help="Of any command: why, for whoever asks later; stands in `query history`, of a hold in extrinsic and "
-            "health, too.",
+            help="For any command: the reason. It appears in `query history`, and for a hold also in extrinsic and "
+            "health.",
             metavar="TEXT",
         ),
     ] = None
     sensor: Annotated[
         str | None,
-        typer.Option(help="Of any command: for all pairs of this sensor of the rig.", metavar="NAME"),
+        typer.Option(help="For any command: apply it to all pairs of this sensor of the rig.", metavar="NAME"),
     ] = None
     payload: Annotated[
-        str | None, typer.Option(help="Payload of a command, JSON, instead of such options.", metavar="JSON")
+        str | None, typer.Option(help="Payload of a command as JSON, instead of these options.", metavar="JSON")
     ] = None
     timeout_s: Annotated[
-        float, typer.Option("--timeout", help="Seconds to wait, for the router and for the answer.", min=0.01)
+        float, typer.Option("--timeout", help="Seconds to wait for the router and for the answer.", min=0.01)
     ] = 5.0
     output: Annotated[
-        Path | None, typer.Option(help="Download windows/ID into this file and verify its sha256.", metavar="FILE")
+        Path | None,
+        typer.Option(
+            help="File to write: windows/ID with its sha256 verified, overlay, or a picture of evidence/ID.",
+            metavar="FILE",
+        ),
     ] = None
     as_json: Json = False
 
@@ -118,8 +124,8 @@ def _help() -> str:
             rows.append(f"{'':{width}}    --param {each.parameters}")
     listed = "\n".join(rows)
     several = (
-        "With --json and several pairs, one document: {pairs: {NAME: what the pair answered}}; with one pair, or with "
-        "--pair, its answer alone."
+        "With --json, several pairs give one document: {pairs: {NAME: answer of the pair}}; one pair, or --pair, gives "
+        "its answer alone."
     )
     return f"Ask a running service.\n\n\b\n{listed}\n\n{several}"
 

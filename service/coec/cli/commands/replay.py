@@ -17,13 +17,13 @@ class Options:
 
     window: Annotated[Path, typer.Argument(help="A recorded window with its result (.mcap).", show_default=False)]
     depth: Annotated[
-        str | None, typer.Option(help="Where the depth network is now, if not where it was.", metavar="MODEL")
+        str | None, typer.Option(help="Depth network, if it has moved since the window was recorded.", metavar="MODEL")
     ] = None
     as_json: Json = False
 
 
 def run(options: Options) -> int:
-    """Reach the recorded decision again from the file alone; exit 1 if a byte of it differs."""
+    """Reproduce the recorded decision from the file alone: exit 1 if a byte of it differs."""
     from coec.cli import replay as work
 
     return work.run(options.window, depth=options.depth, as_json=options.as_json)

@@ -19,7 +19,7 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Be the Zenoh router of the vehicle, with the access control of its configuration (deploy/router.json5)."""
+    """Run a Zenoh router for the vehicle, with the access control of its configuration (deploy/router.json5)."""
     from coec.cli import router as work
 
     return work.run(options.config)

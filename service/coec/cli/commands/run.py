@@ -17,9 +17,11 @@ class Options:
 
     config: ConfigFile
     embedded_router: Annotated[
-        bool, typer.Option("--embedded-router", help="Be the Zenoh router too, listening on `zenoh.listen`.")
+        bool, typer.Option("--embedded-router", help="Also be the Zenoh router, listening on `zenoh.listen`.")
     ] = False
-    state_dir: Annotated[Path | None, typer.Option(help="Instead of `state.directory`.", metavar="DIR")] = None
+    state_dir: Annotated[
+        Path | None, typer.Option(help="State directory, instead of `state.directory`.", metavar="DIR")
+    ] = None
 
 
 def run(options: Options) -> int:

@@ -17,14 +17,14 @@ class Options:
 
     lock: Annotated[
         Path | None,
-        typer.Option(help="The requirements.lock of the installation: hashes come from it.", metavar="FILE"),
+        typer.Option(help="requirements.lock of the installation, for hashes.", metavar="FILE"),
     ] = None
     output: Annotated[Path | None, typer.Option(help="Write coec.cdx.json and licences.md.", metavar="DIR")] = None
     as_json: Json = False
 
 
 def run(options: Options) -> int:
-    """Tell what this installation is made of: a table of licences, with --json a bill of materials (CycloneDX)."""
+    """List the packages of this installation: a table of licences, with --json a bill of materials (CycloneDX)."""
     from coec.cli import sbom as work
 
     return work.run(options.lock, options.output, as_json=options.as_json)

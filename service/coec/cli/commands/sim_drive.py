@@ -17,7 +17,7 @@ class Options:
 
     output: Annotated[
         Path,
-        typer.Option(help="ROS 2 MCAP to write; of a rig, the folder.", metavar="FILE.mcap|DIR", show_default=False),
+        typer.Option(help="ROS 2 MCAP to write; for a rig, the folder.", metavar="FILE.mcap|DIR", show_default=False),
     ]
     rig: Annotated[
         str | None,
@@ -36,12 +36,12 @@ class Options:
     scene: SimScene = "street"
     speed_mps: SimSpeed = None
     rolling_shutter_s: Annotated[
-        float, typer.Option("--rolling-shutter", help="Seconds from the first row to the last.", min=0, max=0.1)
+        float, typer.Option("--rolling-shutter", help="Seconds from the first image row to the last.", min=0, max=0.1)
     ] = 0.0
     intrinsics_off: Annotated[
         str | None,
         typer.Option(
-            help="What the rig is told of the focal length and the principal point is wrong by so many percent.",
+            help="Error of the configured focal length and principal point, percent.",
             metavar="FOCAL[,CX,CY]",
         ),
     ] = None
@@ -51,7 +51,7 @@ class Options:
     workshop: Annotated[
         str | None,
         typer.Option(
-            help="Error of the nominal calibration, degrees and metres; of a rig SENSOR:RX,RY,RZ;...",
+            help="Error of the nominal calibration, degrees and metres; for a rig SENSOR:RX,RY,RZ;...",
             metavar="RX,RY,RZ[,TX,TY,TZ]",
         ),
     ] = None
@@ -59,10 +59,10 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Write a drive as a ROS 2 bag; the truth lies beside the sensors on /ground_truth/tf.
+    """Write a drive as a ROS 2 bag; the truth is on /ground_truth/tf, beside the sensors.
 
-    A bag has no place for a mask: what reads it back finds the vehicle's own body and the rim of the lens from the
-    frames themselves, given five or more in motion.
+    A bag has no place for a mask: its readers find the vehicle's own body and the rim of the lens from the frames, if
+    at least five are in motion.
     """
     if options.rig is not None:
         from coec.cli import sim_rig

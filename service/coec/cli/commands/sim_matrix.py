@@ -23,7 +23,7 @@ class Options:
         int,
         typer.Option(
             "--round",
-            help="The same kinds of drives, each round with seeds of its own.",
+            help="Round of the matrix: each has the same kinds of drives, with other seeds.",
             min=1,
             max=10_000,
             metavar="N",
@@ -32,14 +32,14 @@ class Options:
     only: Annotated[
         str | None,
         typer.Option(
-            help="Drives whose name fits: scene_lens_lidar_light_fault_sN with * and ?, as '*_night_*' or '*_s1'.",
+            help="Only drives whose name matches; names are scene_lens_lidar_light_fault_sN: '*_night_*', '*_s1'.",
             metavar="PATTERN",
         ),
     ] = None
     dof: Annotated[
         DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.", show_default="both")
     ] = None
-    frames: Annotated[int, typer.Option(help="Pairs of a window; a drive has two windows.", min=2, max=100)] = 10
+    frames: Annotated[int, typer.Option(help="Pairs per window; a drive has two windows.", min=2, max=100)] = 10
     depth: Depth = None
     jobs: Jobs = None
     as_json: Json = False
@@ -48,8 +48,8 @@ class Options:
 def run(options: Options) -> int:
     """Try estimator and monitor on simulated drives: scenes, lenses, LiDARs, light, faults.
 
-    A drive takes about half a minute of one core, the whole matrix most of an hour. What is done is kept in DIR: call
-    again to go on. A DIR holds results of one state of the code; take another after a change.
+    A drive takes about half a minute of one core, the whole matrix most of an hour. Finished drives are kept in DIR:
+    call again to go on. A DIR holds results of one state of the code; take another after a change.
     """
     from coec.cli import sim_matrix as work
 

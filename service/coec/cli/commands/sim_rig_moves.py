@@ -14,16 +14,16 @@ from coec.cli.options import Json
 class Options:
     """The arguments of the command; None = not given."""
 
-    drives: Annotated[int, typer.Option(help="Drives of each fault.", min=1, max=10_000)] = 30
-    rigs: Annotated[int, typer.Option(help="Rigs whose windows are combined.", min=1, max=10_000)] = 50
+    drives: Annotated[int, typer.Option(help="Number of drives for each fault.", min=1, max=10_000)] = 30
+    rigs: Annotated[int, typer.Option(help="Number of rigs whose windows are combined.", min=1, max=10_000)] = 50
     as_json: Json = False
 
 
 def run(options: Options) -> int:
-    """Tell how well the sensors of a rig that moved are named, and no others, on drawn evidence of all its pairs.
+    """Measure on drawn evidence of all pairs how well the sensors of a rig that moved are named, and no others.
 
-    Nothing is rendered: checks and windows are drawn with all that is wrong with real ones. A drive takes one to three
-    seconds of a core.
+    Nothing is rendered: checks and windows are drawn at random, with all the errors of real ones. A drive takes one to
+    three seconds of a core.
     """
     from coec.cli import sim_rig_moves as work
 

@@ -17,26 +17,29 @@ class Options:
     """The arguments of the command; None = not given."""
 
     source: Annotated[
-        str | None, typer.Argument(metavar="SOURCE", help=f"Play this: {SOURCE_HELP}", show_default=False)
+        str | None, typer.Argument(metavar="SOURCE", help=f"Recording to play: {SOURCE_HELP}", show_default=False)
     ] = None
     config: Annotated[
         Path | None,
-        typer.Option(help="Instead, watch the running vehicle of this configuration.", metavar="FILE"),
+        typer.Option(help="Instead, show the running vehicle of this configuration.", metavar="FILE"),
     ] = None
-    pair: Annotated[str | None, typer.Option(help="Which pair of the configuration, where there are several.")] = None
+    pair: Annotated[str | None, typer.Option(help="Pair of the configuration, if there are several.")] = None
     connect: Connect = None
     zenoh: SessionFile = None
     timeout_s: RouterTimeout = 5.0
     result: Annotated[
-        Path | None, typer.Option(help="Of `calibrate --json`: drawn as the candidate.", metavar="FILE")
+        Path | None, typer.Option(help="Output of `calibrate --json`, drawn as the candidate.", metavar="FILE")
     ] = None
-    rate: Annotated[float, typer.Option(help="Times recorded speed.", min=0.01, max=100)] = 1.0
-    repeat: Annotated[bool, typer.Option("--repeat", help="Again and again; sensor time goes on.")] = False
+    rate: Annotated[float, typer.Option(help="Factor on the recorded speed.", min=0.01, max=100)] = 1.0
+    repeat: Annotated[bool, typer.Option("--repeat", help="Repeat for ever; sensor time goes on.")] = False
     listen: Annotated[
-        str, typer.Option(help="Where viewers are served; port 0 is any that is free.", metavar="HOST:PORT")
+        str, typer.Option(help="Address for viewers; port 0 takes any free port.", metavar="HOST:PORT")
     ] = "127.0.0.1:8765"
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Also where other computers get in: without a certificate they see all.")
+        bool,
+        typer.Option(
+            "--insecure", help="Also listen where other computers get in; they need no certificate and see everything."
+        ),
     ] = False
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the address and what is served as one JSON document.")
@@ -47,7 +50,7 @@ def run(options: Options) -> int:
     """Show a vehicle or a recording live in Foxglove or Lichtblick: image with points, cloud, frames, health.
 
     Needs the optional extra `foxglove`. Gives no command, and asks the vehicle for frames only while somebody looks.
-    Whoever reaches the address sees all, and so does every web page that a browser of this computer has open.
+    Whoever reaches the address sees everything, and so does every web page open in a browser of this computer.
     """
     from coec.cli import query
     from coec.cli import view as work
