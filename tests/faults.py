@@ -23,9 +23,9 @@ HELD = "held"
 NOT_RUN = "not run yet"
 HEAD = f"""# Faults and attacks
 
-What `coec` promises when something goes wrong, and the test that holds it to that. Written by the tests themselves
-(`pytest -m '' --faults docs/faults.md`): a row is a mark on a test, its figure what that test last measured; `{HELD}`
-where there is nothing to measure but that it passed.
+What `coec` promises when something goes wrong, and the test that holds it to the promise. The tests write this table
+(`pytest -m '' --faults docs/faults.md`). Each row is a mark on a test. The figure is what that test last measured, or
+`{HELD}` for a test that only passes or fails.
 
 | fault or attack | promise | test | last figure |
 |---|---|---|---|

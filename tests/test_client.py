@@ -98,7 +98,9 @@ def test_a_command_is_acknowledged_with_its_arguments(endpoint: str) -> None:
     asyncio.run(asked())
 
 
-@pytest.mark.fault("a program asks for what there is not", "the service's code and words, as an error of coec")
+@pytest.mark.fault(
+    "a program asks for something that does not exist", "the service's code and words, as an error of coec"
+)
 def test_an_error_reply_is_an_error_with_its_code(endpoint: str) -> None:
     async def asked() -> None:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
@@ -227,7 +229,9 @@ def test_changes_begin_with_what_is_so_now_and_go_on(endpoint: str, bus: Bus) ->
     asyncio.run(asked())
 
 
-@pytest.mark.fault("a service ends while a program listens", "it is told, the loop goes on, and hears the next service")
+@pytest.mark.fault(
+    "a service ends while a program listens", "the program is told, its loop goes on, and it hears the next service"
+)
 def test_a_service_that_ends_is_told_and_heard_again(router: Router, tmp_path: Path) -> None:
     config = ZenohConfig(connect=(router.endpoint,))
 
@@ -265,7 +269,9 @@ def test_a_service_that_ends_is_told_and_heard_again(router: Router, tmp_path: P
     asyncio.run(asked())
 
 
-@pytest.mark.fault("a program takes changes slower than they come", "the oldest go, counted; the newest is there")
+@pytest.mark.fault(
+    "a program takes changes slower than they come", "the oldest are dropped and counted; the newest is there"
+)
 def test_a_slow_listener_loses_the_oldest_and_is_told(
     endpoint: str, bus: Bus, monkeypatch: pytest.MonkeyPatch, record_property: Callable[[str, object], None]
 ) -> None:

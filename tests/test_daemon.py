@@ -218,7 +218,7 @@ def has_ended(pid: int) -> bool:
 
 
 @pytest.mark.fault(
-    "a thread of the service dies", "the process ends with a code of its own after health, and ROS, were told why"
+    "a thread of the service dies", "the process ends with its own exit code after telling health, and ROS, why"
 )
 def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     tmp_path: Path, drive: Drive, router: Router
@@ -250,7 +250,7 @@ def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     assert "broken" in told["reason thread_died"]
 
 
-@pytest.mark.fault("steps of the end raise", "the others are done all the same")
+@pytest.mark.fault("steps of the shutdown raise", "the other steps are still done")
 def test_the_end_goes_on_after_steps_that_raise(tmp_path: Path, drive: Drive, router: Router) -> None:
     config = configured(tmp_path, drive, router)
     with service(config, router, warm=False, program=STUBBORN) as running:

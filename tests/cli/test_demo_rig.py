@@ -176,7 +176,7 @@ def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeyp
     assert all(Path(path).stat().st_size > 0 for path in outcome.document["files"])
 
 
-@pytest.mark.fault("a service that looks at nothing", "said in a sentence, and no page is written")
+@pytest.mark.fault("a service that checks nothing", "said in a sentence, and no page is written")
 def test_a_service_that_tells_nothing_is_an_error(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Mute:
         def __init__(self, *_: object) -> None:
@@ -200,7 +200,9 @@ def test_a_service_that_tells_nothing_is_an_error(coec: Coec, tmp_path: Path, mo
 
 
 @pytest.mark.slow
-@pytest.mark.fault("a LiDAR, and on another drive a camera, is knocked by 1°", "it alone is named, and within a minute")
+@pytest.mark.fault(
+    "a LiDAR, and on another drive a camera, is knocked by 1°", "that sensor alone is named, within a minute"
+)
 def test_a_knocked_lidar_and_a_knocked_camera_are_told_apart(
     coec: Coec, tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:

@@ -259,7 +259,7 @@ def test_no_router_is_told_and_fails(coec: Coec, tmp_path: Path) -> None:
     assert "session" not in [one["check"] for one in report["findings"]], "there is nobody to talk to"
 
 
-@pytest.mark.fault("another program at the port of the router", "the doctor tells it from no router")
+@pytest.mark.fault("another program at the port of the router", "the doctor distinguishes this from a missing router")
 def test_a_port_at_which_something_else_answers_is_told_from_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -400,7 +400,10 @@ def test_a_foreign_certificate_is_told_from_no_router(authority: Path, guarded: 
 
 
 @pytest.mark.usefixtures("soon")
-@pytest.mark.fault("rules of the router that refuse the service", "the doctor tells them from no router and no TLS")
+@pytest.mark.fault(
+    "rules of the router that refuse the service",
+    "the doctor distinguishes this from a missing router and from missing TLS",
+)
 def test_rules_that_refuse_are_told_from_no_router(authority: Path, guarded: int, tmp_path: Path) -> None:
     found = found_with(authority, guarded, "vehicle", tmp_path, vehicle="other")
     assert [found[check].level for check in ("router", "tls", "session", "rules")] == ["ok", "ok", "ok", "fail"]

@@ -287,7 +287,7 @@ def test_who_is_told_to_wait_waits(router: Router, far: Keys, tmp_path: Path) ->
     assert refused.value.reply_code == "uplink_busy"
 
 
-@pytest.mark.fault("bytes of a window that are not those promised, or more, or none", "no file has its name")
+@pytest.mark.fault("bytes of a window that are wrong, too many, or missing", "the file does not get its name")
 @pytest.mark.parametrize(
     ("answer", "told", "code"),
     [

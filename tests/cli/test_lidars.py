@@ -20,7 +20,7 @@ needs_search = pytest.mark.skipif(not HAS_SEARCH, reason="needs the optional ext
 
 
 @needs_search
-@pytest.mark.fault("a LiDAR is knocked by 1°", "the edge to another LiDAR tells it, with its size")
+@pytest.mark.fault("a LiDAR is knocked by 1°", "the edge to another LiDAR shows it, with its size")
 def test_a_knocked_lidar_is_told_by_its_size(coec: Coec, record_property: Callable[[str, object], None]) -> None:
     outcome = coec("lidars", f"{RIG}&faults=near_left:step:0:rz=1", "roof", "near_left", "--pairs", 4, "--json")
     assert outcome.status == 0, outcome.err

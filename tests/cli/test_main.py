@@ -155,7 +155,7 @@ def test_the_script_of_a_shell_asks_this_program(coec: Coec, monkeypatch: pytest
     assert f"_COEC_COMPLETE=complete_{shell}" in shown.out
 
 
-@pytest.mark.fault("a full disk under standard output", "one line says so; it is no fault of ours")
+@pytest.mark.fault("a full disk under standard output", "one line says so; it does not count as an internal error")
 def test_a_full_disk_under_the_output_is_a_line_and_1() -> None:
     with open("/dev/full", "wb") as full:  # noqa: PTH123  a device, and no file
         done = subprocess.run(

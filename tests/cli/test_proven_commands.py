@@ -16,7 +16,7 @@ from ports import free_port
 from vehicles import KEYS, LIMITS, serving
 
 
-@pytest.mark.fault("`coec query command/...` of somebody who may not", "it says `not_allowed`, and exits with 1")
+@pytest.mark.fault("`coec query command/...` by somebody without permission", "it says `not_allowed`, and exits with 1")
 def test_the_command_line_proves_who_it_is(authority: TestAuthority, coec: Coec, tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = ZenohConfig(embedded_router=True, listen=(endpoint,))

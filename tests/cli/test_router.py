@@ -63,8 +63,8 @@ def test_a_file_that_is_no_routers_is_refused(coec: Coec, tmp_path: Path) -> Non
 
 
 @pytest.mark.fault(
-    "a router's file whose door is open to everybody",
-    "`coec router` does not start, and names the door",
+    "a router's file with a listener that is open to everybody",
+    "`coec router` does not start, and names the listener",
 )
 def test_a_door_for_everybody_is_refused(coec: Coec, tmp_path: Path) -> None:
     outcome = coec("router", "--config", written(tmp_path, listen=listening("tcp/0.0.0.0:7447")))

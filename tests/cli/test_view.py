@@ -235,7 +235,7 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
 
 
 @pytest.mark.fault(
-    "rubbish under the service's keys and the sensors'", "it is counted by cause; what was served is shown on"
+    "rubbish under the service's keys and the sensors'", "it is counted by cause; what was served stays on the screen"
 )
 def test_rubbish_is_counted(
     viewing: Callable[..., Outcome], router: Router, tmp_path: Path, record_property: Record

@@ -77,7 +77,7 @@ def send(router: Router, number: int) -> None:
     router.session.put("in/lidar", encode_lidar(replace(PAIR.lidar, stamp_ns=stamp_ns)), encoding=MSGPACK)
 
 
-@pytest.mark.fault("more frames than can be shown", "the newest are; the others are passed over, and counted")
+@pytest.mark.fault("more frames than can be shown", "the newest are shown; the others are passed over and counted")
 def test_the_newest_pair_is_shown_and_older_ones_are_passed_over(
     router: Router, streams: Streams, record_property: Record
 ) -> None:

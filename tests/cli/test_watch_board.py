@@ -207,7 +207,7 @@ def test_keys_are_read_as_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> N
                 assert poll(5.0) == key
 
 
-@pytest.mark.fault("a picture from a vehicle that is none", "refused, the board goes on")
+@pytest.mark.fault("an invalid picture from a vehicle", "refused, the board goes on")
 def test_a_picture_that_is_none_is_refused() -> None:
     with pytest.raises(DecodeError):
         half_blocks.drawn(b"\xff\xd8\xff not a picture", 80, 24)

@@ -140,7 +140,7 @@ def test_replay_without_a_result_says_so(coec: Coec, tmp_path: Path) -> None:
     assert "holds no result" in outcome.err
 
 
-@pytest.mark.fault("a damaged window is replayed", "it is said where it is damaged")
+@pytest.mark.fault("a damaged window is replayed", "the message says where it is damaged")
 def test_replay_of_a_damaged_window(coec: Coec, recorded: Path, tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     path.write_bytes(recorded.read_bytes()[:-100])

@@ -102,7 +102,7 @@ def test_no_door_of_the_fleet_is_open_to_everybody() -> None:
     assert unguarded(zenoh.Config.from_file(FLEET_RULES)) == ()
 
 
-@pytest.mark.fault("the vehicle is switched off", "its last word is told all the same, as what it is")
+@pytest.mark.fault("the vehicle is switched off", "its last word is still available, marked as such")
 def test_a_vehicle_that_was_heard_once_can_be_asked_about_when_it_has_gone(fleet: Fleet, tmp_path: Path) -> None:
     with connected_by(fleet.way("viewer"), PATIENCE_S) as viewer:
         config = ZenohConfig(connect=(fleet.of_vehicle,))
@@ -121,7 +121,7 @@ def vehicle_answer() -> Answer:
     return Answer(packed(a_word(state="suspect")), MSGPACK)
 
 
-@pytest.mark.fault("a vehicle that speaks for another", "the fleet's router lets it not through")
+@pytest.mark.fault("a vehicle that speaks for another", "the fleet's router does not let it through")
 def test_a_vehicle_speaks_for_itself_alone(fleet: Fleet) -> None:
     other = Keys("coec", "other").last(PAIR)
     mark = Keys("coec", "vehicle").last("mark")
@@ -133,7 +133,7 @@ def test_a_vehicle_speaks_for_itself_alone(fleet: Fleet) -> None:
 
 
 @pytest.mark.fault(
-    "a command that comes over the fleet's router", "the vehicle's router lets it not through, as shipped"
+    "a command that comes over the fleet's router", "the vehicle's router, as shipped, does not let it through"
 )
 def test_nobody_commands_over_the_fleet_unless_he_is_let(fleet: Fleet, tmp_path: Path) -> None:
     config = ZenohConfig(connect=(fleet.of_vehicle,))

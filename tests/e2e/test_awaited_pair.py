@@ -77,7 +77,7 @@ def refused(running: Service, key: str) -> tuple[str, str]:
 
 
 @pytest.mark.fault(
-    "/tf_static says something else after the pair was built", "told as nominal_changed; what is served stays"
+    "/tf_static says something else after the pair was built", "`nominal_changed` is reported; what is served stays"
 )
 def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, driver: zenoh.Session) -> None:
     rig = drive.recording.rig

@@ -98,8 +98,8 @@ def held(running: Service, *, release: bool) -> tuple[Any, float]:
 
 @pytest.mark.fault(
     "a disk that is full, read-only or gives 100 kB/s for 16 s",
-    "health names it within 5 s; commands are answered within 100 ms and say that they are not on the disk; the beat "
-    "never stops; afterwards all is written, windows are recorded again, and a kill then loses nothing",
+    "health names it within 5 s; commands are answered within 100 ms and say that they are not on the disk; the "
+    "heartbeat never stops; afterwards all is written, windows are recorded again, and a kill then loses nothing",
 )
 @pytest.mark.parametrize(
     ("state", "points"),
@@ -158,8 +158,8 @@ def test_a_broken_disk_is_named_keeps_nobody_waiting_and_loses_nothing(
 
 
 @pytest.mark.fault(
-    "5,000 windows of which nothing is known, 3 GB, on a disk that gives 50 MB/s",
-    "the first list is there within 1 s, and the beat never later than 2 s",
+    "5,000 windows, 3 GB, of which nothing is known, on a disk that gives 50 MB/s",
+    "the first list is there within 1 s, and heartbeats are never more than 2 s apart",
 )
 def test_thousands_of_windows_are_listed_at_once(
     tmp_path: Path, router: Router, monkeypatch: pytest.MonkeyPatch, record_property: Any

@@ -71,7 +71,7 @@ def page(port: int, path: str) -> tuple[int, str]:
 
 @pytest.mark.fault(
     "no router when the service starts",
-    "the log says where it is looked for; when it comes the service answers, and nothing is left of the complaint",
+    "the log says where it is looked for; when a router comes the service answers, and the complaint is withdrawn",
 )
 def test_no_router_then_one_then_other_settings(tmp_path: Path) -> None:
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()

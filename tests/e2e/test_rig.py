@@ -196,7 +196,9 @@ def corrected(running: Service, pair: str) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.fault("nothing, for a drive of four fisheyes and a LiDAR", "no sensor is said to have moved, no alarm")
+@pytest.mark.fault(
+    "nothing happens on a drive of four fisheyes and a LiDAR", "no sensor is said to have moved, no alarm"
+)
 def test_a_right_rig_raises_no_alarm(
     tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
 ) -> None:
@@ -279,7 +281,8 @@ def test_a_knocked_camera_is_named_and_put_right_and_no_other(
 
 @pytest.mark.slow
 @pytest.mark.fault(
-    "nothing, for a drive of two fisheyes and three LiDARs", "LiDARs are measured; no sensor is said to have moved"
+    "nothing happens on a drive of two fisheyes and three LiDARs",
+    "LiDARs are measured; no sensor is said to have moved",
 )
 def test_three_lidars_that_see_each_other_are_measured_and_nobody_is_named(
     tmp_path: Path, router: Router, record_property: Callable[[str, object], None]

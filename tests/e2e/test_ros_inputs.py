@@ -115,7 +115,8 @@ def test_two_drivers_on_one_topic_are_a_trouble_with_their_names(
 
 
 @pytest.mark.fault(
-    "a driver of ROS that babbles: other types, attachments cut short, numbers that jump", "each counted by its cause"
+    "a ROS driver that sends rubbish: other types, attachments cut short, numbers that jump",
+    "each counted by its cause",
 )
 def test_what_babbles_is_counted_by_its_cause(stack: ExitStack, running: Service, router: Router, drive: Drive) -> None:
     images, before, sent = pictures(drive), losses(running), running.counters()["camera"]["received"]

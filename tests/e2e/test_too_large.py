@@ -41,7 +41,8 @@ def router(endpoint: str, max_bytes: int) -> Iterator[None]:
 
 @pytest.mark.fault(
     "a message of 100 MB, which Zenoh drops and does not log, whether in the router or in the service",
-    "of a numbered stream it is a gap; of one without numbers its partner tells: an unpaired sweep, a picture more",
+    "a numbered stream shows a gap; a stream without numbers is noticed by its partner: an unpaired "
+    "sweep, or a surplus picture",
 )
 @pytest.mark.parametrize(
     ("limit", "stream", "numbered", "counted"),

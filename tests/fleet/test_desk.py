@@ -76,7 +76,7 @@ def test_another_rig_decides_for_its_pair(window: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"rig": 3}', "[" * 100_000, "9" * 5000])
-@pytest.mark.fault("a rig in a file that is none", "it is said what is wrong with it")
+@pytest.mark.fault("an invalid rig in a file", "the message says what is wrong with it")
 def test_a_rig_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "rig.json"
     path.write_text(text)
@@ -84,7 +84,9 @@ def test_a_rig_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
         terms_of(None, path, None)
 
 
-@pytest.mark.fault("a window of a batch is not what is stated of it, not there, or damaged", "a row with its error")
+@pytest.mark.fault(
+    "a window of a batch that does not match its stated hash, is missing, or is damaged", "a row with its error"
+)
 def test_what_cannot_be_judged_is_a_row(window: Path, tmp_path: Path) -> None:
     whole = window.read_bytes()
     cut, flipped = tmp_path / "cut.mcap", tmp_path / "flipped.mcap"

@@ -66,7 +66,7 @@ def test_a_vehicle_of_any_name_has_a_folder_within_the_folder(tmp_path: Path) ->
     assert {name for (name,) in asked(tmp_path, "SELECT vehicle FROM TABLE")} >= {"../../etc", "a/b", "x=1", "Ä ö"}
 
 
-@pytest.mark.fault("a batch is stopped at any point", "no finished row is lost, none is there twice")
+@pytest.mark.fault("a batch is stopped at any point", "no finished row is lost, and none is written twice")
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 9])
 def test_a_batch_that_ends_anywhere_is_gone_on_with(tmp_path: Path, count: int) -> None:
     first = Results(tmp_path, Terms(), resume=False)
@@ -132,7 +132,9 @@ def test_a_folder_with_a_batch_is_gone_on_with_only_if_asked_and_on_the_same_ter
         Results(tmp_path, Terms(depth="street"), resume=True)
 
 
-@pytest.mark.fault("tables of a batch are damaged, its folder cannot be written", "it is said which file, what to do")
+@pytest.mark.fault(
+    "tables of a batch are damaged, its folder cannot be written", "the message says which file, and what to do"
+)
 def test_what_cannot_be_read_or_written_is_told(tmp_path: Path) -> None:
     batch = Results(tmp_path / "batch", Terms(), resume=False)
     for row in rows(4):

@@ -23,7 +23,7 @@ def test_a_figure_without_a_limit_keeps_none(
     assert (text, mark.plain) == shown
 
 
-@pytest.mark.fault("a text from a vehicle that a terminal would obey", "it is shown with marks in its place")
+@pytest.mark.fault("a text from a vehicle with control sequences for a terminal", "it is shown with marks in its place")
 def test_what_came_over_a_network_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
     evil = "a\x1b[2J\x07b [red]c[/red]\r"
     console.show(evil)

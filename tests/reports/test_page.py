@@ -96,7 +96,7 @@ def test_small_pictures_stay_as_they_are_and_large_ones_are_made_to_fit() -> Non
     assert shown.shape[1] * 1200 == pytest.approx(shown.shape[0] * 1600, rel=0.01)
 
 
-@pytest.mark.fault("a picture that is none, or too many of them", "the page is refused, never half of it written")
+@pytest.mark.fault("a picture that is invalid, or too many pictures", "the page is refused, and never half written")
 def test_what_is_no_picture_is_refused() -> None:
     with pytest.raises(DecodeError):
         embedded([b"<svg onload=alert(1)>"])

@@ -89,7 +89,7 @@ def test_pairs_are_recorded_between_those_of_a_window_a_second_apart(bench: Benc
         assert len(between_ns) > 2 * len(stamps_ns)
 
 
-@pytest.mark.fault("a worker that is slow", "it changes no decision")
+@pytest.mark.fault("a worker that is slow", "no decision changes")
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_worker_that_takes_its_time_changes_no_decision(bench: Bench, tmp_path: Path, seed: int) -> None:
     slow = Bench(tmp_path / "slow", worker=SlowWorker)
@@ -131,7 +131,7 @@ def test_a_stream_that_has_waited_for_too_long_goes_on_and_says_so(tmp_path: Pat
     assert bench.losses["monitor", "not_awaited"] == waiting
 
 
-@pytest.mark.fault("a restart in the middle of a drive", "it changes no decision")
+@pytest.mark.fault("a restart in the middle of a drive", "no decision changes")
 @pytest.mark.parametrize("restart_s", [3, 57, 100, 104, 109, 112, 116, 125, 160])
 def test_a_restart_in_the_middle_changes_no_decision(bench: Bench, tmp_path: Path, restart_s: int) -> None:
     bench.drive(BEGIN_S, END_S)
@@ -318,7 +318,7 @@ def test_every_check_can_be_read_afterwards(bench: Bench) -> None:
     assert bench.answers.history(0, 2**63 - 1, 1000).checks == history.checks
 
 
-@pytest.mark.fault("a monitor that cannot look", "it is told, and nothing stays green")
+@pytest.mark.fault("a monitor that cannot look", "this is reported, and nothing stays green")
 def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: Bench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
     assert bench.answers.health_reply.state == "healthy"

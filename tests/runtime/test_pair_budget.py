@@ -19,7 +19,9 @@ def driven(folder: Path, cores: float, cost_s: dict[Kind, float], end_s: int = S
     return bench
 
 
-@pytest.mark.fault("a budget that does not suffice", "the checks that are made are some of those of a larger one")
+@pytest.mark.fault(
+    "a budget that does not suffice", "the checks that are made are a subset of those of a larger budget"
+)
 def test_a_small_budget_makes_some_of_the_checks_of_a_large_one(tmp_path: Path) -> None:
     small = driven(tmp_path / "small", 0.1, {Kind.CHECK: 1.0}).worker.checked
     large = driven(tmp_path / "large", 10.0, {Kind.CHECK: 1.0}).worker.checked

@@ -69,7 +69,7 @@ def test_while_the_vehicle_stands_it_is_checked_and_nothing_adds_up(bench: Bench
     assert "miscalibrated" in [entry.code for entry in bench.entries("state")]
 
 
-@pytest.mark.fault("windows that come to nothing", "three in a row are said in health")
+@pytest.mark.fault("windows that come to nothing", "after three in a row, health says so")
 def test_a_window_that_is_lost_is_answered_for_and_three_in_a_row_are_said(bench: Bench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 45)
     bench.recorder.loses = True

@@ -166,7 +166,7 @@ def test_everything_once_and_every_message_is_accounted_for(tmp_path: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.fault(
-    "half an hour of every fault at full rate (three minutes in the gate)",
+    "every fault at full rate for half an hour (three minutes in the gate)",
     "every message is accounted for; memory (RSS) at the end within 30 MiB of minute five",
 )
 def test_a_long_soak(tmp_path: Path, record_property: Any) -> None:

@@ -87,7 +87,7 @@ def test_doubles_that_no_float_holds_go_with_their_point(tmp_path: Path) -> None
     assert load_cloud(0, "lidar", path).xyz_m.tolist() == [[1, 2, 3]]
 
 
-@pytest.mark.fault("a PCD with fields `_1 _`", "it is read")
+@pytest.mark.fault("a PCD with padding fields `_1 _`", "it is read")
 @pytest.mark.parametrize(
     "fields", ["_1 _ x y z", "_ _0 x y z", "_ _ x y z", "_1 _2 x y z", "x x x y z", "_0 _ x _ y z"]
 )

@@ -68,7 +68,9 @@ def test_network_is_opened_by_the_name_of_its_card(tmp_path: Path, monkeypatch: 
     assert model.infer(_frame(5)).values.shape == (256, 256)
 
 
-@pytest.mark.fault("a user without a home, as a service manager makes them up", "networks of the package are opened")
+@pytest.mark.fault(
+    "a user without a home, as a service manager makes them up", "networks of the package can still be opened"
+)
 def test_a_user_without_a_home_has_the_networks_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     def nobody(uid: int) -> None:
         raise KeyError(f"getpwuid(): uid not found: {uid}")

@@ -190,7 +190,7 @@ def test_broken_image_is_a_decode_error(tmp_path: Path) -> None:
         _open(tmp_path, first_channel()).infer(CameraFrame(0, "camera", image))
 
 
-@pytest.mark.fault("an image of absurd aspect that makes the network's input huge", "it is refused")
+@pytest.mark.fault("an image of absurd aspect ratio, which makes the network's input huge", "it is refused")
 def test_image_of_absurd_aspect_is_refused(tmp_path: Path) -> None:
     card = CARD.replace("side: 32", "side: 512")
     with pytest.raises(DecodeError) as caught:

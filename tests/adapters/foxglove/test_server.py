@@ -154,7 +154,7 @@ def test_an_address_of_the_sixth_version_is_written_in_brackets() -> None:
 
 @pytest.mark.fault(
     "a viewer who reads nothing",
-    "others see everything, at once; what is kept for him is bounded",
+    "others see everything at once; what is kept for that viewer is bounded",
 )
 def test_who_does_not_read_costs_nothing(screen: Screen, record_property: Record) -> None:
     told, _ = picture()

@@ -271,7 +271,7 @@ def test_a_velocity_of_two_numbers_is_refused() -> None:
     assert reason_of(decode_ego, EGO | {"angular_radps": [0.0, 0.0]}) == "motion_invalid"
 
 
-@pytest.mark.fault("text of an attacker's in a frame", "it is never quoted in a log or a reply")
+@pytest.mark.fault("an attacker's text in a frame", "it is never quoted in a log or a reply")
 def test_the_sender_is_never_quoted() -> None:
     with pytest.raises(DecodeError) as refused:
         decode_ego(msgpack.packb(EGO | {"frame_id": "\x1b[31m evil " * 30, "stamp_ns": "evil"}), LIMITS)

@@ -518,7 +518,7 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path, record_property: Callable[
             read_window(path)
 
 
-@pytest.mark.fault("a recorded window cut off at any byte", "it is noticed, and said where")
+@pytest.mark.fault("a recorded window cut off at any byte", "the damage is noticed, with its place")
 def test_every_cut_is_noticed_and_says_so(tmp_path: Path) -> None:
     path = tmp_path / "w.mcap"
     a_window(path, [a_pair(0, points=5)])

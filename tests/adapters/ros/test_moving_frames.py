@@ -108,7 +108,9 @@ def test_nothing_is_said_across_a_gap_or_a_step_back(later_ms: float) -> None:
     assert taken(at(0), at(later_ms), at(later_ms + 50))[2] is not None, "it goes on from there"
 
 
-@pytest.mark.fault("a pose that is none on /tf, or one that nobody can have driven to", "refused, and it goes on")
+@pytest.mark.fault(
+    "an invalid pose on /tf, or one that nobody can have driven to", "it is refused, and the stream goes on"
+)
 @pytest.mark.parametrize(
     ("broken", "reason"),
     [

@@ -109,7 +109,7 @@ def test_what_was_recognised_is_said(name: str, form: str, values: list[float], 
         ("t", "<u4", [50_000, 50_000], STAMP, ["ns since the stamp", "µs since the stamp"]),
     ],
 )
-@pytest.mark.fault("point times that may be read in two ways", "the sweep is refused, and the candidates are named")
+@pytest.mark.fault("point times that can be read in two ways", "the sweep is refused, and the candidates are named")
 def test_what_may_mean_two_things_is_refused_with_the_candidates(
     name: str, form: str, values: list[float], stamp_ns: int, candidates: list[str]
 ) -> None:
@@ -196,7 +196,10 @@ def test_no_usual_sweep_is_read_in_another_way_than_it_was_written(
 BEGIN_S = SEC + NSEC * 1e-9
 
 
-@pytest.mark.fault("a cloud without a stamp whose points carry the time of day", "the first point's is taken, and said")
+@pytest.mark.fault(
+    "a cloud without a stamp whose points carry the time of day",
+    "the stamp is taken from the first point, and this is reported",
+)
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 @pytest.mark.parametrize("name", ["timestamp", "t"])
 def test_without_a_stamp_the_first_point_tells_it(unit: str, name: str) -> None:

@@ -97,7 +97,7 @@ def test_a_loop_is_told() -> None:
 UNIT, ZERO = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 
 
-@pytest.mark.fault("static transforms that are none, or without end", "refused with a cause; at most 2048 are kept")
+@pytest.mark.fault("static transforms that are invalid, or without end", "refused with a cause; at most 2048 are kept")
 @pytest.mark.parametrize(
     ("payload", "cause"),
     [

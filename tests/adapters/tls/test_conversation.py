@@ -99,7 +99,9 @@ def test_a_certificate_with_two_names_is_nobodys(authority: TestAuthority, liste
         said(listener, both)
 
 
-@pytest.mark.fault("somebody else answers a proven command in the service's place", "its sender is told nothing of it")
+@pytest.mark.fault(
+    "somebody else answers a proven command in the service's place", "the pretender learns nothing of the command"
+)
 def test_who_is_not_the_service_learns_nothing(authority: TestAuthority, foreign: TestAuthority) -> None:
     for pretender, why in (
         (Listener(authority.credentials("router")), "certificate of 'router', not that of 'vehicle'"),
@@ -112,7 +114,7 @@ def test_who_is_not_the_service_learns_nothing(authority: TestAuthority, foreign
             speaker.say(answer, TEXT)
 
 
-@pytest.mark.fault("a proven command that is changed, cut or repeated on its way", "nothing is heard")
+@pytest.mark.fault("a proven command that is changed, cut or repeated on its way", "the command is not heard")
 def test_what_was_changed_cut_or_repeated_is_not_heard(authority: TestAuthority) -> None:
     chance = random.Random(0)
     heard = 0
@@ -172,7 +174,8 @@ def test_what_takes_too_long_is_not_heard(authority: TestAuthority) -> None:
 
 
 @pytest.mark.fault(
-    "conversations that are begun and never ended", "their number is bounded; who was let in is heard to the end"
+    "conversations that are begun and never ended",
+    "their number is bounded; a client that was let in is heard to the end",
 )
 def test_conversations_that_never_end_keep_nobody_out(authority: TestAuthority) -> None:
     credentials = authority.credentials("operator")
@@ -216,7 +219,7 @@ def test_files_that_cannot_be_used_are_named_and_not_shown(authority: TestAuthor
 
 @pytest.mark.fault(
     "certificates are renewed while a conversation is under way",
-    "it ends as it began; whoever comes next is held to the new",
+    "it ends as it began; later ones use the new certificates",
 )
 def test_certificates_are_renewed_while_a_conversation_is_under_way(
     authority: TestAuthority, listener: Listener, foreign: TestAuthority

@@ -114,7 +114,7 @@ def test_errors_are_replies_in_the_format_asked_for(bus: Bus, client: zenoh.Sess
     assert msgpack.unpackb(too_long)["code"] == "bad_request"
 
 
-@pytest.mark.fault("more slow queries than are answered at once", "quick ones do not wait; too many are told so")
+@pytest.mark.fault("more slow queries than are answered at once", "quick ones do not wait; surplus ones get an error")
 def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: Bus, client: zenoh.Session) -> None:
     entered, release = threading.Event(), threading.Event()
 

@@ -31,7 +31,8 @@ DOORS = (
 
 
 @pytest.mark.fault(
-    "a door that lets in whoever comes, in the configuration or a Zenoh file", "it is refused unless spelled out"
+    "a listener that lets in anybody, in the configuration or a Zenoh file",
+    "it is refused unless it is explicitly allowed",
 )
 @pytest.mark.parametrize("said", DOORS)
 def test_a_door_for_everybody_in_a_file_is_refused_unless_spelled_out(tmp_path: Path, said: str) -> None:
@@ -65,7 +66,7 @@ def test_the_router_that_is_the_service_is_held_to_the_same() -> None:
     assert unguarded(settings_of(ZenohConfig(listen=(EVERYBODY,)), LIMITS)) == (), "nobody listens there"
 
 
-@pytest.mark.fault("a key in an endpoint that is refused", "the message does not tell it")
+@pytest.mark.fault("a key in an endpoint that is refused", "the message does not show the key")
 @pytest.mark.parametrize("endpoint", [f"tls/[::]:1#listen_private_key_base64={SECRET}", f"tls/h#password={SECRET}"])
 def test_a_refusal_does_not_tell_a_secret(endpoint: str) -> None:
     with pytest.raises(ConfigError) as refused:
@@ -112,7 +113,7 @@ def test_what_is_wrong_in_a_file_is_told_without_what_stands_there(tmp_path: Pat
     assert "zenoh.json5 is no configuration of Zenoh" in str(refused.value)
 
 
-@pytest.mark.fault("a Zenoh file nested 100,000 deep", "an error of ours; the process is not ended by Zenoh's reader")
+@pytest.mark.fault("a Zenoh file nested 100,000 deep", "an error of ours; Zenoh's reader does not end the process")
 @pytest.mark.parametrize(
     "text", ["[" * 100_000, "{mode: [" + "[[//]\r" * 100_000, "{a: '" + "[" * 2**20, "\x00", '{a: "[\\', "// [" * 9, ""]
 )

@@ -57,7 +57,7 @@ def settings(mode: str, endpoint: str, *, shares_memory: bool) -> zenoh.Config:
 
 
 @pytest.mark.fault(
-    "a router that hands over in shared memory, as Zenoh's does by default, is started anew again and again",
+    "a router with shared memory, Zenoh's default, is restarted again and again",
     "none of its memory stays in the service",
 )
 def test_no_memory_of_routers_that_are_gone_is_kept(record_property: Any) -> None:

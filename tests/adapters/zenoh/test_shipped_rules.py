@@ -160,7 +160,9 @@ def test_operator_and_viewer_read_everything(town: Town, name: str, what: str) -
     assert answers(town.of(name), READABLE[what])
 
 
-@pytest.mark.fault("a certificate of sensors or of ROS's nodes asks, by name or wildcard", "nothing is answered")
+@pytest.mark.fault(
+    "somebody with a certificate of sensors or ROS nodes asks, by name or wildcard", "nothing is answered"
+)
 @pytest.mark.parametrize("key", [*READABLE.values(), COMMAND])
 @pytest.mark.parametrize("name", ["sensors", "ros"])
 def test_sensors_and_nodes_read_nothing(town: Town, name: str, key: str) -> None:
@@ -180,7 +182,9 @@ def test_the_operator_commands(town: Town, door: Door) -> None:
     assert json.loads(told.payload)["code"] == "held"
 
 
-@pytest.mark.fault("a command with the certificate of a viewer, a sensor or a node", "the router lets it not through")
+@pytest.mark.fault(
+    "a command with the certificate of a viewer, a sensor or a node", "the router does not let it through"
+)
 @pytest.mark.parametrize("name", ["viewer", "sensors", "ros"])
 def test_nobody_else_commands(town: Town, name: str) -> None:
     before = town.vehicle.commands
@@ -201,7 +205,7 @@ def test_frames_come_from_sensors_only(town: Town) -> None:
     assert set(town.frames) == {b"true"}
 
 
-@pytest.mark.fault("frames subscribed to with the certificate of a viewer", "he gets none")
+@pytest.mark.fault("somebody with the certificate of a viewer subscribes to frames", "no frame comes")
 def test_frames_go_to_the_vehicle_only(town: Town) -> None:
     got: list[bytes] = []
 

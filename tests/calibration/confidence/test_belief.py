@@ -37,7 +37,7 @@ def test_a_centre_that_was_told_right_counts_by_what_is_off_in_truth(
 
 
 @pytest.mark.fault(
-    "a camera whose centre is 30 cm from where it is held, in a window that tells it to 3 cm", "the window is believed"
+    "a camera's centre is 30 cm from where it is held, and the window determines it to 3 cm", "the window is believed"
 )
 def test_a_centre_that_is_off_beyond_doubt_is_believed(record_property: Callable[[str, object], None]) -> None:
     believed = in_centre(5.0, 0.30, KNOWN_M)

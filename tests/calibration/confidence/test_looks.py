@@ -105,7 +105,7 @@ def test_looks_are_never_more_than_frames_nor_less_than_one(alike: float) -> Non
     assert independent_looks(agreement(alike)) == (FRAMES if alike < 0.0 else 1.0)
 
 
-@pytest.mark.fault("frames that agree nowhere", "they are one look, and no number that ends the service")
+@pytest.mark.fault("frames that agree nowhere", "they count as one look, and no number ends the service")
 @pytest.mark.parametrize("own", [0.0, -2.0])
 def test_frames_that_do_not_agree_with_themselves_are_one_look(own: float) -> None:
     assert independent_looks(agreement(0.3, own)) == 1.0

@@ -82,9 +82,7 @@ def test_without_a_maximum_or_with_too_few_frames_nothing_is_known(
     assert measure_noise(landscape(paraboloids(square, moving(rng)[:frames]))) is None
 
 
-@pytest.mark.fault(
-    "frames that repeat one another", "no certainty is made of them, and no number that ends the service"
-)
+@pytest.mark.fault("frames that repeat one another", "they give no certainty, and no number ends the service")
 @pytest.mark.parametrize(("views", "axes"), [(1, 3), (2, 3), (3, 3), (5, 6)])
 def test_views_that_come_again_settle_no_more_axes_than_they_are(
     views: int, axes: int, rng: np.random.Generator

@@ -176,7 +176,7 @@ def test_a_step_of_the_clock_that_lasts_is_followed(step_ms: int) -> None:
     assert pairer.losses[f"camera_stamp_{kind}"] == AGREEING_STAMPS - 1
 
 
-@pytest.mark.fault("a sensor that is off", "what waits for it stays bounded")
+@pytest.mark.fault("a sensor that is off", "the memory for frames that wait for it stays bounded")
 def test_a_stream_without_partners_stays_bounded() -> None:
     pairs, pairer = run([sweep(i * 100) for i in range(1000)])
     assert pairs == []

@@ -147,9 +147,7 @@ def test_unknown_motion_is_not_standing(street: Window) -> None:
     assert selected_s(drive(cutter, street, [0.0], speed=None)) == [0.0]
 
 
-@pytest.mark.fault(
-    "a camera that repeats its picture while the vehicle moves", "the pairs are refused, and the cause is told"
-)
+@pytest.mark.fault("a camera that repeats its picture while the vehicle moves", "the pairs are refused, with the cause")
 def test_a_frozen_image_of_a_moving_vehicle_is_refused(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(lambda _: SHARP), AsTheyAre())
     assert selected_s(drive(cutter, street, [0.0, 10.0, 20.0])) == [0.0]

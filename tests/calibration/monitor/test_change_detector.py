@@ -145,7 +145,9 @@ class TestEvidence:
     def test_what_confirms_is_no_more_after_an_hour_than_after_a_minute(self) -> None:
         assert after(*(fresh(k) for k in range(720))).evidence == LEVELS.most
 
-    @pytest.mark.fault("every check of a highway is off alike", "it accuses the mount by no more than it can tell")
+    @pytest.mark.fault(
+        "every check on a highway is off in the same way", "the mount is accused by no more than such checks can tell"
+    )
     def test_what_a_scene_cannot_tell_accuses_nobody(self, record_property: Callable[[str, object], None]) -> None:
         off_alike = [turned(0.4, 0.0, 0.0)] * 60
         states = {

@@ -88,7 +88,7 @@ class TestSupport:
         assert not told.of_rotation.insists
         assert not told.of_pose.insists
 
-    @pytest.mark.fault("one thing in the image draws the optimum aside", "the look does not accuse the mount")
+    @pytest.mark.fault("one thing in the image pulls the optimum aside", "the look does not accuse the mount")
     def test_what_all_cells_gain_is_certain_and_what_a_few_gain_is_not(
         self, record_property: Callable[[str, object], None]
     ) -> None:

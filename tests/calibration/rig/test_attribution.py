@@ -37,7 +37,9 @@ def _named(state: RigState, rig: RigGraph) -> set[str]:
     return {name for name, health in _health(state, rig).items() if health in MOVED}
 
 
-@pytest.mark.fault("sensors of a rig are knocked by 1°", "they are named, no other is, after five looks of each pair")
+@pytest.mark.fault(
+    "sensors of a rig are knocked by 1°", "they are named after five looks of each pair, and no other is"
+)
 @pytest.mark.parametrize("who", [("front",), ("roof",), ("front", "rear")])
 def test_those_that_moved_are_named_and_told_by_how_much(
     who: tuple[str, ...], record_property: Callable[[str, object], None]
@@ -73,8 +75,8 @@ def test_a_sensor_is_named_by_the_second_answer_that_knows_of_a_new_look_at_it(w
 
 
 @pytest.mark.fault(
-    "bent looks at one pair of a LiDAR that was knocked",
-    "its camera is not named beside the LiDAR before a window of it says so",
+    "biased looks at one pair of a LiDAR that was knocked",
+    "its camera is not named beside the LiDAR, unless its own window says so",
 )
 def test_a_camera_beside_its_one_lidar_is_named_by_a_window_and_not_by_looks() -> None:
     rig = graph(STAR)
@@ -119,7 +121,7 @@ def _looked_at(after: Mapping[str, Matrix4], suspicious: Collection[int]) -> set
 
 
 @pytest.mark.fault(
-    "a street bends all looks at a pair a little",
+    "a street biases all looks at a pair a little",
     "its camera is not named unless the pair suspects a move, and still does",
 )
 def test_a_camera_whose_only_pair_suspects_nothing_is_not_named() -> None:
@@ -141,7 +143,7 @@ def test_a_window_of_before_the_step_is_no_answer() -> None:
     assert _named(after_window(state, rig, window), rig) == {"roof"}
 
 
-@pytest.mark.fault("looks at a camera that are bad together, then none of it", "looks at others do not name it")
+@pytest.mark.fault("bad looks at a camera, then no new look at it", "looks at other sensors do not name the camera")
 def test_an_answer_without_a_new_look_at_a_sensor_is_none() -> None:
     rig, rng = graph(STAR), np.random.default_rng(3)
     state = driven(rig, POSES, POSES, rounds=(6, 0))
@@ -255,7 +257,9 @@ def test_it_replays_to_the_byte() -> None:
     assert one.posterior.steps["front"].x.tobytes() == two.posterior.steps["front"].x.tobytes()
 
 
-@pytest.mark.fault("a covariance of a rig's evidence is NaN, singular or absurd", "refused by its reason, no traceback")
+@pytest.mark.fault(
+    "a covariance of a rig's evidence that is NaN, singular or absurd", "it is refused with its reason, no traceback"
+)
 @pytest.mark.parametrize(
     "covariance",
     [

@@ -107,7 +107,7 @@ def test_a_camera_that_moved_leaves_the_others_where_they_were() -> None:
 
 
 @pytest.mark.fault(
-    "a camera moves in the knock of its LiDAR", "what was known of it is left out; it keeps its own window"
+    "a camera is moved by the same knock as its LiDAR", "earlier knowledge of it is dropped; it keeps its own window"
 )
 def test_what_a_camera_denies_of_the_past_is_left_out_and_bends_nothing(
     record_property: Callable[[str, object], None],

@@ -56,7 +56,9 @@ def test_a_check_carries_since_when_its_pair_is_suspected_by_itself() -> None:
         assert found.stepped_ns == since_ns
 
 
-@pytest.mark.fault("a check of a rig's pair is NaN, or served where no pose is", "it says nothing, or is refused")
+@pytest.mark.fault(
+    "a check of a rig's pair is NaN, or comes where no pose is served", "it counts for nothing, or is refused"
+)
 def test_hostile_checks_say_nothing() -> None:
     assert of_check("e", POSE, _observation(np.full(6, np.nan))) is None
     only_turns = of_check("e", POSE, _observation(np.array([0.01, 0.0, 0.0, np.nan, 0.0, 0.0])))

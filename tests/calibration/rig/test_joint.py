@@ -60,7 +60,9 @@ def test_covariances_of_two_pairs_are_those_of_many_drawn_rigs() -> None:
     assert np.abs(found.between("front-roof", "left-roof")).max() > 0.0
 
 
-@pytest.mark.fault("one pair's window is 1° off, and claims not to be", "it alone is left out; the rest is not bent")
+@pytest.mark.fault(
+    "one pair's window is 1° off, and claims not to be", "it alone is left out; the rest is not distorted"
+)
 def test_one_bad_edge_is_found_and_bends_nothing(record_property: Callable[[str, object], None]) -> None:
     rig = graph([*LOOPED, ("roof", "bumper")])
     told = windows(rig, POSES, 4)
@@ -146,7 +148,7 @@ def test_neither_names_nor_order_nor_the_frame_of_the_rig_matter() -> None:
 
 
 @pytest.mark.fault(
-    "a window of a rig claims NaN, a singular covariance or a pose that is none", "refused by its reason"
+    "a window of a rig claims NaN, a singular covariance or an invalid pose", "it is refused with its reason"
 )
 def test_hostile_windows_are_refused() -> None:
     rig = graph(LOOPED[:2])

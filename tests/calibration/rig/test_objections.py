@@ -30,7 +30,8 @@ def driven() -> Drive:
 
 
 @pytest.mark.fault(
-    "a LiDAR is knocked between two looks at it and another", "one thing is said at a time, never `inconsistent_rig`"
+    "a LiDAR is knocked between two looks at it and another",
+    "`health` gives one reason at a time, never `inconsistent_rig`",
 )
 def test_from_the_knock_to_the_correction_one_thing_is_said_at_a_time(
     record_property: Callable[[str, object], None],
@@ -85,7 +86,7 @@ def test_one_bad_look_at_two_lidars_is_held_against_nobody() -> None:
 
 
 @pytest.mark.fault(
-    "of two LiDARs one is knocked while no camera sees anything", "a suspicion of either, no `inconsistent_rig`"
+    "one of two LiDARs is knocked while no camera sees anything", "either is suspected, without `inconsistent_rig`"
 )
 def test_while_nothing_tells_which_of_two_moved_it_is_a_suspicion() -> None:
     drive, after = driven(), with_moved("roof")

@@ -146,7 +146,9 @@ def test_it_stays_moved_for_as_long_as_a_pair_serves_what_was_before() -> None:
     assert drive.health()["roof"] is SensorHealth.CALIBRATED
 
 
-@pytest.mark.fault("one camera sees nothing when its LiDAR is knocked", "the others tell its pair where the LiDAR is")
+@pytest.mark.fault(
+    "one camera sees nothing when its LiDAR is knocked", "the others determine where the LiDAR is for its pair"
+)
 def test_a_pair_that_is_blind_is_not_waited_for_and_told_by_the_others() -> None:
     drive, after = Drive(graph(STAR)), with_moved("roof")
     drive.looks(POSES, 8)
@@ -211,7 +213,9 @@ def test_what_nobody_can_attribute_is_over_when_its_pair_serves_what_it_found() 
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
 
 
-@pytest.mark.fault("a window of one pair of a rig is 1° off", "`inconsistent_rig` on its loop, nothing is corrected")
+@pytest.mark.fault(
+    "a window of one pair of a rig is 1° off", "`inconsistent_rig` for the pairs of its loop; nothing is corrected"
+)
 def test_a_window_that_does_not_fit_the_others_is_said_of_the_pairs_of_its_loop() -> None:
     drive = Drive(graph(LOOPS))
     drive.looks(POSES, 4)

@@ -13,7 +13,7 @@ from coec.runtime.api.configuration import shown
 KEY = "tls/vehicle:7448#connect_private_key_base64=c2VjcmV0;connect_certificate_file=/etc/c.pem"
 
 
-@pytest.mark.fault("a key in an endpoint, asked for by `config`", "it is hidden")
+@pytest.mark.fault("a key in an endpoint, when `config` is asked for", "it is hidden")
 def test_keys_in_endpoints_are_hidden_and_the_rest_is_shown() -> None:
     config = example().model_copy(update={"zenoh": ZenohConfig(connect=(KEY,), listen=(KEY, "tcp/127.0.0.1:7447"))})
     document = shown(config)

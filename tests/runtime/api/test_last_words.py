@@ -77,9 +77,7 @@ def test_the_service_answers_for_itself_and_is_silent_about_pairs_that_it_does_n
         assert [reply.key for reply in ask(session, "coec/@v1/*/*/health", 5.0)] == [KEYS.health(PAIR)]
 
 
-@pytest.mark.fault(
-    "a last word that is too large, is none, or speaks for another vehicle", "refused by cause, never shown"
-)
+@pytest.mark.fault("a last word that is too large, invalid, or about another vehicle", "refused by cause, never shown")
 @pytest.mark.parametrize(
     ("key", "payload", "cause"),
     [

@@ -126,7 +126,7 @@ def test_a_router_that_is_away_is_told_once_each_time(caplog: pytest.LogCaptureF
     ]
 
 
-@pytest.mark.fault("a night without a router", "health has the reason; the log repeats it, each time later")
+@pytest.mark.fault("a night without a router", "health has the reason; the log repeats it at growing intervals")
 def test_a_night_without_a_router_is_a_few_lines(caplog: pytest.LogCaptureFixture) -> None:
     clock = count(0)
     watch = RouterWatch(("tcp/10.0.0.1:7447",), lambda: False, lambda: float(next(clock)))

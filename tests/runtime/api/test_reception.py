@@ -124,7 +124,7 @@ def test_who_proves_his_name_may_give_the_commands_that_are_his(
     assert senders == ["operator (certificate)", "operator (certificate)", "fleet (certificate)"]
 
 
-@pytest.mark.fault("a name that is only claimed", "it is not taken for one that is proven")
+@pytest.mark.fault("a name that is claimed without proof", "it is not taken for a proven one")
 def test_a_name_that_is_claimed_is_not_proven(authority: TestAuthority, router: zenoh.Session, vehicle: Served) -> None:
     there = vehicle(authority.of_service(OPERATOR, anonymous="always"))
     claim = b"operator (certificate)"
@@ -239,7 +239,9 @@ def test_a_command_does_not_wait_for_a_window_that_is_read(
     record_property("figure", f"median {sorted(times_s)[5] * 1e3:.0f} ms, longest {max(times_s) * 1e3:.0f} ms")
 
 
-@pytest.mark.fault("conversations begun without end, 64 at a time, by who proves nothing", "a proven command is done")
+@pytest.mark.fault(
+    "conversations that are begun without end, 64 at a time, without proof", "a proven command is still carried out"
+)
 def test_beginnings_without_end_hold_up_no_proven_command(
     authority: TestAuthority,
     router: zenoh.Session,

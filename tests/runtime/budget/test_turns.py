@@ -152,7 +152,7 @@ def test_where_it_does_not_all_periods_stretch_alike() -> None:
 
 
 @pytest.mark.fault(
-    "eight cameras and three LiDARs on the default budget", "each pair in its turn; status says the rest"
+    "eight cameras and three LiDARs on the default budget", "each pair gets its turn, and status says what they lack"
 )
 def test_sixteen_pairs_are_looked_at_in_turn_and_what_they_lack_is_told(
     record_property: Callable[[str, object], None],

@@ -41,7 +41,7 @@ def filled(folder: Path) -> tuple[History, CalibrationResult]:
     return history, result
 
 
-@pytest.mark.fault("thousands of commands in the history", "no result that a roll back needs is pushed out")
+@pytest.mark.fault("thousands of commands in the history", "no result that `rollback` needs is pushed out")
 @pytest.mark.parametrize(
     "flood",
     [

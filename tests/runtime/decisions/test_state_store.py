@@ -133,8 +133,8 @@ def test_an_intact_file_of_another_form_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault(
-    "a state with a pair that the service does not know, in a form that nobody wrote",
-    "it stays as it is, and the state is written",
+    "a state with a pair that the service does not know, in an unknown form",
+    "the pair stays as it is, and the state is written",
 )
 @pytest.mark.parametrize("foreign", [2, None, [], "x", {"history_heads": 1}])
 def test_what_is_there_of_an_unknown_pair_stays(tmp_path: Path, foreign: object) -> None:
@@ -180,9 +180,7 @@ def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: 
     assert restarted(tmp_path) is not None
 
 
-@pytest.mark.fault(
-    "a forged state with numbers and shapes that nobody wrote", "an error of ours, and nominal is served"
-)
+@pytest.mark.fault("a forged state with invalid numbers and shapes", "an error of ours, and nominal is served")
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -27,7 +27,7 @@ def test_every_two_lidars_of_the_pairs_in_their_order() -> None:
     assert planned([pair_of("roof")], 15.0) == ()
 
 
-@pytest.mark.fault("the extra lidars is not installed", "said in status and rig; nothing breaks")
+@pytest.mark.fault("the extra lidars is not installed", "status and rig say so; nothing breaks")
 def test_what_is_not_installed_is_said_and_breaks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nearest, "installed", lambda: False)
     bench = LidarBench(tmp_path)

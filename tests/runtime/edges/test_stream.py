@@ -60,7 +60,7 @@ def test_every_two_lidars_are_told_with_their_age_and_uncertainty(tmp_path: Path
     assert {pair for sensor in bench.reply.sensors for pair in sensor.pairs} == {f"front-{name}" for name in LIDARS}
 
 
-@pytest.mark.fault("a LiDAR is knocked, and no camera sees anything", "named by the other LiDARs alone")
+@pytest.mark.fault("a LiDAR is knocked, and no camera sees anything", "the other LiDARs alone name it")
 @pytest.mark.parametrize("name", ["roof", "bumper"])
 def test_a_knocked_lidar_is_named_by_the_others_alone(
     tmp_path: Path, name: str, record_property: Callable[[str, object], None]
@@ -118,7 +118,7 @@ def test_what_waits_is_bounded_and_losses_are_counted(tmp_path: Path) -> None:
     assert bench.between(EDGE).state == "measured"
 
 
-@pytest.mark.fault("the worker dies of a registration", "refused in words; the next look is taken")
+@pytest.mark.fault("the worker dies of a registration", "the request is refused with words; the next look is taken")
 def test_a_worker_that_fails_is_a_reason_and_no_end(tmp_path: Path) -> None:
     failing = Reason("worker_failed", "The worker was ended by signal 9.")
 
@@ -134,7 +134,7 @@ def test_a_worker_that_fails_is_a_reason_and_no_end(tmp_path: Path) -> None:
     assert bench.between(EDGE).reasons == ()
 
 
-@pytest.mark.fault("two LiDARs see nothing in common", "said, and tried an eighth as often")
+@pytest.mark.fault("two LiDARs see nothing in common", "this is reported, and tried an eighth as often")
 def test_lidars_that_do_not_overlap_are_let_rest(tmp_path: Path) -> None:
     apart = Reason("lidar_overlap", "roof and bumper have too little in view in common.")
 

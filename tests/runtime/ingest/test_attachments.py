@@ -91,7 +91,9 @@ def test_numbers_that_make_no_sense_cost_nothing(desk: Desk, numbers: tuple[int,
     assert desk.losses.snapshot() == {}
 
 
-@pytest.mark.fault("bytes beside a message that are none of rmw_zenoh's", "counted; the frame is taken all the same")
+@pytest.mark.fault(
+    "bytes beside a message that are not rmw_zenoh's", "they are counted; the frame is taken all the same"
+)
 @pytest.mark.parametrize(
     "attachment",
     [b"", beside(1)[:-1], beside(1)[:16] + b"\x0f" + beside(1)[17:], b"\xff" * 33],

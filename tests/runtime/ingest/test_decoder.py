@@ -233,7 +233,7 @@ def test_a_frame_that_was_overtaken_is_counted_once(desk: Desk) -> None:
     assert pairer.losses["camera_stamp_back"] == 1
 
 
-@pytest.mark.fault("a flood of bad messages", "the log grows with their logarithm")
+@pytest.mark.fault("a flood of bad messages", "the log grows only with the logarithm of their number")
 def test_losses_are_logged_first_and_then_ever_more_rarely(caplog: pytest.LogCaptureFixture) -> None:
     losses = LossCounter(logging.getLogger("test"), "front")
     for _ in range(1000):

@@ -270,7 +270,7 @@ def test_each_stream_has_room_of_its_own(record_property: Callable[[str, object]
     assert len(vehicle.looks["1-0"].pairs) == 9
 
 
-@pytest.mark.fault("pairs that nobody lets go of", "memory of a vehicle's frames is bounded, each counted once")
+@pytest.mark.fault("pairs that are never released", "memory of a vehicle's frames is bounded, each counted once")
 def test_frames_of_all_pairs_are_bounded_together_and_each_counts_once(
     record_property: Callable[[str, object], None],
 ) -> None:

@@ -152,7 +152,7 @@ def test_rubbish_is_counted_by_its_cause_and_what_comes_after_it_is_taken() -> N
     assert codes(watch) == ["being_built"]
 
 
-@pytest.mark.fault("messages of 32 MB on /tf_static and CameraInfo", "none is kept; counted by cause")
+@pytest.mark.fault("messages of 32 MB on /tf_static and CameraInfo", "none is kept; they are counted by cause")
 def test_messages_larger_than_any_are_not_kept() -> None:
     watch = heard_all()
     watch.look()

@@ -104,7 +104,7 @@ def test_closing_leaves_the_window_unread(store: WindowStore) -> None:
 
 
 @pytest.mark.fault(
-    "gigabytes of unknown windows on a slow disk", "the list is there at once, and reading never blocks the beat"
+    "gigabytes of unknown windows on a slow disk", "the list is there at once, and reading never blocks the heartbeat"
 )
 def test_on_a_slow_disk_a_round_is_short_and_the_list_is_there_at_once(
     store: WindowStore, monkeypatch: pytest.MonkeyPatch

@@ -70,7 +70,7 @@ class Life:
 
 @pytest.mark.fault(
     "a disk that is full or read-only at any write, fsync or rename of a window's life",
-    "that window is lost and told, or whole; the next one is whole, and no half file is left",
+    "that window is whole, or lost and reported; the next one is whole, and no half file is left",
 )
 @pytest.mark.parametrize(
     ("error", "length"),

@@ -190,7 +190,9 @@ def test_pairs_between_are_recorded_beside_those_of_the_open_window_and_do_not_c
     assert bench.lost == ["front-40"], "pairs between make no window"
 
 
-@pytest.mark.fault("a window whose last pairs the next one is to hold is gone", "the loss is counted, the next is kept")
+@pytest.mark.fault(
+    "a window is gone whose last pairs the next window is to hold", "the loss is counted, the next is kept"
+)
 def test_kept_pairs_that_are_gone_are_counted_and_cost_no_window(bench: Bench) -> None:
     with bench.running():
         for name, stamps in (("front-50", [50, 60]), ("front-70", [70])):
@@ -385,7 +387,7 @@ def test_a_stop_does_not_wait_for_windows_that_are_being_read(tmp_path: Path) ->
     assert store.unread("front") == ("front-1",)
 
 
-@pytest.mark.fault("a disk that never lets go of the recorder", "it is told, and the stop goes on")
+@pytest.mark.fault("a disk that never lets go of the recorder", "this is reported, and the stop goes on")
 def test_a_thread_that_the_disk_does_not_let_go_is_told(tmp_path: Path) -> None:
     recorder = Bench(store_of(tmp_path)).recorder
     assert recorder.trouble is None

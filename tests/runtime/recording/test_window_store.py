@@ -84,7 +84,7 @@ def jumped(monkeypatch: pytest.MonkeyPatch, days: float) -> None:
     monkeypatch.setattr(time, "time_ns", lambda: real() + round(days * DAY_NS))
 
 
-@pytest.mark.fault("a wall clock that jumps by years", "it takes no window")
+@pytest.mark.fault("a wall clock that jumps by years", "no window is removed")
 @pytest.mark.parametrize("days", [100, -400, 10_000])
 def test_a_wall_clock_that_jumps_takes_no_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: int) -> None:
     store = store_of(tmp_path)
@@ -98,7 +98,7 @@ def test_a_wall_clock_that_jumps_takes_no_window(tmp_path: Path, monkeypatch: py
     assert len(stems(store)) == 9
 
 
-@pytest.mark.fault("a sensor clock that jumps by years", "it takes no window")
+@pytest.mark.fault("a sensor clock that jumps by years", "no window is removed")
 @pytest.mark.parametrize("days", [100, -100])
 def test_a_sensor_clock_that_jumps_takes_no_window(tmp_path: Path, days: int) -> None:
     store = store_of(tmp_path)
@@ -333,7 +333,7 @@ def test_what_is_gone_is_forgotten_and_the_index_stays_bounded(tmp_path: Path, m
     assert stems(store_of(tmp_path)) == [at(day) for day in (57, 58, 59)]
 
 
-@pytest.mark.fault("a damaged index of the windows", "it costs reading them again, no window")
+@pytest.mark.fault("a damaged index of the windows", "the windows are read again, and none is lost")
 def test_an_index_that_is_damaged_or_cannot_be_written_costs_reading_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -58,7 +58,7 @@ def states(said: SaidRig) -> dict[str, str]:
     return {sensor.name: sensor.state for sensor in reply(said).sensors}
 
 
-@pytest.mark.fault("the LiDAR of a vehicle is knocked", "named, and told to all pairs from one sensor time on")
+@pytest.mark.fault("the LiDAR of a vehicle is knocked", "it is named, and all pairs are told from one sensor time on")
 def test_a_correction_comes_to_all_pairs_at_one_sensor_time(
     tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
@@ -214,7 +214,7 @@ def test_a_hostile_file_is_refused(tmp_path: Path, body: dict[str, object]) -> N
 
 
 @pytest.mark.fault(
-    "the file of the rig says that an edge was a kilometre off", "looks are taken as any, and the reply is whole"
+    "the file of the rig says that an edge was a kilometre off", "looks count as usual, and the reply is whole"
 )
 def test_a_file_that_lies_within_its_form_harms_nothing(tmp_path: Path) -> None:
     far = np.eye(4)
@@ -294,7 +294,7 @@ def test_a_single_lidar_closes_no_loop_and_no_pair_is_inconsistent(tmp_path: Pat
     assert INCONSISTENT not in str(joint)
 
 
-@pytest.mark.fault("all cameras of a vehicle stop", "what they said last is put together all the same")
+@pytest.mark.fault("all cameras of a vehicle stop", "what they said last is still combined")
 def test_once_all_streams_have_stopped_nothing_waits_any_more(tmp_path: Path) -> None:
     said = SaidRig(tmp_path)
     for camera in CAMERAS:

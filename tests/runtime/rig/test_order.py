@@ -20,7 +20,7 @@ def _taken(order: Order[str], *, silent: bool = False) -> list[str]:
     return found
 
 
-@pytest.mark.fault("answers of several pairs overtake each other", "the rig is put together in the same order")
+@pytest.mark.fault("answers of several pairs overtake each other", "the rig combines them in the same order")
 @pytest.mark.parametrize("seed", range(20))
 def test_the_order_of_arrival_changes_nothing(seed: int) -> None:
     """Each pair asks at its times, and goes on once it has its answers; how long these take is drawn."""
