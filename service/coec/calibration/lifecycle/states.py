@@ -24,12 +24,12 @@ class HealthState(StrEnum):
 
 STATES: Mapping[HealthState, str] = MappingProxyType(
     {
-        HealthState.UNKNOWN: "what is served has not been looked at",
-        HealthState.HEALTHY: "what is served has been looked at and agrees with the data",
-        HealthState.SUSPECT: "something speaks against what is served; a window is being taken to tell",
+        HealthState.UNKNOWN: "what is served has not been checked",
+        HealthState.HEALTHY: "what is served has been checked and agrees with the data",
+        HealthState.SUSPECT: "something speaks against what is served; a window is being recorded to decide",
         HealthState.MISCALIBRATED: "what is served is wrong",
-        HealthState.DEGRADED: "the data, or the service, do not allow to tell",
-        HealthState.STALE: "nothing has been looked at for longer than `stale_after_s`",
+        HealthState.DEGRADED: "the data, or the service, do not allow a judgement",
+        HealthState.STALE: "nothing has been checked for longer than `stale_after_s`",
     }
 )
 
@@ -59,7 +59,7 @@ MEANING: Mapping[Event, str] = MappingProxyType(
         Event.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
         Event.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
         Event.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
-        Event.REFUSED_ELSEWHERE: "a window was refused, yet the pose that it or its end shows is not what is served",
+        Event.REFUSED_ELSEWHERE: "a window was refused, but it, or its end, shows a pose other than what is served",
         Event.CLEAR: "the monitor sees nothing wrong with an extrinsic that a window has confirmed",
         Event.NO_OBJECTION: "the monitor sees nothing wrong with an extrinsic that no window has confirmed",
         Event.SUSPECTED: "the monitor suspects that the mount has moved",
@@ -69,8 +69,8 @@ MEANING: Mapping[Event, str] = MappingProxyType(
         Event.OVERDUE: "no check has been completed for three periods of the monitor",
         Event.AGED: "no check has been completed for `stale_after_s`",
         Event.REPLACED: "a person replaced the extrinsic (rollback, reset)",
-        Event.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing of the new time has been looked at",
-        Event.RESTARTED: "the service was started again: nothing has been looked at since",
+        Event.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing has been checked in the new time",
+        Event.RESTARTED: "the service was started again: nothing has been checked since",
     }
 )
 
