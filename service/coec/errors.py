@@ -34,8 +34,8 @@ class ConfigError(CoecError):
 
 
 class UnavailableError(CoecError):
-    """Something outside that is taken, away or not writable now, though nothing is wrong with the configuration: a
-    port, the state directory, the vehicle's place on the network. Another start later may succeed."""
+    """The service needs something that it cannot have now: the port, the state directory or the vehicle's place on
+    the network is taken, absent or not writable. The configuration is right, and a later start may succeed."""
 
     exit_code = 75  # EX_TEMPFAIL of sysexits.h: a service manager tries again
     reply_code = "unavailable"
@@ -66,7 +66,7 @@ class CalibrationError(CoecError):
 
 
 class LensError(CalibrationError):
-    """A camera model that does not fit the lens it is to stand for."""
+    """A camera model that does not fit the lens that it should describe."""
 
     reply_code = "lens_does_not_fit"
 
@@ -98,7 +98,7 @@ class DecodeError(CoecError):
 
     Attributes:
         reason: short code under which the loss is counted, for example `image_truncated`. It is one of a fixed
-            set and never holds text of the sender's.
+            set and never holds text from the sender.
     """
 
     reply_code = "bad_input"
@@ -109,13 +109,13 @@ class DecodeError(CoecError):
 
 
 class OutputError(CoecError):
-    """A file that was asked for could not be written."""
+    """A requested file could not be written."""
 
     reply_code = "output_failed"
 
 
 class NotAcceptedError(CoecError):
-    """A calibration that its own verdict speaks against was to be written into the files of a vehicle."""
+    """Somebody asked to write a calibration into the files of a vehicle, but its own verdict rejects it."""
 
     reply_code = "not_accepted"
 
@@ -127,7 +127,7 @@ class ConnectionFailedError(CoecError):
 
 
 class RemoteError(CoecError):
-    """An error reply. `code` is the sender's."""
+    """An error reply; `code` is the one that the sender gave."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -135,6 +135,6 @@ class RemoteError(CoecError):
 
 
 class NotProvenError(CoecError):
-    """Who speaks has not shown a certificate that is taken here."""
+    """The sender has not shown a certificate that the service accepts."""
 
     reply_code = "not_proven"

@@ -1,8 +1,7 @@
 """Everything a user may set, with its default, unit and reason: one frozen model per stage, unknown keys refused.
 
-`load_config` reads the one YAML file of a daemon. The same stage models (`WindowConfig`, `CalibrationConfig`, ...)
-serve the command line, so a default exists once. Others import from
-here: which room holds what is the package's own affair.
+`load_config` reads the one YAML file of a daemon. The command line uses the same stage models (`WindowConfig`,
+`CalibrationConfig`, ...), so that each default exists once. Import from this package, not from its modules.
 """
 
 from coec.config.authority import AuthorityConfig, SenderConfig

@@ -10,35 +10,35 @@ from coec.config.base import FilePath, Stage
 from coec.schemas.commands import NAMES, CommandName
 
 CommonName = Annotated[str, Field(pattern=r"^[A-Za-z0-9 ._:/@+=,-]{1,64}$")]
-"""Of a certificate; X.509 allows 64 characters."""
+"""Common name of a certificate; X.509 allows 64 characters."""
 
 
 class SenderConfig(Stage):
-    """Somebody who may give commands, by the common name of his certificate."""
+    """A sender who may give commands, known by the common name of its certificate."""
 
     name: CommonName = Field(description="common name of the certificate")
     commands: tuple[CommandName, ...] = Field(
-        default=NAMES, min_length=1, description="that may be given; all, unless they are listed"
+        default=NAMES, min_length=1, description="commands that this sender may give; all unless listed"
     )
 
 
 class AuthorityConfig(Stage):
-    """Who may give commands, whatever the router lets through. A router tells the service nothing of who asks: whoever
-    is to be known proves it to the service itself, by a certificate of `root_ca`, in a TLS conversation inside the
-    query (`coec query command/...` does). A router in between can only keep such a command back. `anonymous` are all
-    others; `loopback` takes theirs while the session listens and connects on loopback only, and its router's port is
-    open nowhere else. What other doors that router has the service cannot see: where it has some, they are what its own
-    access control lets in, or `never` shuts them."""
+    """Who may give commands, whatever the router lets through. A router does not tell the service who asks. A sender
+    proves its name to the service itself, with a certificate signed by `root_ca`, in a TLS conversation inside the
+    query (`coec query command/...` does this); a router in between can only hold such a command back. Senders without
+    proof are `anonymous`. `loopback` accepts their commands while the session listens and connects on loopback only and
+    the router's port is open on no other address. The service cannot see whether the router listens elsewhere, too. If
+    it does, the router's own access control decides who gets in there; `never` refuses all anonymous commands."""
 
     anonymous: Literal["never", "loopback", "always"] = Field(
-        default="loopback", description="when commands are taken from whoever proves nothing"
+        default="loopback", description="when the service takes commands from senders without proof"
     )
-    senders: tuple[SenderConfig, ...] = Field(default=(), max_length=64, description="by `name`, and their `commands`")
+    senders: tuple[SenderConfig, ...] = Field(default=(), max_length=64, description="who may give which commands")
     certificate: FilePath | None = Field(
-        default=None, description="of the service; its common name is the vehicle's name"
+        default=None, description="certificate of the service; its common name is the vehicle's name"
     )
-    private_key: FilePath | None = Field(default=None, description="of the certificate")
-    root_ca: FilePath | None = Field(default=None, description="the authority that signed the senders' certificates")
+    private_key: FilePath | None = Field(default=None, description="private key of `certificate`")
+    root_ca: FilePath | None = Field(default=None, description="authority that signed the senders' certificates")
 
     @model_validator(mode="after")
     def _provable(self) -> AuthorityConfig:

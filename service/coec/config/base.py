@@ -1,4 +1,4 @@
-"""What every model of the configuration is built of: names, paths, matrices, and the base of all models."""
+"""What every model of the configuration is built from: names, paths, matrices, and the base of all models."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 MAX_NAME = 64
-"""Characters of a name."""
+"""Most characters of a name."""
 
 Name = Annotated[str, Field(pattern=rf"^[A-Za-z0-9_.-]{{1,{MAX_NAME}}}$")]
 """A name that becomes one chunk of a Zenoh key and part of a file name."""
@@ -19,10 +19,11 @@ KeyExpression = Annotated[str, Field(pattern=r"^[^\s/*$?#]+(/[^\s/*$?#]+)*$", ma
 """A Zenoh key without wildcards, and without empty chunks."""
 
 MAX_NAME_BYTES = 255
-"""Of one name in a path: what Linux's file systems take (limits.h, NAME_MAX)."""
+"""Most bytes of one name in a path: what Linux's file systems take (limits.h, NAME_MAX)."""
 
 MAX_PATH_BYTES = 2048
-"""Of a path: half of what Linux takes (limits.h, PATH_MAX); the folder that it is relative to may have the rest."""
+"""Most bytes of a path: half of what Linux takes (limits.h, PATH_MAX). The rest is for the folder that the path is
+relative to."""
 
 
 def _path(path: Path) -> Path:
@@ -34,7 +35,8 @@ def _path(path: Path) -> Path:
 
 
 FilePath = Annotated[Path, AfterValidator(_path)]
-"""A path that can be asked for. What a text file says may be none, and Python raises whatever it likes about it."""
+"""A path that the operating system accepts. Text from a file may be no valid path, and Python raises various
+exceptions on such a path; `_path` refuses it first."""
 
 Matrix4x4 = tuple[
     tuple[float, float, float, float],
@@ -47,12 +49,12 @@ IDENTITY: Matrix4x4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.
 
 
 OUR_WORDS = {
-    # Pydantic would name the class of ours.
+    # Pydantic's own message would name our class.
     "model_type": "give names with their values (a mapping)",
     "missing": "is missing",
     "extra_forbidden": "there is no such key",
 }
-"""What a file says wrongly, by pydantic's name of it, where its own words are those of a programmer."""
+"""Error messages by pydantic's error type, where pydantic's own message is written for programmers."""
 
 
 class Stage(BaseModel):
@@ -62,8 +64,8 @@ class Stage(BaseModel):
 
 
 def describe(error: ValidationError, names: Mapping[str, Sequence[str]] | None = None) -> str:
-    """Each complaint of pydantic on a line: where, what. `names` are those of the entries of lists at the top, by which
-    people know them."""
+    """Pydantic's complaints in one line: where and what, with `; ` between them. `names` holds the names of the entries
+    of each list at the top of the file; they stand in place of the entries' indices."""
     known, lines = names or {}, []
     for item in error.errors():
         place = list(item["loc"])

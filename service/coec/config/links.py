@@ -1,4 +1,4 @@
-"""Poses that people write in one line, and what is known to be rigid between two sensors of a kind."""
+"""Poses written in one line, and links: known rigid poses between two sensors of a kind."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from coec.config.base import Matrix4x4, Name, Stage, describe
 
 
 class _Written(Stage):
-    """A pose in one line."""
+    """A pose written in one line."""
 
     xyz: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
 
 
 QUATERNION_TOLERANCE = 0.01
-"""By how much the length of a quaternion may differ from 1: more is a number that was mistyped, less is rounding."""
+"""How far the length of a quaternion may be from 1: within this it is rounding, beyond it a mistyped number."""
 
 
 def _rows(value: Any) -> Any:
-    """The rows of a pose that is written as a place and a quaternion; anything else as it is."""
+    """The rows of a pose that is written as a position and a quaternion; any other value as it is."""
     if not isinstance(value, dict):
         return value
     from coec.config import poses
@@ -46,17 +46,17 @@ def _rigid(rows: Matrix4x4) -> Matrix4x4:
 
 
 Pose = Annotated[Matrix4x4, BeforeValidator(_rows), AfterValidator(_rigid)]
-"""4x4, or `{xyz: [x, y, z], quaternion: [x, y, z, w]}` in one line."""
+"""A 4x4 matrix, or `{xyz: [x, y, z], quaternion: [x, y, z, w]}` in one line."""
 
 
 class LinkConfig(Stage):
-    """How two cameras, or two LiDARs, are known to lie to one another: a stereo bar, a common mount."""
+    """The known pose between two cameras, or between two LiDARs, for example on a stereo bar or a common mount."""
 
     camera_a: Name | None = Field(default=None, description="name of a camera")
-    camera_b: Name | None = Field(default=None, description="name of another")
-    lidar_a: Name | None = Field(default=None, description="or of a LiDAR")
-    lidar_b: Name | None = Field(default=None, description="and of another")
-    T_a_b: Pose = Field(description="pose of b in the frame of a: maps what b sees to a")
+    camera_b: Name | None = Field(default=None, description="name of another camera")
+    lidar_a: Name | None = Field(default=None, description="or: name of a LiDAR")
+    lidar_b: Name | None = Field(default=None, description="name of another LiDAR")
+    T_a_b: Pose = Field(description="pose of b in the frame of a: maps b coordinates to a coordinates")
     sigma_deg: float = Field(gt=0, le=180, description="standard deviation about each axis, degrees")
     sigma_m: float = Field(gt=0, le=10, description="standard deviation along each axis, m")
 

@@ -1,4 +1,4 @@
-"""The door for a scraper on the same computer."""
+"""The HTTP endpoint for a scraper on the same computer."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from coec.config.base import Stage
 
 class MetricsConfig(Stage):
     """HTTP for a scraper on the same computer: `/metrics` (OpenMetrics) and `/health` (200, or 503 when a
-    calibration is not known to be right). Whoever reaches it reads; nobody changes anything."""
+    calibration is not known to be right). Everybody who reaches the address can read; nobody can change anything."""
 
-    http: str | None = Field(default=None, description="HOST:PORT, as 127.0.0.1:9464; null: nobody listens")
-    insecure: bool = Field(default=False, description="listen on other addresses than loopback, too; health says so")
+    http: str | None = Field(default=None, description="HOST:PORT, such as 127.0.0.1:9464; null: no HTTP")
+    insecure: bool = Field(default=False, description="allow addresses other than loopback; health says so")
 
     @property
     def address(self) -> tuple[str, int] | None:
-        """Host, without brackets, and port; None: nobody listens."""
+        """Host, without brackets, and port; None: no HTTP."""
         if self.http is None:
             return None
         host, _, port = self.http.rpartition(":")
@@ -27,7 +27,7 @@ class MetricsConfig(Stage):
 
     @property
     def is_open(self) -> bool:
-        """Whether other computers may get in."""
+        """Whether other computers can reach it."""
         return self.address is not None and not is_loopback(self.address[0])
 
     @model_validator(mode="after")
@@ -49,8 +49,8 @@ class MetricsConfig(Stage):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this computer gets to an address, without brackets. A name but `localhost` does not count: who
-    answers to it is not for us to know."""
+    """Whether only this computer can reach an address (without brackets). Of names, only `localhost` counts: any other
+    could resolve to any address."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -1,4 +1,4 @@
-"""One camera-LiDAR pair: its streams, where they lie to one another, and the stages of its calibration."""
+"""One camera-LiDAR pair: its streams, the poses between them, and the stages of its calibration."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from coec.config.streams import (
 
 
 class OpenPairConfig(Stage):
-    """One camera-LiDAR pair that may leave to be found what topics of ROS 2 tell: the frames of its sensors, the
-    intrinsics (`CameraInfo`) and how the sensors lie to one another (`/tf_static`). `points: TEXT` is short for
+    """One camera-LiDAR pair that may leave out what the service can read from ROS 2 topics: the frames of its sensors,
+    the intrinsics (`CameraInfo`) and the poses between the sensors (`/tf_static`). `points: TEXT` is short for
     `lidar: {topic: TEXT}`."""
 
-    name: Name = Field(description="of the pair, a part of its keys and files")
+    name: Name = Field(description="name of the pair, part of its keys and file names")
     camera: OpenCameraConfig
     lidar: OpenLidarConfig
     ego: OpenEgoConfig | None = None
@@ -57,7 +57,7 @@ class OpenPairConfig(Stage):
 
 
 class PairConfig(OpenPairConfig):
-    """One camera-LiDAR pair of which everything is known."""
+    """One camera-LiDAR pair whose description is complete."""
 
     camera: CameraConfig
     lidar: LidarConfig

@@ -1,6 +1,7 @@
-"""Poses as people write them and what they come to: the one room of the configuration that calculates.
+"""Calculations with the poses of a configuration; the only module of `config` that needs NumPy.
 
-Others import it where a pose is read, not at their head: whoever reads a configuration without a rig needs no NumPy.
+Other modules import it inside the functions that read a pose, not at their top, so that reading a configuration without
+a rig does not import NumPy.
 """
 
 from __future__ import annotations
@@ -14,16 +15,16 @@ from coec.config.base import Matrix4x4
 from coec.geometry import cameras, se3
 
 LOOKED_AT_M = 15.0
-"""Distance at which it is judged what two sensors see: the middle, on a scale of logarithms, of 2 to 80 m in which
-points count. Beside it half the width of a vehicle is little."""
+"""Distance at which the common view of two sensors is judged. It is about the geometric middle of the 2 to 80 m in
+which points count, and large against half the width of a vehicle."""
 
 AZIMUTHS, ELEVATIONS = 120, 9
-"""Directions, all around and within its elevations, in which a LiDAR is looked at: the view of a telephoto lens of 10°
-holds some."""
+"""Directions that are tested for a LiDAR: azimuths over the full circle, elevations within its own. They are dense
+enough that a telephoto lens of 10° sees some."""
 
 
 def rows_of(xyz_m: tuple[float, float, float], quaternion_xyzw: tuple[float, float, float, float]) -> Matrix4x4:
-    """The pose of a place, metres, and a rotation.
+    """The pose with a position, metres, and a rotation.
 
     Raises:
         ValueError: the quaternion is zero.
@@ -32,13 +33,13 @@ def rows_of(xyz_m: tuple[float, float, float], quaternion_xyzw: tuple[float, flo
 
 
 def is_rigid(rows: Matrix4x4) -> bool:
-    """Whether it is a rotation and a translation."""
+    """Whether the matrix is a rotation and a translation."""
     return se3.is_rigid(np.array(rows))
 
 
 def relative(T_vehicle_a: Matrix4x4, T_vehicle_b: Matrix4x4) -> Matrix4x4:
-    """T_a_b, which maps what b sees to a, of the poses of both in the vehicle's frame. Its rotation is one to the last
-    bit, however few digits those of the poses have."""
+    """T_a_b, which maps b coordinates to a coordinates, from the poses of both in the vehicle's frame. Its rotation is
+    orthonormal to rounding, however few digits the rotations of the poses have."""
     T_a_b = se3.inverse(np.array(T_vehicle_a)) @ np.array(T_vehicle_b)
     unit = se3.rotation_from_quaternion_xyzw(se3.quaternion_xyzw_from_rotation(T_a_b[:3, :3]))
     return _rows(se3.transform_from(unit, T_a_b[:3, 3]))
@@ -46,11 +47,12 @@ def relative(T_vehicle_a: Matrix4x4, T_vehicle_b: Matrix4x4) -> Matrix4x4:
 
 @dataclass(frozen=True, slots=True)
 class Common:
-    """What a camera and a LiDAR both see, as shares of 0 to 1.
+    """How much a camera and a LiDAR see in common, as shares from 0 to 1.
 
     Attributes:
-        of_lidar: of the directions in which the LiDAR measures, those that have a pixel.
-        of_camera: of what the camera would see of such a LiDAR that measured all around.
+        of_lidar: share of the LiDAR's directions that fall on a pixel.
+        of_camera: share, of the directions that the camera would see if the LiDAR measured all around, in which the
+            LiDAR does measure.
     """
 
     of_lidar: float
@@ -64,11 +66,11 @@ def common(
     azimuth_deg: tuple[float, float],
     elevation_deg: tuple[float, float],
 ) -> Common:
-    """What both see. What stands in between, the vehicle itself for instance, is not known here.
+    """How much both see in common. Obstacles in between, such as the vehicle itself, are not taken into account.
 
     Args:
         model, intrinsics: of the camera, see `CameraIntrinsics`.
-        azimuth_deg, elevation_deg: from where to where the LiDAR measures; counter-clockwise from its x, and up.
+        azimuth_deg, elevation_deg: (from, to) of the LiDAR's field of view; counter-clockwise from its x, and up.
 
     Raises:
         ValueError: an intrinsic parameter is missing, not of this model, or out of range.
@@ -90,6 +92,6 @@ def common(
 
 
 def _rows(T: NDArray[np.float64]) -> Matrix4x4:
-    # Adding zero makes no minus of a nought.
+    # Adding zero turns -0.0 into 0.0.
     a, b, c, d = ((float(w), float(x), float(y), float(z)) for w, x, y, z in T + 0.0)
     return a, b, c, d

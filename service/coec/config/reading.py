@@ -1,4 +1,4 @@
-"""From the file of a user to the configuration of a daemon; complaints name their places."""
+"""Reads a user's file into the configuration of a daemon; error messages name the key that is wrong."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def load_config(path: Path) -> Config:
 
 
 def config_of(document: Any) -> Config:
-    """The configuration that a document tells, whose sensors may stand in it once each (see `config.rig`).
+    """The configuration of a document, which may be in the form that lists each sensor once (see `config.rig`).
 
     Raises:
         ConfigError: no mapping, unknown key, wrong type or value out of range; names each place.

@@ -1,8 +1,8 @@
-"""The sensors of a vehicle, each told once, and the pairs that follow: the long form of `pairs` is written from it.
+"""The rig form of a configuration lists each sensor of a vehicle once; the long form of `pairs` follows from it.
 
-A pair of camera C and LiDAR L is named `C-L`, and `C` alone where the vehicle has one LiDAR. Its nominal calibration is
-inverse(T_vehicle_camera) · T_vehicle_lidar where both are told, else it is awaited, as that of any pair. On native keys
-a sensor's `frame_id` is its name unless it is told.
+A pair of camera C and LiDAR L is named `C-L`, or just `C` if the vehicle has one LiDAR. Its nominal calibration is
+inverse(T_vehicle_camera) · T_vehicle_lidar if both poses are given; otherwise it is awaited, as for any pair. On native
+keys a sensor's `frame_id` is its name unless another is given.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from coec.config.streams import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig
 from coec.errors import ConfigError
 
 MAX_SENSORS = 16
-"""Cameras, and LiDARs, of a vehicle."""
+"""Most cameras of a vehicle, and most LiDARs."""
 
 MAX_LINKS = 64
 
 LEAST_OF_LIDAR = 0.005
-"""Share of a LiDAR's directions that a camera must see: 500 points, without which a window takes no pair
-(`window.min_points_in_view`), of the 100,000 of a sweep of 64 beams."""
+"""Least share of a LiDAR's directions that a camera must see. It stands for 500 of the 100,000 points of a sweep of 64
+beams: with fewer points in view a window takes no frame pair (`window.min_points_in_view`)."""
 
 LEAST_OF_CAMERA = 0.1
-"""Share of what a camera would see of a LiDAR all around. Less is a strip at the edge of the image: there lenses are
-known worst, the vehicle itself is in the way, and a strip cannot tell the three rotations apart."""
+"""Least share of the image that the LiDAR must cover: 1 is what a LiDAR that measures all around would cover. Less is a
+strip at the edge of the image. There the lens model is worst and the vehicle itself is in the way, and a strip cannot
+tell the three rotations apart."""
 
 ALL = "all"
 
@@ -40,8 +41,10 @@ T = TypeVar("T")
 class FieldOfView(Stage):
     """Where a LiDAR measures, in its own frame: x ahead, y left, z up."""
 
-    azimuth_deg: tuple[float, float] = Field(default=(-180.0, 180.0), description="from, to; counter-clockwise")
-    elevation_deg: tuple[float, float] = Field(default=(-25.0, 15.0), description="from, to; up")
+    azimuth_deg: tuple[float, float] = Field(
+        default=(-180.0, 180.0), description="[from, to], counter-clockwise from x, degrees"
+    )
+    elevation_deg: tuple[float, float] = Field(default=(-25.0, 15.0), description="[from, to], upwards, degrees")
 
     @model_validator(mode="after")
     def _from_to(self) -> Self:
@@ -55,14 +58,14 @@ class FieldOfView(Stage):
 class RigCamera(OpenCameraConfig):
     """A camera of the vehicle."""
 
-    name: Name = Field(description="of the camera")
+    name: Name = Field(description="name of the camera")
     T_vehicle_camera: Pose | None = Field(default=None, description="pose of the camera in the vehicle's frame")
 
 
 class RigLidar(OpenLidarConfig):
     """A LiDAR of the vehicle."""
 
-    name: Name = Field(description="of the LiDAR")
+    name: Name = Field(description="name of the LiDAR")
     T_vehicle_lidar: Pose | None = Field(default=None, description="pose of the LiDAR in the vehicle's frame")
     field_of_view: FieldOfView = FieldOfView()
 
@@ -70,12 +73,14 @@ class RigLidar(OpenLidarConfig):
 class RigEgo(OpenEgoConfig):
     """The ego-motion of the vehicle."""
 
-    T_lidar_ego: None = Field(default=None, description="follows from the poses of each LiDAR and of this")
-    T_vehicle_ego: Pose = Field(default=IDENTITY, description="pose of the frame in which motion is told")
+    T_lidar_ego: None = Field(
+        default=None, description="not given here: follows from `T_vehicle_ego` and the pose of each LiDAR"
+    )
+    T_vehicle_ego: Pose = Field(default=IDENTITY, description="pose of the ego-motion's frame in the vehicle's frame")
 
 
 class RigStages(Stage):
-    """What may be set of a pair but its sensors."""
+    """Everything that can be set for a pair except its sensors."""
 
     pairing: PairingConfig = PairingConfig()
     window: WindowConfig = WindowConfig()
@@ -90,7 +95,7 @@ class RigPair(RigStages):
 
     camera: Name = Field(description="name of the camera")
     lidar: Name = Field(description="name of the LiDAR")
-    name: Name | None = Field(default=None, description="of the pair, where it is not to be that of its sensors")
+    name: Name | None = Field(default=None, description="name of the pair; by default made from its sensors' names")
 
 
 def _listed(value: Any) -> Any:
@@ -104,13 +109,13 @@ def _listed(value: Any) -> Any:
 class RigConfig(Stage):
     """The sensors of a vehicle."""
 
-    cameras: tuple[RigCamera, ...] = Field(min_length=1, max_length=MAX_SENSORS, description="each told once")
-    lidars: tuple[RigLidar, ...] = Field(min_length=1, max_length=MAX_SENSORS, description="each told once")
+    cameras: tuple[RigCamera, ...] = Field(min_length=1, max_length=MAX_SENSORS, description="each listed once")
+    lidars: tuple[RigLidar, ...] = Field(min_length=1, max_length=MAX_SENSORS, description="each listed once")
     ego: RigEgo | None = None
     pairs: Annotated[tuple[RigPair, ...] | None, BeforeValidator(_listed)] = Field(
-        description="`all` that see something in common; or a list"
+        description="`all`: every camera and LiDAR that see something in common; or a list"
     )
-    stages: RigStages = Field(default=RigStages(), description="of every pair, unless it says otherwise")
+    stages: RigStages = Field(default=RigStages(), description="settings of every pair that does not set its own")
     links: tuple[LinkConfig, ...] = Field(default=(), max_length=MAX_LINKS, description="as in the whole configuration")
 
     @model_validator(mode="after")
@@ -124,7 +129,7 @@ class RigConfig(Stage):
 
 
 def is_rig(document: Mapping[str, Any]) -> bool:
-    """Whether a configuration, as it is written, tells its sensors once each."""
+    """Whether a configuration, as it is written, is in the form that lists each sensor once."""
     return "cameras" in document or "lidars" in document or document.get("pairs") == ALL
 
 
@@ -153,7 +158,7 @@ def written_out(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _names(sensors: Any) -> list[str]:
-    """By index, of sensors as they are written."""
+    """Names of sensors as they are written, by index."""
     if not isinstance(sensors, list | tuple):
         return []
     names = [sensor.get("name") if isinstance(sensor, dict) else None for sensor in sensors[: 2 * MAX_SENSORS]]
@@ -164,7 +169,7 @@ class _Pairs:
     """The pairs of a rig in their long form.
 
     Attributes:
-        left_out: names of those that see nothing in common, when all have been asked for.
+        left_out: if `pairs` is `all`: names of the pairs that were not made, as their sensors see nothing in common.
     """
 
     def __init__(self, rig: RigConfig, *, native: bool) -> None:
@@ -178,7 +183,7 @@ class _Pairs:
         """All of them.
 
         Raises:
-            ConfigError: a sensor is not there, or lacks what nothing else tells.
+            ConfigError: a listed sensor does not exist, or lacks a value that has no other source.
         """
         if self._rig.pairs is None:
             for camera in self._rig.cameras:
@@ -198,7 +203,7 @@ class _Pairs:
     def _pair(self, camera: RigCamera, lidar: RigLidar, written: RigPair | None) -> dict[str, Any]:
         if self._native:
             _check_told(camera, lidar)
-        # Frames of eight cameras have eight names, and those that are told nothing else carry the sensor's.
+        # On native keys each sensor's frames carry its own name, unless a `frame_id` is given.
         frames = {kind: {"frame_id": sensor.name} for kind, sensor in (("camera", camera), ("lidar", lidar))}
         frames = frames if self._native else {"camera": {}, "lidar": {}}
         own = {} if written is None else written.model_dump(exclude_unset=True, exclude={"camera", "lidar"})
@@ -227,7 +232,7 @@ def _found(sensors: Mapping[str, T], name: str, where: str, kind: str) -> T:
 
 
 def _check_told(camera: RigCamera, lidar: RigLidar) -> None:
-    """Native frames tell nothing of their sensors."""
+    """Refuses sensors whose intrinsics or pose are missing: native frames do not tell them."""
     lacking = {
         f"cameras.{camera.name}.intrinsics": camera.intrinsics,
         f"cameras.{camera.name}.T_vehicle_camera": camera.T_vehicle_camera,
@@ -256,7 +261,7 @@ def _ego(ego: RigEgo, lidar: RigLidar) -> dict[str, Any]:
 
 
 def _see_something(camera: RigCamera, lidar: RigLidar) -> bool:
-    """Whether both see enough of the same; True where that is not known yet.
+    """Whether both see enough in common; True where that is not known yet.
 
     Raises:
         ConfigError: the model of the camera refuses its parameters.
@@ -276,7 +281,7 @@ def _see_something(camera: RigCamera, lidar: RigLidar) -> bool:
 
 
 def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Both, key by key; where both say something the second counts."""
+    """Both mappings merged key by key; where both set a value, `own` wins."""
     merged = {**common, **own}
     for name in common.keys() & own.keys():
         if isinstance(common[name], dict) and isinstance(own[name], dict):

@@ -1,4 +1,4 @@
-"""Where the samples of a sensor come from and how they are read: cameras, LiDARs, ego-motion."""
+"""Where the samples of a sensor come from and how they are read: cameras, LiDARs and ego-motion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class CameraIntrinsics(Stage):
     """Intrinsics as in `dataset.yaml`; which of the optional parameters are needed depends on `model`."""
 
     model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"] = Field(
-        description="of the lens"
+        description="model of the lens"
     )
     width: int = Field(gt=0, le=16384, description="image width, px")
     height: int = Field(gt=0, le=16384, description="image height, px")
@@ -22,7 +22,7 @@ class CameraIntrinsics(Stage):
     cx: float = Field(description="principal point, px; pixel centres at integers")
     cy: float = Field(description="principal point, px; pixel centres at integers")
     xi: float | None = Field(
-        default=None, description="shift of the second sphere (double_sphere), of the mirror (mei)"
+        default=None, description="shift of the second sphere (double_sphere) or of the mirror (mei)"
     )
     alpha: float | None = Field(default=None, description="from pinhole to sphere (double_sphere, eucm), 0 to 1")
     beta: float | None = Field(default=None, description="form of the ellipsoid (eucm)")
@@ -36,7 +36,7 @@ class CameraIntrinsics(Stage):
     p2: float | None = Field(default=None, description="tangential (radtan, rational, mei)")
 
     def parameters(self) -> dict[str, float]:
-        """Every intrinsic that was given, by name, without `model`."""
+        """The intrinsics that were given, by name, without `model`."""
         return self.model_dump(exclude={"model"}, exclude_none=True)
 
 
@@ -46,7 +46,7 @@ class SweepConfig(Stage):
 
     period_s: float = Field(default=0.1, gt=0, le=10, description="one revolution, s")
     sign: Literal[-1, 1] = Field(default=-1, description="-1 clockwise seen from above, 1 counter-clockwise")
-    stamp_azimuth_deg: float = Field(default=0.0, ge=-360, le=360, description="azimuth that is measured at the stamp")
+    stamp_azimuth_deg: float = Field(default=0.0, ge=-360, le=360, description="azimuth of the LiDAR at the stamp")
 
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -54,19 +54,19 @@ TimeBase = Literal["stamp", "clock"]
 
 
 class PointTimeConfig(Stage):
-    """How the points of a `PointCloud2` are timed, where their values leave it open."""
+    """How the points of a `PointCloud2` are timed, for clouds whose values do not show it."""
 
-    field: str = Field(min_length=1, max_length=64, description="name of the field")
-    unit: TimeUnit = Field(description="of its values")
+    field: str = Field(min_length=1, max_length=64, description="name of the field with the time")
+    unit: TimeUnit = Field(description="unit of its values")
     base: TimeBase = Field(
-        default="stamp", description="counted since the cloud's stamp, or on the clock that its stamp is of"
+        default="stamp", description="stamp: times since the cloud's stamp; clock: times on the clock of the stamp"
     )
 
 
 Encoding = Literal["msgpack", "cdr"]
 
 TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$", max_length=247)]
-"""A full name of a topic of ROS 2 (rmw/validate_full_topic_name.h)."""
+"""A full ROS 2 topic name (rmw/validate_full_topic_name.h)."""
 
 CameraMessage = Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"]
 LidarMessage = Literal["sensor_msgs/msg/PointCloud2"]
@@ -80,11 +80,12 @@ EgoMessage = Literal[
 
 
 class StreamConfig(Stage):
-    """Where the samples of a stream come from; one text alone is short for its `topic`."""
+    """Where the samples of a stream come from; a text in its place is short for `topic`."""
 
     key: KeyExpression | None = Field(default=None, description="Zenoh key of the frames")
     topic: TopicName | None = Field(
-        default=None, description="of ROS 2, instead of a key, where `middleware` is one of its; its frames are CDR"
+        default=None,
+        description="ROS 2 topic, given instead of `key` unless `middleware` is native; its frames are CDR",
     )
     encoding: Encoding = Field(default="msgpack", description="assumed when a sample names no encoding")
 
@@ -95,13 +96,13 @@ class StreamConfig(Stage):
 
     @property
     def sensor(self) -> str:
-        """What it is called, whatever pairs it is of: its name, or its place where it has none."""
+        """The sensor's name in every pair that it belongs to: `name`, or `place` if it has none."""
         return str(getattr(self, "name", None) or self.place)
 
     @model_validator(mode="before")
     @classmethod
     def _completed(cls, document: Any) -> Any:
-        """A text is the name of a topic, and what comes on topics is CDR."""
+        """A text is the name of a topic, and frames on topics are CDR."""
         if isinstance(document, str):
             document = {"topic": document}
         if isinstance(document, dict) and document.get("topic") is not None:
@@ -118,29 +119,30 @@ class StreamConfig(Stage):
 
 
 class OpenCameraConfig(StreamConfig):
-    """Camera stream of a pair, which may leave its calibration to be found."""
+    """Camera stream of a pair that may leave out the camera's calibration, to be found on ROS 2 topics."""
 
-    name: Name | None = Field(default=None, description="of the camera, whatever pairs it is of: `links` speak of it")
+    name: Name | None = Field(default=None, description="name of the camera, the same in all its pairs; `links` use it")
 
-    frame_id: str | None = Field(default=None, max_length=128, description="frames of another id are refused")
+    frame_id: str | None = Field(default=None, max_length=128, description="images with another frame id are refused")
     type: CameraMessage | None = Field(
         default=None,
-        description="of CDR that does not say its own; unless set CompressedImage, and Image where the name of a topic "
-        "does not end with /compressed. What comes on a topic must have it, if it is set",
+        description="type of CDR messages that do not name theirs; by default CompressedImage, or Image on a topic "
+        "whose name does not end with /compressed. If set, a topic's messages must have this type",
     )
-    intrinsics: CameraIntrinsics | None = Field(default=None, description="of the images as they come")
+    intrinsics: CameraIntrinsics | None = Field(default=None, description="intrinsics of the images as they come")
     info_topic: TopicName | None = Field(
         default=None,
-        description="of the `CameraInfo` that tells intrinsics left out; unless set, `camera_info` beside the images",
+        description="topic of the `CameraInfo` that gives omitted intrinsics; by default `camera_info` beside the "
+        "images",
     )
     mask: FilePath | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
     hardware_id: str | None = Field(
-        default=None, max_length=128, description="its serial number, for ROS diagnostics; null: vehicle/pair"
+        default=None, max_length=128, description="serial number of the camera, for ROS diagnostics; null: vehicle/pair"
     )
 
     @property
     def assumed_type(self) -> CameraMessage:
-        """The type of messages that do not say theirs."""
+        """The type of messages that do not name theirs."""
         if self.type is not None:
             return self.type
         is_raw = self.topic is not None and not self.topic.endswith("/compressed")
@@ -148,69 +150,72 @@ class OpenCameraConfig(StreamConfig):
 
     @property
     def types(self) -> tuple[str, ...]:
-        """Types of messages that this stream takes."""
+        """The message types that this stream accepts."""
         return _types(CameraMessage, self.type if self.topic else None)
 
 
 class CameraConfig(OpenCameraConfig):
     """Camera stream of a pair."""
 
-    frame_id: str = Field(default="camera", max_length=128, description="frames of another id are refused")
+    frame_id: str = Field(default="camera", max_length=128, description="images with another frame id are refused")
     intrinsics: CameraIntrinsics
 
 
 class OpenLidarConfig(StreamConfig):
-    """LiDAR stream of a pair, which may leave its frames to be found."""
+    """LiDAR stream of a pair that may leave out the LiDAR's frames, to be found on ROS 2 topics."""
 
-    name: Name | None = Field(default=None, description="of the LiDAR, whatever pairs it is of: `links` speak of it")
+    name: Name | None = Field(default=None, description="name of the LiDAR, the same in all its pairs; `links` use it")
 
     frame_id: str | None = Field(
-        default=None, max_length=128, description="of the LiDAR; clouds of another id are refused"
+        default=None, max_length=128, description="frame of the LiDAR; clouds with another frame id are refused"
     )
     T_cloud_lidar: Matrix4x4 | None = Field(
-        default=None, description="pose of the LiDAR in the frame in which its driver gives the points"
+        default=None, description="pose of the LiDAR in the frame of the points that its driver sends"
     )
     cloud_frame_id: str | None = Field(
-        default=None, max_length=128, description="of the clouds as they come, where it is not that of the LiDAR"
+        default=None, max_length=128, description="frame of the clouds as they come, if it is not the LiDAR's"
     )
     source: int | None = Field(
         default=None,
         ge=-(2**31),
         lt=2**32,
-        description="of a cloud of several LiDARs: this one's number in the field that tells them apart (lidar_id, "
+        description="if a cloud holds several LiDARs: this one's number in the field that tells them apart (lidar_id, "
         "sensor_id, source_id, device_id or source)",
     )
     sweep: SweepConfig | None = Field(default=None, description="needed for clouds without per-point time")
     time: PointTimeConfig | None = Field(
-        default=None, description="of clouds of ROS; unless set it is recognised from the values"
+        default=None, description="time of the points of ROS clouds; by default recognised from the values"
     )
 
     @property
     def assumed_type(self) -> LidarMessage:
-        """The type of messages that do not say theirs."""
+        """The type of messages that do not name theirs."""
         return "sensor_msgs/msg/PointCloud2"
 
     @property
     def types(self) -> tuple[str, ...]:
-        """Types of messages that this stream takes."""
+        """The message types that this stream accepts."""
         return _types(LidarMessage, None)
 
 
 class LidarConfig(OpenLidarConfig):
     """LiDAR stream of a pair."""
 
-    frame_id: str = Field(default="lidar", max_length=128, description="of the LiDAR; clouds of another id are refused")
+    frame_id: str = Field(
+        default="lidar", max_length=128, description="frame of the LiDAR; clouds with another frame id are refused"
+    )
     T_cloud_lidar: Matrix4x4 = Field(
-        default=IDENTITY, description="pose of the LiDAR in the frame in which its driver gives the points"
+        default=IDENTITY, description="pose of the LiDAR in the frame of the points that its driver sends"
     )
 
 
 class OpenEgoConfig(StreamConfig):
-    """Ego-motion stream of a pair, which may leave its place to be found."""
+    """Ego-motion stream of a pair that may leave out the pose of its frame, to be found on ROS 2 topics."""
 
     type: EgoMessage | None = Field(
         default=None,
-        description="of CDR that does not say its own; Odometry unless set. What comes on a topic must have it, if set",
+        description="type of CDR messages that do not name theirs; by default Odometry. If set, a topic's messages "
+        "must have this type",
     )
     T_lidar_ego: Matrix4x4 | None = Field(default=None, description="maps ego-frame to LiDAR coordinates")
     parent: str = Field(
@@ -222,12 +227,12 @@ class OpenEgoConfig(StreamConfig):
 
     @property
     def assumed_type(self) -> EgoMessage:
-        """The type of messages that do not say theirs."""
+        """The type of messages that do not name theirs."""
         return self.type or "nav_msgs/msg/Odometry"
 
     @property
     def types(self) -> tuple[str, ...]:
-        """Types of messages that this stream takes."""
+        """The message types that this stream accepts."""
         return _types(EgoMessage, self.type if self.topic else None)
 
 
@@ -242,5 +247,5 @@ KnownStreamConfig = CameraConfig | LidarConfig | EgoConfig
 
 
 def _types(known: Any, only: str | None) -> tuple[str, ...]:
-    """Those of a `Literal`, or the one that was asked for."""
+    """The values of a `Literal`, or only the one that was configured."""
     return get_args(known) if only is None else (only,)

@@ -1,4 +1,4 @@
-"""The one configuration of a daemon, and what its parts must agree on."""
+"""The whole configuration of a daemon, and what its parts must agree on."""
 
 from __future__ import annotations
 
@@ -35,11 +35,12 @@ MAX_PAIRS = 32
 class Config(Stage):
     """The one configuration file of a daemon."""
 
-    vehicle: Name = Field(default="vehicle", description="its name, a part of every key: one vehicle, one name")
-    prefix: KeyExpression = Field(default="coec", description="what all keys begin with")
+    vehicle: Name = Field(default="vehicle", description="name of the vehicle, unique, part of every key")
+    prefix: KeyExpression = Field(default="coec", description="beginning of all keys")
     zenoh: ZenohConfig = ZenohConfig()
     middleware: Literal["native", "rmw_zenoh", "ros2dds"] = Field(
-        default="native", description="how topics lie on the bus: native keys, or as ROS 2 nodes or a bridge put them"
+        default="native",
+        description="what frames come on: native Zenoh keys, topics of ROS 2 nodes (rmw_zenoh) or a bridge (ros2dds)",
     )
     ros: RosConfig = RosConfig()
     authority: AuthorityConfig = AuthorityConfig()
@@ -56,27 +57,27 @@ class Config(Stage):
     metrics: MetricsConfig = MetricsConfig()
     uplink: UplinkConfig = UplinkConfig()
     pairs: tuple[PairConfig, ...] = Field(
-        default=(), max_length=MAX_PAIRS, description="what is calibrated: each a camera and a LiDAR"
+        default=(), max_length=MAX_PAIRS, description="what is calibrated; each pair is a camera and a LiDAR"
     )
     awaited: tuple[OpenPairConfig, ...] = Field(
         default=(),
         max_length=MAX_PAIRS,
-        description="entries of `pairs` that leave out what topics of ROS 2 tell; each joins them when it is found",
+        description="entries of `pairs` that leave out what ROS 2 topics tell; each joins `pairs` once that is found",
     )
     links: tuple[LinkConfig, ...] = Field(
         default=(),
         max_length=MAX_LINKS,
-        description="between two cameras, or two LiDARs, whose pose to one another is known",
+        description="known poses between two cameras, or between two LiDARs",
     )
     left_out: tuple[str, ...] = Field(
         default=(),
         max_length=MAX_SENSORS**2,
-        description="what `pairs: all` made no pairs of, as their sensors see nothing in common; only told",
+        description="for information: pairs that `pairs: all` did not make, as their sensors see nothing in common",
     )
 
     @property
     def every_pair(self) -> tuple[OpenPairConfig, ...]:
-        """Those of which everything is known, and then those that are awaited."""
+        """The complete pairs, then the awaited ones."""
         return (*self.pairs, *self.awaited)
 
     @model_validator(mode="before")
@@ -151,7 +152,7 @@ class Config(Stage):
 
 
 def _leaves_out(pair: Any) -> bool:
-    """Whether a pair, as it is written, leaves out what topics of ROS 2 tell."""
+    """Whether a pair, as it is written, leaves out something that ROS 2 topics tell."""
     if not isinstance(pair, dict):
         return False
     lidar, ego = pair.get("lidar", pair.get("points")), pair.get("ego")

@@ -1,4 +1,4 @@
-"""YAML 1.2 whose size, depth and number of values are bounded before anything is built of it."""
+"""A YAML 1.2 reader that bounds size, depth and number of values before it builds anything."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from coec.errors import ConfigError
 
 MAX_YAML_BYTES = 2**20
-"""Of a YAML file; 10,000 frames of a manifest, or pairs beyond number. However few values it has, that is read in 1 s
-(one core at 3 GHz)."""
+"""Largest YAML file: enough for the 10,000 frames of a manifest, and for far more than the allowed pairs. A file of
+this size with few values is read in 1 s (one core at 3 GHz)."""
 
 MAX_YAML_DEPTH = 32
-"""Of ours, none is nested deeper than 6."""
+"""Deepest nesting; no file of coec is nested deeper than 6."""
 
 MAX_YAML_VALUES = 100_000
-"""With the keys; each takes 35 µs to read. 5,200 frames of a manifest with a velocity each, 14,000 without."""
+"""Most values of a file, keys included; each takes 35 µs to read. Enough for a manifest of 5,200 frames with a velocity
+each, or of 14,000 without."""
 
 MERGE = "tag:yaml.org,2002:merge"
 
@@ -52,7 +53,7 @@ def parse_yaml(text: str) -> Any:
     """The document of a YAML 1.2 text.
 
     Raises:
-        ConfigError: it is not YAML, or larger or deeper than anything that a person writes.
+        ConfigError: the text is not YAML, or exceeds one of the limits above.
     """
     if len(text) > MAX_YAML_BYTES:
         raise ConfigError(f"it has more than {MAX_YAML_BYTES} bytes")
@@ -67,22 +68,24 @@ def parse_yaml(text: str) -> Any:
         raise ConfigError(_told(error)) from error
     except YAMLError as error:
         raise ConfigError(" ".join(str(error).split())) from error
-    except Exception as error:  # constructors of numbers, dates and the like raise whatever Python's own do
+    except (
+        Exception
+    ) as error:  # constructors of numbers, dates and the like raise any exception that Python's own raise
         raise ConfigError(f"a value in it is none: {type(error).__name__}") from error
     _check_extent(document)
     return document
 
 
 def _told(error: MarkedYAMLError) -> str:
-    """What is wrong and where, in one line."""
+    """One line that says what is wrong and where."""
     mark = error.problem_mark
     where = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
     return " ".join(f"{where}{error.problem or error.context or 'no YAML'}".split())
 
 
 class _Bounded(Composer):
-    """Gives a document up when it has more values than ours have, not when all of them are read. Merge keys, which
-    YAML 1.2 does not have, would copy values over and over."""
+    """Refuses a document while reading it, as soon as it has too many values. It also refuses merge keys: YAML 1.2 does
+    not have them, and they would copy values over and over."""
 
     def __init__(self, loader: Any = None) -> None:
         super().__init__(loader)
@@ -99,7 +102,8 @@ class _Bounded(Composer):
 
 
 def _check_extent(document: object) -> None:
-    """Aliases make little text a document without end: it is walked as whoever validates it will walk it."""
+    """Checks depth and number of values again with all aliases followed, as a validator would: with aliases a short
+    text can make a huge, even endless document."""
     waiting, values = [(document, 0)], 0
     while waiting:
         value, depth = waiting.pop()
