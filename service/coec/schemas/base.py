@@ -11,25 +11,24 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coec.errors import DecodeError
 
 SCHEMA_VERSION = 6
-"""Version of the models in this package. It is raised when a field is added; a field that changes its meaning
-or goes away needs a new `@v2` in the keys instead."""
+"""Version of the models in this package, raised when a field is added. A field that changes its meaning or goes away
+needs a new `@v2` in the keys instead."""
 
 
 class Part(BaseModel):
-    """A value inside a message. Readers ignore fields that they do not know, so that a newer sender is
-    understood."""
+    """A value inside a message. Readers ignore fields that they do not know, so that they understand newer senders."""
 
     model_config = ConfigDict(
         frozen=True,
         extra="ignore",
         allow_inf_nan=False,
-        # A writer writes every field, also those that a reader could do without.
+        # A writer writes every field, even those that a reader can do without.
         json_schema_serialization_defaults_required=True,
     )
 
 
 class Message(Part):
-    """A value that travels by itself, and therefore says which version of the schema it was written with."""
+    """A value that travels by itself, and therefore carries the version of the schema that it was written with."""
 
     schema_version: int = Field(default=SCHEMA_VERSION, ge=1, description="version of this schema at the writer")
 
@@ -59,7 +58,7 @@ def to_msgpack(model: BaseModel) -> bytes:
 
 
 def from_json(model: type[M], payload: bytes) -> M:
-    """The model that `to_json` wrote, or a newer writer's.
+    """The model that `to_json` wrote, here or in a newer version.
 
     Raises:
         DecodeError: not JSON, or not this model.
@@ -71,8 +70,8 @@ def from_json(model: type[M], payload: bytes) -> M:
 
 
 def from_msgpack(model: type[M], payload: bytes) -> M:
-    """The model that `to_msgpack` wrote, or a newer writer's. For replies, that is for senders one has asked;
-    frames come from anywhere and pass through `coec.adapters.frames.msgpack_frames`, which is stricter.
+    """The model that `to_msgpack` wrote, here or in a newer version. Use it for replies, whose sender was asked. Frames
+    come from anywhere and go through `coec.adapters.frames.msgpack_frames`, which is stricter.
 
     Raises:
         DecodeError: not msgpack, or not this model.
@@ -93,7 +92,7 @@ def _sorted(value: Any) -> Any:
 
 def _places(error: Exception) -> str:
     if isinstance(error, ValidationError):
-        # At most three places, and never the values: they are the sender's text.
+        # At most three places, and never the values: they are text from the sender.
         return "; ".join(
             f"{'.'.join(str(part) for part in item['loc'])}: {item['type']}" for item in error.errors()[:3]
         )

@@ -1,5 +1,5 @@
-"""Documents of `coec sim checks --json`: what checks of simulated drives say, and what the change detector makes of
-them. Radians and metres, as the detector takes them; axes rx ry rz tx ty tz about and along the camera axes."""
+"""Documents of `coec sim checks --json`: the checks of simulated drives, and how the change detector judges them.
+Radians and metres, as the detector takes them; axes rx ry rz tx ty tz about and along the camera axes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from coec.schemas.replies import Count, Vector6
 
 
 class Judged(Part):
-    """One check, judged: see `Observation`, of which it holds what the detector takes."""
+    """One judged check: those fields of `Observation` that the change detector takes."""
 
     offset: Vector6
     sigma: Vector6
@@ -20,17 +20,17 @@ class Judged(Part):
     distance2: float
     flagged: bool
     undecided: bool
-    faint: tuple[str, ...] = Field(description="of what its edges have too little; empty where they are not faint")
-    causes: tuple[str, ...] = Field(description="what is wrong with its data, by code")
+    faint: tuple[str, ...] = Field(description="what its edges have too little of; empty if they are not faint")
+    causes: tuple[str, ...] = Field(description="codes of what is wrong with its data")
 
 
 class CheckedPose(Part):
-    """All checks of a drive at one served pose, one after the other, as two rigs see them: one of which nothing is
-    known, and one that was commissioned on other drives."""
+    """All checks of a drive at one served pose, in order, for two rigs: one that is not commissioned, and one that was
+    commissioned on other drives."""
 
     moved: str = Field(description="`right`, or how far the served pose is off")
     uncommissioned: tuple[Judged, ...]
-    commissioned: tuple[Judged, ...] = Field(description="empty where the rig could not be commissioned")
+    commissioned: tuple[Judged, ...] = Field(description="empty if the rig could not be commissioned")
 
 
 class CheckedDrive(Message):
@@ -46,25 +46,27 @@ class CheckedDrive(Message):
 
 
 class MovedStatistics(Part):
-    """Of all checks at poses that are off by one amount."""
+    """All checks at poses that are off by one amount."""
 
     moved: str
     drives: Count
     checks: Count
-    blind: Count = Field(description="with a cause in their data: they say nothing of the pose")
-    weak: Count = Field(description="with faint edges")
-    undecided: Count = Field(description="with clear edges that neither accuse the pose nor acquit it")
-    clear: Count = Field(description="all others")
-    flagged: Count = Field(description="of the clear ones")
-    flagged_low: float | None = Field(description="95 % interval of that share (Wilson); null of no clear check")
-    flagged_high: float | None
+    blind: Count = Field(description="checks with something wrong in their data: they say nothing about the pose")
+    weak: Count = Field(description="checks with faint edges")
+    undecided: Count = Field(description="checks with clear edges that neither accuse nor acquit the pose")
+    clear: Count = Field(description="all other checks")
+    flagged: Count = Field(description="clear checks that are flagged")
+    flagged_low: float | None = Field(
+        description="lower end of the 95 % interval (Wilson) of the flagged share of clear checks; null without any"
+    )
+    flagged_high: float | None = Field(description="upper end of it")
     suspected: Count = Field(description="drives on which the detector suspected the mount")
-    confirmed: Count = Field(description="drives on which it became certain")
-    delay_checks: tuple[Count, ...] = Field(description="until it did, of each of those")
+    confirmed: Count = Field(description="drives on which the detector became certain")
+    delay_checks: tuple[Count, ...] = Field(description="checks until it became certain, for each of those drives")
 
 
 class PlaceStatistics(Part):
-    """Of all checks of right mounts in places of one kind: how many can tell."""
+    """All checks of right mounts in places of one kind, and how many of them can tell."""
 
     place: str
     checks: Count
@@ -75,34 +77,41 @@ class PlaceStatistics(Part):
 
 
 class HoursStatistics(Part):
-    """What the detector made of a right mount in hours of driving."""
+    """How often the detector accused a right mount in hours of driving."""
 
-    how: str = Field(description="`rendered`, one after the other; or `resampled` from these, place after place")
+    how: str = Field(
+        description="`rendered`: the drives one after the other; `resampled`: drawn from them, place after place"
+    )
     hours: float
     suspicions: Count
     alarms: Count
     alarms_per_100_h_at_most: float = Field(
-        description="of 95 % confidence that alarms come no more often (Poisson); of resampled hours, as if the "
-        "rendered drives were all that there are"
+        description="upper bound of the alarm rate at 95 % confidence (Poisson); for resampled hours it holds as if "
+        "there were no drives but the rendered ones"
     )
-    alarmed: tuple[str, ...] = Field(description="where: rig and place")
+    alarmed: tuple[str, ...] = Field(description="where there were alarms: rig and place")
 
 
 class TailStatistics(Part):
-    """How often a right mount would be accused, from how far off places are, beyond those that were met."""
+    """How often a right mount would be accused: extrapolated to places that displace checks further than any that was
+    met."""
 
-    stay_checks: Count = Field(description="a vehicle is at another place after so many")
+    stay_checks: Count = Field(description="checks after which the vehicle is at another place")
     places: Count = Field(description="drives with a clear check of a right mount")
-    farthest: float = Field(description="displacement of the farthest of them, standard deviations of what places are")
+    farthest: float = Field(
+        description="displacement of the farthest of these places, in standard deviations of `place`"
+    )
     accused_at: float | None = Field(
-        description="displacement at which half of drawn places accuse; null where the farthest drawn do not"
+        description="displacement at which half of the drawn places accuse; null if the farthest drawn do not"
     )
     alarms_per_100_h: float = Field(description="mean over all tails that fit")
-    alarms_per_100_h_at_most: float = Field(description="of 95 % of the tails that fit, by how well they do")
+    alarms_per_100_h_at_most: float = Field(
+        description="bound that 95 % of the tails that fit, weighted by how well they fit, stay below"
+    )
 
 
 class RigStatistics(Part):
-    """Of a rig that was commissioned, or was not."""
+    """Figures of a rig that was commissioned, or was not."""
 
     commissioned: bool
     moved: tuple[MovedStatistics, ...]

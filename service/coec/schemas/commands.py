@@ -1,4 +1,4 @@
-"""Commands on the wire: their names, and the form of one that its sender proves."""
+"""Commands on the wire: their names, their arguments, and the form of a command whose sender proves its name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field
 from coec.schemas.base import Message
 
 CommandName = Literal["calibrate", "apply", "rollback", "reset", "commission", "hold"]
-"""Of CONTRACT."""
+"""Commands of CONTRACT."""
 
 NAMES: Final[tuple[CommandName, ...]] = get_args(CommandName)
 
@@ -37,14 +37,15 @@ REASON: Final = Argument(
 SENSOR: Final = Argument("sensor", str, "of the rig: all pairs of this sensor, and no others")
 
 OF_PAIR: Final[Mapping[str, tuple[Argument, ...]]] = {"rollback": (TO,), "hold": (RELEASE,)}
-"""What a payload may hold, by command, beside the reason that all take."""
+"""What the payload of each command may hold beside the reason, which all commands take."""
 
 MAX_REASON: Final = 200
-"""Characters of a reason: two sentences. In UTF-8 they are far below the limit of a payload."""
+"""Most characters of a reason, about two sentences. In UTF-8 they stay far below the limit of a payload."""
 
 
 def arguments_of(command: str, *, for_rig: bool) -> tuple[Argument, ...]:
-    """What the payload of a command may hold, for a pair or for the rig. A window is of one pair only."""
+    """What the payload of a command may hold, for a pair or for the rig. For the rig there is no `to`, because a window
+    belongs to one pair."""
     own = (*OF_PAIR.get(command, ()), REASON)
     return (*(argument for argument in own if argument is not TO), SENSOR) if for_rig else own
 
@@ -53,7 +54,7 @@ class ProvenCommand(Message):
     """What the sender of a command says inside a TLS conversation (`command/<name>?tls=<conversation>`)."""
 
     selector: str = Field(
-        description="the key of the command and its parameters, as they would stand in a query without proof: what was "
-        "meant for one pair or command cannot be turned into another"
+        description="key and parameters of the command, as in a query without proof, so that nobody can redirect it to "
+        "another pair or command"
     )
     payload: str = Field(default="", description="arguments of the command, a JSON object; empty: none")

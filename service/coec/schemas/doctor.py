@@ -12,17 +12,17 @@ Level = Literal["ok", "warn", "fail"]
 
 
 class Finding(Part):
-    """One thing that was looked at."""
+    """One thing that was checked."""
 
-    check: str = Field(description="what was looked at, one of a fixed set of words")
-    level: Level = Field(description="fail: the service cannot do its work so; warn: it can, but see to it")
+    check: str = Field(description="what was checked, one of a fixed set of words")
+    level: Level = Field(description="fail: the service cannot work like this; warn: it can, but needs attention")
     where: str = Field(description="file, endpoint, key or pair; empty for the computer as a whole")
     text: str = Field(description="what was found, one sentence")
-    advice: str | None = Field(default=None, description="what to do about it; null where nothing is to be done")
+    advice: str | None = Field(default=None, description="what to do about it; null if there is nothing to do")
 
 
 class DoctorReport(Message):
-    """Everything that was looked at, in the order in which one thing depends on another."""
+    """Everything that was checked; each finding depends only on those before it."""
 
-    healthy: bool = Field(description="whether nothing failed; the exit code is 0 then")
+    healthy: bool = Field(description="whether nothing failed; then the exit code is 0")
     findings: tuple[Finding, ...]

@@ -1,5 +1,5 @@
-"""JSON Schemas of the wire models: `python -m coec.schemas.export DIR` writes them (committed under
-`schemas/v1`)."""
+"""JSON Schemas of the wire models. `python -m coec.schemas.export DIR` writes them; they are committed under
+`schemas/v1`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SENT: tuple[type[Message], ...] = (
     frames.EgoMotion,
     commands.ProvenCommand,
 )
-"""To the service; all others come from it."""
+"""Messages to the service; all others come from it."""
 
 MESSAGES: tuple[type[Message], ...] = (
     *SENT,
@@ -74,7 +74,7 @@ def schemas() -> dict[str, dict[str, Any]]:
     return {
         f"{message.__name__}.json": {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
-            # What a sender may leave out, and what a reply always holds.
+            # Validation schemas show what a sender may leave out, serialization schemas what a reply always holds.
             **message.model_json_schema(mode="validation" if message in SENT else "serialization"),
         }
         for message in MESSAGES
@@ -87,7 +87,7 @@ def text(schema: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Writes every schema into the folder that is the only argument."""
+    """Writes every schema into a folder, the only argument."""
     if len(arguments) != 1:
         sys.stderr.write("usage: python -m coec.schemas.export DIR\n")
         return 2

@@ -1,4 +1,4 @@
-"""What is said of many windows that were judged again: a row each, and a summary of a batch.
+"""Documents about many windows that were judged again: a row for each window, and a summary of the batch.
 
 Angles in degrees, lengths in metres, axes rx ry rz tx ty tz about and along the camera axes.
 """
@@ -11,55 +11,55 @@ from coec.schemas.base import Message, Part
 from coec.schemas.replies import CalibrationResult, Count, Counts, Maybe6
 
 AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
-"""Columns of a correction, in its order; `sigma_` before them is its standard deviation."""
+"""Columns of a correction, in order; with the prefix `sigma_` they hold its standard deviations."""
 
 SEEN = (0.5, 0.5, 0.5, 0.1, 0.1, 0.1)
-"""Steps, deg and m, that a monitor has to see: the measure of a drift."""
+"""Steps, deg and m, that a monitor has to detect; drifts are measured in them."""
 
 
 class WindowRow(Message):
-    """A window of a batch, as it is kept until it becomes a row of a table. It holds a result or an error."""
+    """A window of a batch, kept until it becomes a row of a table. It holds either a result or an error."""
 
     url: str = Field(description="where the window was found; its name in the batch")
-    sha256: str | None = Field(description="of the whole file, hexadecimal; null where it could not be read")
-    bytes: Count | None = Field(description="of the file")
-    vehicle: str = Field(description="as the window says; empty where it does not")
+    sha256: str | None = Field(description="hash of the whole file, hexadecimal; null if it could not be read")
+    bytes: Count | None = Field(description="size of the file")
+    vehicle: str = Field(description="vehicle named in the window; empty if it names none")
     result: CalibrationResult | None = Field(default=None, description="what was decided; null with an error")
     recorded: str | None = Field(default=None, description="sha256 of the result in the file, as canonical JSON")
-    decided: str | None = Field(default=None, description="likewise of `result`: equal where the decision is the same")
+    decided: str | None = Field(default=None, description="sha256 of `result`; equals `recorded` if both agree")
     error_code: str | None = Field(default=None, description="why there is no result, for programs")
-    error: str | None = Field(default=None, description="likewise, for people")
-    seconds: float = Field(ge=0, description="that reading and solving took, by the clock on the wall")
-    cpu_s: float = Field(ge=0, description="processor time of the same")
-    versions: dict[str, str] = Field(description="of the program and of what it calculates with")
+    error: str | None = Field(default=None, description="why there is no result, for people")
+    seconds: float = Field(ge=0, description="wall-clock time of reading and solving")
+    cpu_s: float = Field(ge=0, description="processor time of reading and solving")
+    versions: dict[str, str] = Field(description="versions of the program and of the libraries it calculates with")
 
 
 class BatchReport(Message):
     """What `coec batch --json` prints."""
 
     output: str = Field(description="folder of the tables")
-    windows: Count = Field(description="that there are")
-    kept: Count = Field(description="of them, judged before this run")
+    windows: Count = Field(description="windows of the batch")
+    kept: Count = Field(description="windows that were judged before this run")
     accepted: Count
     refused: Count
     errors: Counts = Field(description="windows without a result, by code")
-    compared: Count = Field(description="windows whose vehicle had decided, too, and that hold its result")
-    differing: Count = Field(description="of them, those with another decision now, to the byte")
-    elapsed_s: float = Field(ge=0, description="of this run")
-    cpu_s: float = Field(ge=0, description="of this run's windows, in all processes")
+    compared: Count = Field(description="windows that hold the result of their vehicle")
+    differing: Count = Field(description="compared windows whose result differs now, to the byte")
+    elapsed_s: float = Field(ge=0, description="duration of this run")
+    cpu_s: float = Field(ge=0, description="processor time for this run's windows, in all processes")
     share_of_ideal: float | None = Field(
-        description="time that this run's windows took, over cores and elapsed time: 1 where no core ever waited"
+        description="time that this run's windows took, over cores × elapsed time: 1 if no core ever waited"
     )
 
 
 class DayOfPair(Part):
     """Accepted windows of a pair on one day; null on axes that none of them told."""
 
-    date: str = Field(description="UTC, as 2026-11-22")
+    date: str = Field(description="UTC, such as 2026-11-22")
     windows: Count
-    low: Maybe6 = Field(description="16th percentile of the correction: one standard deviation below, were it normal")
-    middle: Maybe6 = Field(description="median")
-    high: Maybe6 = Field(description="84th percentile")
+    low: Maybe6 = Field(description="16th percentile of the correction; one standard deviation below if it is normal")
+    middle: Maybe6 = Field(description="median of the correction")
+    high: Maybe6 = Field(description="84th percentile of the correction")
 
 
 class PairOfFleet(Part):
@@ -72,10 +72,10 @@ class PairOfFleet(Part):
     errors: Count = Field(description="windows without a result")
     last_ns: int | None = Field(description="stamp of the last window with a result, ns")
     latest: Maybe6 = Field(description="median of the last accepted windows; null on axes that they do not tell")
-    drift: Maybe6 = Field(description="`latest` less the median of as many that were accepted first")
-    slope: Maybe6 = Field(description="of the corrections over time, per 30 days; null with windows of one day")
-    worst: str | None = Field(description="axis that drifted furthest, measured by what a monitor has to see")
-    urgency: float = Field(ge=0, description="drift of that axis, in multiples of that")
+    drift: Maybe6 = Field(description="`latest` minus the median of as many windows that were accepted first")
+    slope: Maybe6 = Field(description="slope of the corrections over time, per 30 days; null with windows of one day")
+    worst: str | None = Field(description="axis that drifted furthest, in steps that a monitor has to detect")
+    urgency: float = Field(ge=0, description="drift of that axis in such steps")
     days: tuple[DayOfPair, ...]
 
 
@@ -92,11 +92,11 @@ class FigureOfFleet(Part):
 
 
 class ChangedWindow(Part):
-    """A window that is decided otherwise than before."""
+    """A window whose decision changed."""
 
     vehicle: str
     window_id: str
-    before: str = Field(description="`accepted`, or codes of the reasons or the error")
+    before: str = Field(description="`accepted`, or codes of the reasons or of the error")
     now: str
     rotation_deg: float | None = Field(description="largest difference of the corrections; null without two results")
     translation_m: float | None
@@ -109,22 +109,22 @@ class FleetChanges(Part):
     identical: Count = Field(description="to the byte")
     newly_accepted: Count
     newly_refused: Count
-    newly_failing: Count = Field(description="without a result now, with one before")
-    rotation_deg: float | None = Field(description="root mean square over windows accepted twice")
+    newly_failing: Count = Field(description="with a result before, without one now")
+    rotation_deg: float | None = Field(description="root mean square difference over windows accepted both times")
     translation_m: float | None
-    windows: tuple[ChangedWindow, ...] = Field(description="decided otherwise, those furthest apart first")
+    windows: tuple[ChangedWindow, ...] = Field(description="changed decisions, largest differences first")
 
 
 class FalseAlarms(Part):
-    """What became of the alarms of a fleet's pairs, by their last words."""
+    """What became of the alarms of a fleet's pairs, according to their last words."""
 
-    pairs: Count = Field(description="that have told")
-    watched_h: float = Field(ge=0, description="sensor time between completed checks, of all pairs, h")
+    pairs: Count = Field(description="pairs whose last word counts alarms")
+    watched_h: float = Field(ge=0, description="sensor time between completed checks, summed over all pairs, h")
     confirmed: Count = Field(description="alarms that ended with another extrinsic")
-    withdrawn: Count = Field(description="alarms that ended with the extrinsic that they accused: false ones")
-    per_100_h: float | None = Field(description="of false ones, in 100 h of a pair; null where nobody watched")
-    per_100_h_at_most: float | None = Field(description="upper end of that: exceeded once in twenty (Poisson)")
-    by_pair: dict[str, Count] = Field(description="false ones by vehicle/pair, of the pairs that have any")
+    withdrawn: Count = Field(description="false alarms: they ended with the extrinsic that they had accused")
+    per_100_h: float | None = Field(description="false alarms per 100 h of a pair; null if nothing was watched")
+    per_100_h_at_most: float | None = Field(description="upper bound of that rate, exceeded once in twenty (Poisson)")
+    by_pair: dict[str, Count] = Field(description="false alarms by vehicle/pair, for pairs that have any")
 
 
 class FleetReport(Message):

@@ -14,25 +14,25 @@ Standing = Literal["live", "parked", "silent"]
 
 
 class PairNow(Part):
-    """A pair of a vehicle. Nothing in it is newer than its last word; ages are by now."""
+    """A pair of a vehicle. Nothing in it is newer than its last word; ages are counted up to now."""
 
     word: LastWord
     standing: Standing = Field(
-        description="`live`: it says so now; `parked`: it took its leave; `silent`: it is overdue, or its vehicle has "
-        "gone without leave, and its state is that of then"
+        description="`live`: its last word is current; `parked`: it said goodbye; `silent`: it is overdue, or its "
+        "vehicle left without a goodbye, and the state shown is the last known one"
     )
-    said_s: float = Field(ge=0, description="since it said this, s")
+    said_s: float = Field(ge=0, description="age of its last word, s")
     looked_s: float | None = Field(description="age of its last evaluated data, s; null before the first")
     worst: Literal["rx", "ry", "rz", "tx", "ty", "tz"] | None = Field(description="axis that drifted furthest")
-    urgency: float = Field(ge=0, description="drift of that axis, in multiples of what a monitor has to see")
+    urgency: float = Field(ge=0, description="drift of that axis, in steps that a monitor has to detect")
 
 
 class FleetNow(Message):
     """Pairs of many vehicles, the most urgent first."""
 
     vehicles: Count
-    known: Count = Field(description="pairs that have said something")
-    states: Counts = Field(description="pairs that are live, by state; `parked` and `silent` are the others")
+    known: Count = Field(description="pairs with a last word")
+    states: Counts = Field(description="live pairs by state; the others as `parked` and `silent`")
     matching: Count = Field(description="pairs that the filter lets through")
-    pairs: tuple[PairNow, ...] = Field(description="of them, the first")
-    refused: Counts = Field(description="words that were not taken, by cause")
+    pairs: tuple[PairNow, ...] = Field(description="the first of the matching pairs")
+    refused: Counts = Field(description="last words that were refused, by cause")

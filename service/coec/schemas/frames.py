@@ -1,4 +1,4 @@
-"""Wire models of the native encoding of frames in: one msgpack map per message.
+"""Wire models of frames sent to the service in the native encoding: one msgpack map per message.
 
 Stamps are sensor time in integer nanoseconds. Numbers in `bin` columns are little-endian.
 """
@@ -16,9 +16,7 @@ END_OF_ROS_TIME_NS = 2**31 * 10**9
 
 StampNs = Annotated[int, Field(ge=0, lt=END_OF_ROS_TIME_NS, description="sensor time, ns")]
 FrameId = Annotated[str, Field(max_length=128, description="coordinate frame of the sensor")]
-Sequence = Annotated[
-    int | None, Field(ge=0, lt=2**63, description="counts frames at the sender; gaps are counted as loss")
-]
+Sequence = Annotated[int | None, Field(ge=0, lt=2**63, description="frame counter of the sender; gaps count as loss")]
 # 1000 m/s and 1000 rad/s lie beyond every vehicle and gyroscope: more is a broken sender, not motion.
 Velocity = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Vector3 = tuple[Velocity, Velocity, Velocity]
@@ -51,8 +49,10 @@ class Image(Part):
         "bayer_grbg16",
         "yuv422",
         "yuv422_yuy2",
-    ] = Field(description="layout of `data`; raw ones as sensor_msgs names them, 16 bits little-endian")
-    data: bytes = Field(min_length=1, description="the compressed file, or height × width × bytes of a pixel")
+    ] = Field(description="layout of `data`; raw layouts have the names of sensor_msgs; 16-bit values little-endian")
+    data: bytes = Field(
+        min_length=1, description="the compressed file, or raw pixels: height × width × bytes per pixel"
+    )
     width: int | None = Field(default=None, ge=1, description="px; required for raw pixels, else read from `data`")
     height: int | None = Field(default=None, ge=1, description="px; required for raw pixels, else read from `data`")
 
@@ -75,7 +75,7 @@ class CameraFrame(Message):
     frame_id: FrameId
     sequence: Sequence = None
     image: Image
-    depth: Depth | None = Field(default=None, description="used instead of a depth network where configured so")
+    depth: Depth | None = Field(default=None, description="used in place of a depth network if configured (`stereo`)")
 
 
 class LidarFrame(Message):
@@ -102,5 +102,5 @@ class EgoMotion(Message):
     stamp_ns: StampNs
     frame_id: FrameId
     sequence: Sequence = None
-    linear_mps: Vector3 | None = Field(description="x y z, m/s; null: not known, as of an IMU")
+    linear_mps: Vector3 | None = Field(description="x y z, m/s; null: not known, as from an IMU")
     angular_radps: Vector3 = Field(description="about x y z, rad/s")

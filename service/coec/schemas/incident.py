@@ -1,4 +1,4 @@
-"""What `coec fetch` brings home of a red event, and whether that is what the vehicle had."""
+"""The report of `coec fetch`: what it fetched about a red event, and whether that matches what the vehicle has."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coec.schemas.replies import Count, Decision
 class FetchedFile(Part):
     """A file in the folder."""
 
-    name: str = Field(description="from the folder")
+    name: str = Field(description="path relative to the folder")
     sha256: str = Field(description="hexadecimal")
     size_bytes: Count
 
@@ -20,18 +20,17 @@ class FetchedWindow(Part):
     """A window before or after the event."""
 
     window_id: str
-    sha256: str = Field(description="of the file, the one that the vehicle's list says")
+    sha256: str = Field(description="hash of the file, equal to that in the vehicle's list")
     size_bytes: Count
     pairs: Count | None
     decision: Decision | None
     in_history: bool | None = Field(
-        description="whether the result in the file is the one in the vehicle's history; null where one of the two is "
-        "missing"
+        description="whether the result in the file is the one in the vehicle's history; null if one of them is missing"
     )
 
 
 class Absent(Part):
-    """What is not in the folder."""
+    """Something that could not be fetched."""
 
     what: str
     why: str
@@ -44,13 +43,13 @@ class IncidentReport(Message):
     vehicle: str
     pair: str
     event_id: str
-    fetched_ns: Count = Field(description="wall clock of who fetched, ns since 1970")
-    version: str = Field(description="of the program that fetched")
+    fetched_ns: Count = Field(description="wall clock of the fetching computer, ns since 1970")
+    version: str = Field(description="version of the program that fetched")
     files: tuple[FetchedFile, ...]
     windows: tuple[FetchedWindow, ...]
-    entries: Count = Field(description="of the history, around the event")
+    entries: Count = Field(description="entries of the history around the event")
     chain_holds: bool | None = Field(
-        description="whether each of these entries holds the hash of the one before it in its book, as far as both are "
-        "here; null where there are no two"
+        description="whether each of these entries holds the hash of the one before it in its book, where both were "
+        "fetched; null without two such entries"
     )
     absent: tuple[Absent, ...]

@@ -13,10 +13,11 @@ VERSION_CHUNK: Final = "@v1"
 """A chunk that starts with `@` is not matched by `**`: the version never leaks into wildcards."""
 
 RIG: Final = "rig"
-"""What all pairs of a vehicle together are called, in the place of a pair."""
+"""Stands in a key in place of a pair, for all pairs of a vehicle together."""
 
 LAST: Final = "last"
-"""In the place of a pair: below it lies the last word of each, for whoever keeps it while the vehicle is parked."""
+"""Stands in a key in place of a pair; below it are the last words of all pairs, which a storage keeps while the vehicle
+is parked."""
 
 MAX_LIMIT: Final = 10_000
 """Most results in one reply of `history`, as many as the state keeps at most (config.StateConfig.history)."""
@@ -25,8 +26,7 @@ MAX_LENGTH: Final = 16 * 2**20
 """Most bytes in one reply of `windows/<id>`: half of Zenoh's configured message size."""
 
 COMMAND_TIMEOUT_MS: Final = 10_000
-"""Of a command that does not say: after this a Zenoh client gives up that does not say either
-(`queries_default_timeout`)."""
+"""Timeout of a command that gives none; a Zenoh client that gives none waits as long (`queries_default_timeout`)."""
 
 MAX_COMMAND_TIMEOUT_MS: Final = 600_000
 
@@ -36,8 +36,8 @@ _FORMATS: Final[dict[str, Format]] = {"msgpack": "msgpack", "json": "json"}
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """What a key names: `resource` of `pair`, or of the vehicle where `pair` is None; `argument` is the
-    window's id or the command's name."""
+    """What a key names: `resource` of `pair`, or of the vehicle if `pair` is None. `argument` is the id of the window
+    or event, or the command's name."""
 
     pair: str | None
     resource: str
@@ -46,12 +46,12 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What a daemon says of itself to other daemons of its vehicle.
+    """What a daemon tells other daemons of its vehicle about itself.
 
     Attributes:
         daemon: its Zenoh id, hexadecimal.
         since_ns: wall clock at its start.
-        serving: whether it answers; before that it starts.
+        serving: whether it answers queries; False while it starts.
     """
 
     daemon: str
@@ -88,11 +88,11 @@ class Keys:
 
     @property
     def rig(self) -> str:
-        """Queryable, and published on change: all sensors of the vehicle together."""
+        """Queryable, and published on change: state of all sensors of the vehicle."""
         return f"{self.root}/{RIG}"
 
     def last(self, pair: str) -> str:
-        """Queryable, and published on change and from time to time: the last word of a pair; `pair` may be `*`."""
+        """Queryable, and published on change and periodically: the last word of a pair; `pair` may be `*`."""
         return f"{self.root}/{LAST}/{pair}"
 
     def extrinsic(self, pair: str) -> str:
@@ -120,7 +120,7 @@ class Keys:
         return f"{self.root}/{pair}/overlay"
 
     def evidence(self, pair: str) -> str:
-        """Queryable: list of red events that are kept."""
+        """Queryable: list of the kept red events."""
         return f"{self.root}/{pair}/evidence"
 
     def evidence_of(self, pair: str, event_id: str) -> str:
@@ -128,8 +128,8 @@ class Keys:
         return f"{self.root}/{pair}/evidence/{event_id}"
 
     def command(self, pair: str, name: str) -> str:
-        """Queryable with payload; `name` may be `*`. Of `RIG`: for all pairs, or for those of the sensor that the
-        payload names."""
+        """Queryable with payload; `name` may be `*`. With `RIG` as pair: for all pairs, or for those of the sensor that
+        the payload names."""
         return f"{self.root}/{pair}/command/{name}"
 
     def alive(self, pair: str) -> str:
@@ -185,14 +185,14 @@ class Keys:
 
 @dataclass(frozen=True, slots=True)
 class Selector:
-    """Parameters behind the `?` of a query that has none of its own."""
+    """Parameters behind the `?` of a query whose resource adds none."""
 
     format: Format = "msgpack"
 
 
 @dataclass(frozen=True, slots=True)
 class ExtrinsicSelector:
-    """A reply, or (`export` is not None) a file of another program, between its frames or those that are named."""
+    """A reply, or, if `export` is not None, a file for another program, between the pair's frames or the named ones."""
 
     format: Format = "msgpack"
     export: str | None = None
@@ -202,9 +202,9 @@ class ExtrinsicSelector:
 
 @dataclass(frozen=True, slots=True)
 class CommandSelector:
-    """How long the sender of a command waits for its acknowledgement, ms from when the command comes to the service; no
-    clock is shared. What could not be begun by then is not done. `conversation` is the one in which its sender proves
-    who he is; None: he does not."""
+    """How long the sender of a command waits for the acknowledgement, ms, counted from the arrival of the command at
+    the service because the two share no clock. A command that cannot start in that time is not carried out.
+    `conversation` is the id of the TLS conversation in which the sender proves its name; None: no proof."""
 
     timeout_ms: int = COMMAND_TIMEOUT_MS
     conversation: str | None = None
@@ -213,7 +213,7 @@ class CommandSelector:
 
 @dataclass(frozen=True, slots=True)
 class HistorySelector:
-    """`since` and `until` bound `data_stamp_ns` (inclusive); `limit` keeps the newest of them."""
+    """`since` and `until` bound `data_stamp_ns` (inclusive); of these, `limit` keeps the newest."""
 
     since_ns: int = 0
     until_ns: int = 2**63 - 1
@@ -240,7 +240,7 @@ class OverlaySelector:
 
 @dataclass(frozen=True, slots=True)
 class EvidenceSelector:
-    """A picture of the event, or (None) the event itself."""
+    """A picture of the event, or, with `overlay` None, the event itself."""
 
     overlay: Literal["before", "after"] | None = None
     format: Format = "msgpack"
@@ -360,7 +360,7 @@ def _integer(given: dict[str, str], name: str, default: int, low: int, high: int
     text = given.get(name)
     if text is None:
         return default
-    # str.isdigit also accepts other scripts' digits, and int() signs, spaces and underscores: not here.
+    # Plain digits only: str.isdigit also accepts digits of other scripts, and int() signs, spaces and underscores.
     if not (text.isascii() and text.isdigit() and len(text) <= 19 and low <= int(text) <= high):
         raise UsageError(f"parameter `{name}` must be a whole number from {low} to {high}")
     return int(text)

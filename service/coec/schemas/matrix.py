@@ -1,4 +1,4 @@
-"""Documents of `coec sim matrix --json`: what the estimator and the monitor make of many simulated drives.
+"""Documents of `coec sim matrix --json`: how the estimator and the monitor perform on many simulated drives.
 
 Angles in degrees, lengths in metres, axes rx ry rz tx ty tz about and along the camera axes. Errors are taken against
 the truth at the last pair. A number that could not be computed is null.
@@ -15,31 +15,31 @@ from coec.schemas.replies import Count, Counts, Maybe6
 
 
 class SolvedWindow(Part):
-    """One window, solved from a start that is off."""
+    """One window, solved from a start away from the truth."""
 
     pairs: Count
-    start_deg: float = Field(description="angle from the truth at which the search began")
-    start_m: float = Field(description="and distance; with 3 dof that of the centre that is held")
+    start_deg: float = Field(description="angle between the start of the search and the truth")
+    start_m: float = Field(description="distance between the start and the truth; with 3 dof it stays as it is")
     accepted: bool
     hit: bool = Field(description="within the limits of a hit; with 6 dof the translation counts, too")
     rotation_deg: float | None = Field(description="angle of the rotation error; null without an estimate")
     translation_m: float | None
     error: Maybe6 = Field(description="null on axes that were not solved")
     sigma: Maybe6 = Field(description="as the estimate claims it")
-    reasons: tuple[str, ...] = Field(description="codes for which it was refused")
+    reasons: tuple[str, ...] = Field(description="codes of the reasons why it was refused")
     evaluations: Count
     failure: str | None = Field(description="why there is no estimate")
 
 
 class Watched(Part):
-    """Checks of one served pose along a drive, one after the other, through the change detector."""
+    """The checks of one served pose along a drive, in order, through the change detector."""
 
     moved: str = Field(description="`right`, or how far the served pose is off")
     checks: Count
     flagged: Count = Field(description="checks over their limits")
-    blind: Count = Field(description="checks with a cause in the data: they say nothing of the pose")
-    alarms: Count = Field(description="times that the detector became certain of a wrong mount")
-    seconds: float = Field(ge=0, description="of driving that the checks cover")
+    blind: Count = Field(description="checks with something wrong in the data: they say nothing about the pose")
+    alarms: Count = Field(description="how often the detector became certain of a wrong mount")
+    seconds: float = Field(ge=0, description="seconds of driving that the checks cover")
     delay_checks: Count | None = Field(description="checks until the first alarm; null without one")
 
 
@@ -55,31 +55,31 @@ class MatrixRow(Message):
     seed: Count
     source: str = Field(description="SOURCE that draws it again")
     windows: dict[Literal["3", "6"], tuple[SolvedWindow, ...]] = Field(description="by degrees of freedom")
-    watched: tuple[Watched, ...] = Field(description="empty where the mount itself moves")
+    watched: tuple[Watched, ...] = Field(description="empty if the mount itself moves")
     failure: str | None = Field(default=None, description="why the drive has no result")
-    settings: str = Field(description="what decides the result beside the drive; another one is run again")
-    cpu_s: float = Field(ge=0, description="of one core, drawing included")
+    settings: str = Field(description="what else decides the result; a row with other settings is run again")
+    cpu_s: float = Field(ge=0, description="processor time of one core, drawing included, s")
 
 
 class AxisStatistics(Part):
-    """Of one axis, over the accepted windows that solved it."""
+    """Errors on one axis, over the accepted windows that solved it."""
 
     axis: Literal["rx", "ry", "rz", "tx", "ty", "tz"]
     windows: Count
     bias: float | None = Field(description="mean error")
     rms: float | None
     mean_sigma: float | None
-    sigma_over_rms: float | None = Field(description="mean sigma over rms error: 1 is right, more hides")
-    rms_normalised: float | None = Field(description="of error over sigma: 1 is right, more claims too much")
-    within_1: float | None = Field(description="share of errors within 1 sigma; 0.683 of a normal distribution")
-    within_2: float | None = Field(description="0.954")
-    within_3: float | None = Field(description="0.997")
+    sigma_over_rms: float | None = Field(description="mean sigma over rms error: 1 is right, more is too cautious")
+    rms_normalised: float | None = Field(description="rms of error over sigma: 1 is right, more claims too much")
+    within_1: float | None = Field(description="share of errors within 1 sigma; 0.683 for normal errors")
+    within_2: float | None = Field(description="share within 2 sigma; 0.954 for normal errors")
+    within_3: float | None = Field(description="share within 3 sigma; 0.997 for normal errors")
 
 
 class GroupStatistics(Part):
-    """Of the drives that have one property in common."""
+    """Windows of the drives that have one property in common."""
 
-    of: str = Field(description="scene, lens, lidar, light or fault")
+    of: str = Field(description="the property: scene, lens, lidar, light or fault")
     value: str
     windows: Count
     hits: Count
@@ -89,7 +89,7 @@ class GroupStatistics(Part):
 
 
 class SolveStatistics(Part):
-    """Of all windows of one number of degrees of freedom."""
+    """All windows solved with one number of degrees of freedom."""
 
     dof: Literal[3, 6]
     windows: Count
@@ -97,26 +97,28 @@ class SolveStatistics(Part):
     accepted: Count
     accepted_hits: Count
     accepted_wrong: Count = Field(description="off by more than the limit and by more than 4 sigma on some axis")
-    wrong: tuple[str, ...] = Field(description="the names of these, with axis, error and sigma")
+    wrong: tuple[str, ...] = Field(description="names of the accepted wrong ones, with axis, error and sigma")
     axes: tuple[AxisStatistics, ...]
     groups: tuple[GroupStatistics, ...]
     reasons: Counts = Field(description="refused windows by code; a window may have several")
 
 
 class WatchStatistics(Part):
-    """Of all checks of one served pose."""
+    """All checks of one served pose."""
 
     moved: str
     drives: Count
     checks: Count
-    flagged: float | None = Field(description="share of the checks that could tell")
+    flagged: float | None = Field(description="flagged share of the checks that could tell")
     blind: Count
     alarms: Count
     alarmed: Count = Field(description="drives with an alarm")
     hours: float
     alarms_per_hour: float | None
-    median_delay_checks: float | None = Field(description="of the drives with an alarm")
-    names: tuple[str, ...] = Field(description="drives with an alarm at the right pose, drives without one elsewhere")
+    median_delay_checks: float | None = Field(description="over the drives with an alarm")
+    names: tuple[str, ...] = Field(
+        description="the drives that went wrong: with an alarm at the right pose, without one at any other"
+    )
 
 
 class MatrixReport(Message):

@@ -1,8 +1,7 @@
 """Wire models of everything that coec answers, publishes and writes into files.
 
-Conventions: `camera_from_lidar` maps LiDAR coordinates (x forward, y left, z up) to camera coordinates (x
-right, y down, z forward). Corrections are taken about the camera axes. A number that could not be computed is
-null.
+Conventions: `camera_from_lidar` maps LiDAR coordinates (x forward, y left, z up) to camera coordinates (x right, y
+down, z forward). Corrections are about the camera axes. A number that could not be computed is null.
 """
 
 from __future__ import annotations
@@ -37,10 +36,10 @@ ROS_LEVELS: dict[HealthState, Literal[0, 1, 2, 3]] = {
     "stale": 3,
     "unknown": 3,
 }
-"""Level of `diagnostic_msgs/DiagnosticStatus`: 0 OK, 1 WARN, 2 ERROR, 3 STALE. Unknown never reads as OK."""
+"""Level of `diagnostic_msgs/DiagnosticStatus`: 0 OK, 1 WARN, 2 ERROR, 3 STALE. `unknown` is never OK."""
 
 STUCK: Final = "service_stuck"
-"""Code of the reason that a reply has not been renewed: what it says may not be so any more."""
+"""Code of the reason that a reply has not been renewed, so that it may be out of date."""
 
 
 # --- parts --------------------------------------------------------------------------------------------------
@@ -55,7 +54,7 @@ class Transform(Part):
 
 
 class Reason(Part):
-    """Why."""
+    """One reason, for programs and for people."""
 
     code: str = Field(description="machine-readable, stable")
     text: str = Field(description="one sentence for people")
@@ -64,9 +63,9 @@ class Reason(Part):
 class MetricReply(Part):
     """A figure of self-diagnosis with its limit."""
 
-    value: float | None = Field(description="null when it could not be computed")
-    limit: float | None = Field(description="null when there is none")
-    at_least: bool = Field(description="true: good is value ≥ limit; false: good is value ≤ limit")
+    value: float | None = Field(description="null if it could not be computed")
+    limit: float | None = Field(description="null if there is none")
+    at_least: bool = Field(description="true: value ≥ limit is good; false: value ≤ limit is good")
     passed: bool
 
 
@@ -76,8 +75,8 @@ class AxisReply(Part):
     status: AxisStatus = Field(
         description="`not_solved`: not searched; `not_observable`: searched, but the window does not tell it"
     )
-    sigma: float | None = Field(description="standard deviation in `unit`; null when not estimated")
-    correction: float = Field(description="from the nominal calibration, in `unit`")
+    sigma: float | None = Field(description="standard deviation in `unit`; null if not estimated")
+    correction: float = Field(description="correction from the nominal calibration, in `unit`")
     unit: Literal["deg", "m"]
 
 
@@ -93,30 +92,32 @@ class Axes(Part):
 
 
 class Verdict(Part):
-    """The decision on one result, and why when it failed."""
+    """The decision on one result, and why it failed if it did."""
 
     decision: Decision
-    reasons: tuple[Reason, ...] = Field(description="empty when accepted")
+    reasons: tuple[Reason, ...] = Field(description="empty if accepted")
 
 
 # --- one result ---------------------------------------------------------------------------------------------
 
 
 class MovedWithin(Part):
-    """The camera moved while the window was taken."""
+    """How and when the camera moved while the window was recorded."""
 
     last_before_ns: int = Field(
-        description="stamp of the last pair that is surely from before it moved, of the window or recorded between, ns"
+        description="stamp of the last pair surely from before the move, of the window or recorded between, ns"
     )
-    first_after_ns: int = Field(description="stamp of the first one that is surely from after it, ns")
-    pairs_after: Count = Field(description="pairs of the window after it; they are kept for the next one")
-    before: Transform = Field(description="camera_from_lidar that fits the pairs before it; turned, not shifted")
-    after: Transform = Field(description="likewise after it")
+    first_after_ns: int = Field(description="stamp of the first pair surely from after the move, ns")
+    pairs_after: Count = Field(description="pairs of the window after the move; they are kept for the next window")
+    before: Transform = Field(
+        description="camera_from_lidar that fits the pairs before the move; found by a turn, not a shift"
+    )
+    after: Transform = Field(description="camera_from_lidar that fits the pairs after the move, found likewise")
 
 
 class CalibrationResult(Message):
-    """The result of calibrating one window. State, history, the window's file and `coec calibrate` carry the
-    same."""
+    """The result of calibrating one window; the same in the state, the history, the window's file and `coec
+    calibrate`."""
 
     vehicle: str
     pair: str
@@ -125,50 +126,51 @@ class CalibrationResult(Message):
     window_id: str
     data_stamp_ns: int = Field(description="stamp of the last contributing pair, ns")
     pairs: Count = Field(description="camera-LiDAR pairs in the window")
-    camera_from_lidar: Transform = Field(description="the estimate; served as current only when accepted")
+    camera_from_lidar: Transform = Field(description="the estimate; served as current only if accepted")
     correction: Vector6 = Field(description="rx ry rz (deg), tx ty tz (m), from the nominal calibration")
-    sigma: Maybe6 = Field(description="standard deviations (deg, m); null where not estimated")
+    sigma: Maybe6 = Field(description="standard deviations (deg, m); null on axes that are not estimated")
     correction_rad_m: Vector6 = Field(description="`correction` in rad and m, exact")
     noise: Maybe6x6 = Field(
-        description="covariance (rad, m), exact, of what differs from window to window; null: unknown"
+        description="covariance (rad, m), exact, of the errors that differ from window to window; null: unknown"
     )
     systematic: dict[str, Vector6] = Field(
-        description="by its name, the shift (rad, m) by one standard deviation of an error that windows have in common"
+        description="errors that windows have in common, by name: the shift (rad, m) for one standard deviation"
     )
     correlation_pitch_height: float | None = Field(
-        description="of the errors of rx and ty; null where either is unknown"
+        description="correlation of the errors of rx and ty; null if either is unknown"
     )
-    correlation_yaw_side: float | None = Field(description="of the errors of ry and tx; null where either is unknown")
+    correlation_yaw_side: float | None = Field(
+        description="correlation of the errors of ry and tx; null if either is unknown"
+    )
     independent_looks: float | None = Field(
-        description="how many independent looks the pairs are worth: near 1 where the vehicle stood; null: unknown"
+        description="how many independent looks the pairs are worth: near 1 if the vehicle stood; null: unknown"
     )
     solved: Flags6 = Field(description="axes that the search found")
     unobservable: Flags6 = Field(
-        description="axes that were searched but that the window does not tell: kept as before"
+        description="axes that were searched although the window does not determine them: kept as before"
     )
     status: Status
     verdict: Verdict
-    metrics: dict[str, MetricReply] = Field(description="self-diagnosis by name")
-    score: float | None = Field(description="objective at the result: nats, for `fused` standard deviations")
-    score_at_start: float | None = Field(description="objective at the start, likewise")
+    metrics: dict[str, MetricReply] = Field(description="figures of self-diagnosis by name")
+    score: float | None = Field(description="objective at the result, in nats; for `fused` in standard deviations")
+    score_at_start: float | None = Field(description="objective at the start, in the same unit")
     mi: float | None = Field(description="mutual information at the result, equation (1), nats")
     overlap: float | None = Field(description="share of the guarded points that lie in view, 0 to 1")
-    points_in_view: Count = Field(description="over all pairs")
-    evaluations: Count = Field(description="of the objective")
+    points_in_view: Count = Field(description="LiDAR points in view over all pairs")
+    evaluations: Count = Field(description="evaluations of the objective")
     stop_reason: StopReason
-    first_derivative: Maybe6 = Field(description="f': d(objective) per rad or m; null where not searched")
-    second_derivative: Maybe6 = Field(description="f'': -d²(objective) per rad² or m²; null where not searched")
+    first_derivative: Maybe6 = Field(description="f': d(objective) per rad or m; null on axes not searched")
+    second_derivative: Maybe6 = Field(description="f'': -d²(objective) per rad² or m²; null on axes not searched")
     compensation: Counts = Field(description="pairs by outcome of motion compensation")
     depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
-    config_hash: str = Field(description="of everything that decides the result")
+    config_hash: str = Field(description="hash of everything that decides the result")
     moved: MovedWithin | None = Field(
-        default=None, description="set where the window was refused because the camera moved within it"
+        default=None, description="set if the window was refused because the camera moved within it"
     )
 
 
 class CalibrationReport(CalibrationResult):
-    """What `coec calibrate --json` prints: the result, and how long it took (which is no part of the
-    result)."""
+    """What `coec calibrate --json` prints: the result and how long it took."""
 
     elapsed_s: dict[str, float] = Field(description="by stage, s")
 
@@ -182,7 +184,7 @@ class Candidate(Part):
     window_id: str
     data_stamp_ns: int
     camera_from_lidar: Transform
-    step: Vector6 | None = Field(default=None, description="from what is served: rx ry rz (deg), tx ty tz (m)")
+    step: Vector6 | None = Field(default=None, description="from the served extrinsic: rx ry rz (deg), tx ty tz (m)")
     waits: Reason | None = Field(default=None, description="why it was not applied")
 
 
@@ -192,12 +194,12 @@ class Hold(Part):
     since_ns: int | None = Field(
         description="wall clock of the service, ns since 1970; null: an earlier version held it"
     )
-    sender: str = Field(description="attachment of the command, or the name on a certificate, made harmless")
-    reason: str | None = Field(description="in the sender's words; null where none was given")
+    sender: str = Field(description="attachment of the command, or the name on a certificate, sanitised")
+    reason: str | None = Field(description="in the sender's words; null if none was given")
 
 
 class ExtrinsicReply(Message):
-    """The calibration to use now. A reply exists before the first result: nominal, not_accepted, 0 %."""
+    """The calibration to use now. Before the first result it is nominal, not_accepted, 0 %."""
 
     vehicle: str
     pair: str
@@ -205,136 +207,144 @@ class ExtrinsicReply(Message):
     lidar_frame: str
     camera_from_lidar: Transform = Field(description="current; an unaccepted estimate is never served here")
     cloud_frame: str | None = Field(
-        default=None, description="frame in which the driver gives the points; null where it is `lidar_frame`"
+        default=None, description="frame of the points that the driver sends; null if it is `lidar_frame`"
     )
     camera_from_cloud: Transform | None = Field(
-        default=None, description="the same calibration for points in `cloud_frame`; null where that is `lidar_frame`"
+        default=None, description="the same calibration for points in `cloud_frame`; null if that is `lidar_frame`"
     )
     provenance: Provenance = Field(description="where `camera_from_lidar` comes from")
-    status: Status = Field(description="of the latest attempt; not_accepted before the first")
-    percent_complete: float = Field(ge=0, le=100, description="of the open window")
+    status: Status = Field(description="status of the latest attempt; not_accepted before the first")
+    percent_complete: float = Field(ge=0, le=100, description="how full the open window is")
     axes: Axes
     correlation_pitch_height: float | None = Field(
-        default=None, description="of the errors of rx and ty; null where either is unknown"
+        default=None, description="correlation of the errors of rx and ty; null if either is unknown"
     )
     correlation_yaw_side: float | None = Field(
-        default=None, description="of the errors of ry and tx; null where either is unknown"
+        default=None, description="correlation of the errors of ry and tx; null if either is unknown"
     )
     valid_from_ns: int = Field(description="sensor time from which it holds, ns; 0 for nominal")
-    data_stamp_ns: int | None = Field(description="last contributing pair, ns; null for nominal")
-    window_id: str | None = Field(description="the window it came from; null for nominal")
+    data_stamp_ns: int | None = Field(description="stamp of the last contributing pair, ns; null for nominal")
+    window_id: str | None = Field(description="the window that it comes from; null for nominal")
     config_hash: str
     pending: Candidate | None = None
     held: bool = Field(default=False, description="frozen by `command/hold`")
-    hold: Hold | None = Field(default=None, description="who holds it, since when and why; null while nobody does")
+    hold: Hold | None = Field(default=None, description="who holds it, since when and why; null if not held")
 
 
 class DataQuality(Part):
-    """What the streams look like."""
+    """Quality of the streams."""
 
     pair_rate_hz: float | None = Field(default=None, description="camera-LiDAR pairs per second of sensor time")
     sync_error_s: float | None = Field(default=None, description="latest camera stamp minus LiDAR stamp")
     drops: dict[str, Counts] = Field(default_factory=dict, description="frames lost, by stream, then by cause")
-    sharpness: float | None = Field(default=None, description="latest exposure; falls with blur")
-    mean_level: float | None = Field(default=None, description="latest exposure, mean grey value, 0 to 255")
-    clipped: float | None = Field(default=None, description="latest exposure, share of black or white pixels")
-    frozen_image: bool = Field(default=False, description="the camera repeats the same picture")
-    point_times: str = Field(default="", description="how the times of points are read, of clouds that leave it open")
+    sharpness: float | None = Field(default=None, description="sharpness of the latest image; falls with blur")
+    mean_level: float | None = Field(default=None, description="mean grey value of the latest image, 0 to 255")
+    clipped: float | None = Field(default=None, description="share of black or white pixels in the latest image")
+    frozen_image: bool = Field(default=False, description="whether the camera repeats the same picture")
+    point_times: str = Field(default="", description="how point times are read, for clouds that leave this open")
 
 
 class CheckReply(Part):
-    """One check of the monitor at the extrinsic that was served, and what the checks so far add up to."""
+    """One check of the monitor at the extrinsic served then, and what all checks so far add up to."""
 
-    stamp_ns: int = Field(description="of the last pair, ns")
-    pair_stamps_ns: tuple[int, ...] = Field(description="of all of them, ns, ascending")
+    stamp_ns: int = Field(description="stamp of the last pair, ns")
+    pair_stamps_ns: tuple[int, ...] = Field(description="stamps of all pairs of the check, ns, ascending")
     flagged: bool = Field(description="the pose is wrong, or the data are")
-    undecided: bool = Field(default=False, description="it neither accuses the pose nor acquits it")
-    weak: bool = Field(description="the edges are fainter than they should be: the check counts less")
+    undecided: bool = Field(default=False, description="the check neither accuses nor acquits the pose")
+    weak: bool = Field(description="the edges are fainter than they should be, so that the check counts less")
     flagged_by_paper: bool | None = Field(
-        description="equation (2), for comparison: it decides nothing; null until the rig is commissioned"
+        description="verdict of equation (2), for comparison only; null until the rig is commissioned"
     )
-    causes: tuple[Reason, ...] = Field(description="what is wrong with the data; such a check says nothing of the pose")
-    metrics: dict[str, MetricReply] = Field(description="by name")
+    causes: tuple[Reason, ...] = Field(
+        description="what is wrong with the data; a check with a cause says nothing about the pose"
+    )
+    metrics: dict[str, MetricReply] = Field(description="figures of the check by name")
     first_derivative: Maybe6 = Field(description="f' at the pose: dMI, nats per rad or m")
     second_derivative: Maybe6 = Field(description="f'' at the pose: -d²MI, nats per rad² or m²")
     offset: Maybe6 = Field(
-        description="from the pose to where the check puts the mount, bias removed where known (deg, m): rotations of "
-        "the optimum over rotations, translations of that over all axes"
+        description="from the pose to where the check puts the mount, known bias removed (deg, m): rotations from the "
+        "optimum over rotations only, translations from the optimum over all axes"
     )
     sigma: Maybe6 = Field(description="standard deviations of `offset` (deg, m)")
     drift: Maybe6 | None = Field(
-        description="of the local optimum from commissioned (deg, m); null before commissioning"
+        description="local optimum from the commissioned extrinsic (deg, m); null before commissioning"
     )
     drift_sigma: Maybe6 | None = Field(description="standard deviations of `drift` (deg, m)")
-    outcome: Literal["unknown", "clear", "at_odds", "suspect", "confirmed"] = Field(description="of all checks so far")
-    evidence: float = Field(description="for a moved mount, log-likelihood ratio in nats, of all checks so far")
-    state: HealthState = Field(description="of the pair after the check")
+    outcome: Literal["unknown", "clear", "at_odds", "suspect", "confirmed"] = Field(
+        description="finding of all checks so far"
+    )
+    evidence: float = Field(description="evidence of all checks so far for a moved mount: log-likelihood ratio, nats")
+    state: HealthState = Field(description="state of the pair after the check")
 
 
 class Alarms(Part):
-    """What became of the alarms of a pair since its state directory was new. Of false ones, `withdrawn` over
-    `watched_s` is the rate."""
+    """What became of the alarms of a pair since its state directory was new. The rate of false alarms is `withdrawn`
+    over `watched_s`."""
 
     watched_s: float = Field(ge=0, description="sensor time between completed checks, s")
-    confirmed: Count = Field(description="ended with another extrinsic")
-    withdrawn: Count = Field(description="ended `healthy` with the extrinsic that they accused")
-    open: bool = Field(description="whether one has not ended yet")
+    confirmed: Count = Field(description="alarms that ended with another extrinsic")
+    withdrawn: Count = Field(description="alarms that ended `healthy` with the extrinsic that they had accused")
+    open: bool = Field(description="whether an alarm has not ended yet")
 
 
 class HealthReply(Message):
-    """Is the calibration right? `unknown` is the state of not having looked."""
+    """Whether the calibration is right. `unknown` means that nothing has looked yet."""
 
     vehicle: str
     pair: str
     state: HealthState
     level: Literal[0, 1, 2, 3] = Field(description="ROS: 0 OK, 1 WARN, 2 ERROR, 3 STALE")
     reasons: tuple[Reason, ...]
-    metrics: dict[str, MetricReply] = Field(description="of the latest result and of the latest check, by name")
+    metrics: dict[str, MetricReply] = Field(description="figures of the latest result and the latest check, by name")
     axes: Axes
     drift: Maybe6 | None = Field(
-        default=None, description="of what is served from commissioned (deg, m); null before commissioning"
+        default=None, description="served extrinsic from the commissioned one (deg, m); null before commissioning"
     )
     drift_sigma: Maybe6 | None = Field(default=None, description="standard deviations of `drift` (deg, m)")
     result_drift: Maybe6 | None = Field(
-        default=None, description="of the latest result, accepted or not, from commissioned (deg, m)"
+        default=None, description="latest result, accepted or not, from the commissioned extrinsic (deg, m)"
     )
     result_drift_sigma: Maybe6 | None = Field(default=None, description="standard deviations of `result_drift`")
     check: CheckReply | None = Field(
-        default=None, description="the latest check; null when none was taken at what is served"
+        default=None, description="the latest check; null if none was made at the served extrinsic"
     )
     needs: tuple[str, ...] = Field(description="what is still missing, one sentence each")
     data_quality: DataQuality
     since_ns: int = Field(description="wall clock when this state began, ns since 1970")
     evaluated_ns: int | None = Field(description="stamp of the last evaluated pair, ns; null before the first window")
-    age_s: float | None = Field(description="of the last evaluated window; null before the first")
-    alarms: Alarms | None = Field(default=None, description="how often it was accused; null while the pair is awaited")
+    age_s: float | None = Field(description="age of the last evaluated window; null before the first")
+    alarms: Alarms | None = Field(default=None, description="counts of its alarms; null while the pair is awaited")
 
 
 Book = Literal["results", "states", "commands"]
-"""Part of a history with a quota of its own."""
+"""A part of the history, with a quota of its own."""
 
 
 class HistoryEntry(Message):
-    """A line of a book of the append-only history. Its sha256 is that of its own canonical JSON; the next entry of the
-    book holds it as `previous_sha256`, so that no entry can be changed, taken out or put in unseen."""
+    """A line of a book of the append-only history. Its sha256 is taken over its own canonical JSON. The next entry of
+    the book holds it as `previous_sha256`, so that a changed, removed or inserted entry shows."""
 
-    sequence: Count = Field(description="counts the entries of a pair, over all books, from 0")
-    book: Book = Field(default="results", description="chain that the entry belongs to; each keeps a quota of its own")
-    previous_sha256: str = Field(description="of the entry before in its book, hexadecimal; 64 zeros for the first")
+    sequence: Count = Field(description="number of the entry among all books of the pair, from 0")
+    book: Book = Field(default="results", description="chain that the entry belongs to; each has a quota of its own")
+    previous_sha256: str = Field(
+        description="sha256 of the previous entry in the book, hexadecimal; 64 zeros for the first"
+    )
     kind: Literal["estimate", "extrinsic", "state", "command", "commissioned", "chain"]
-    code: str = Field(description="machine-readable: decision, provenance, state, outcome of the command")
+    code: str = Field(description="machine-readable: decision, provenance, state, or outcome of the command")
     text: str = Field(description="one sentence")
     wall_ns: int = Field(description="wall clock of the service, ns since 1970")
     stamp_ns: int | None = Field(default=None, description="sensor time of the data behind it, ns")
     window_id: str | None = None
-    sender: str | None = Field(default=None, description="attachment of a command, made harmless")
-    reason: str | None = Field(default=None, description="of a command, why, in the sender's words")
+    sender: str | None = Field(default=None, description="attachment of a command, sanitised")
+    reason: str | None = Field(default=None, description="reason for a command, in the sender's words")
     camera_from_lidar: Transform | None = Field(default=None, description="what is served from here on (`extrinsic`)")
-    result_sha256: str | None = Field(default=None, description="of the canonical JSON of the result (`estimate`)")
+    result_sha256: str | None = Field(
+        default=None, description="sha256 of the canonical JSON of the result (`estimate`)"
+    )
 
 
 class ChainedEntry(Part):
-    """An entry of the history, and its own sha256, by which `command/rollback` can name it."""
+    """An entry of the history with its own sha256, by which `command/rollback` can name it."""
 
     sha256: str
     entry: HistoryEntry
@@ -345,10 +355,12 @@ class HistoryReply(Message):
 
     vehicle: str
     pair: str
-    total: Count = Field(description="results kept, before the selector")
+    total: Count = Field(description="results kept, before the selector is applied")
     results: tuple[CalibrationResult, ...]
-    entries: tuple[ChainedEntry, ...] = Field(default=(), description="of all books, results without their bodies")
-    checks: tuple[CheckReply, ...] = Field(default=(), description="of the monitor, as far as they are kept")
+    entries: tuple[ChainedEntry, ...] = Field(
+        default=(), description="entries of all books; results stand here without their bodies"
+    )
+    checks: tuple[CheckReply, ...] = Field(default=(), description="checks of the monitor that are kept")
 
 
 class MetricsPoint(Part):
@@ -360,7 +372,7 @@ class MetricsPoint(Part):
 
 
 class EvidenceEvent(Message):
-    """What is kept of a red event: windows before and after, pictures, the figures around it, the decision."""
+    """What is kept of a red event: windows before and after, pictures, figures around it, and how it ended."""
 
     event_id: str
     vehicle: str
@@ -369,16 +381,16 @@ class EvidenceEvent(Message):
     wall_ns: int = Field(description="wall clock, ns since 1970")
     reasons: tuple[Reason, ...]
     camera_from_lidar: Transform = Field(description="what was served then")
-    window_before: str | None = Field(description="the last window before the event; null when there is none")
+    window_before: str | None = Field(description="the last window before the event; null if there is none")
     window_after: str | None = Field(default=None, description="the first window after it; null until there is one")
-    overlays: tuple[Literal["before", "after"], ...] = Field(default=(), description="pictures that are kept")
-    metrics: tuple[MetricsPoint, ...] = Field(description="around the event, oldest first")
-    resolved_stamp_ns: int | None = Field(default=None, description="sensor time of the end of the red state, ns")
-    resolution: str | None = Field(default=None, description="one sentence; null while it is red")
+    overlays: tuple[Literal["before", "after"], ...] = Field(default=(), description="the kept pictures")
+    metrics: tuple[MetricsPoint, ...] = Field(description="figures around the event, oldest first")
+    resolved_stamp_ns: int | None = Field(default=None, description="sensor time at which the red state ended, ns")
+    resolution: str | None = Field(default=None, description="how it ended, one sentence; null while it is red")
 
 
 class EvidenceReply(Message):
-    """Red events that are kept, oldest first, without their figures."""
+    """The kept red events, oldest first, without their figures."""
 
     vehicle: str
     pair: str
@@ -393,25 +405,25 @@ class WindowInfo(Part):
 
     window_id: str
     sha256: str | None = Field(
-        description="of the whole file, hexadecimal; null until the service has read this version of it"
+        description="hash of the whole file, hexadecimal; null until the service has read this version of it"
     )
     size_bytes: Count
-    pairs: Count | None = Field(description="null until the file was read, or when it cannot be")
+    pairs: Count | None = Field(description="null until the file was read, or if it cannot be read")
     decision: Decision | None = Field(description="null while it is not evaluated, or `sha256` is null")
     kept_for: KeptFor | None = Field(
-        default=None, description="why it outlives others when room is made; null: it goes when it is its turn"
+        default=None, description="why it is kept longer than others when room is made; null: it is removed in turn"
     )
 
 
 class SnippetInfo(Part):
-    """A recording at full rate of the seconds around an event; `windows/<snippet_id>` gives its bytes."""
+    """A full-rate recording of the seconds around an event; `windows/<snippet_id>` gives its bytes."""
 
     snippet_id: str
-    event: str = Field(description="state of health that was entered; empty where its file does not say")
-    stamp_ns: int = Field(description="sensor time of the last frame before the event was told, ns")
+    event: str = Field(description="state of health that was entered; empty if the file does not say")
+    stamp_ns: int = Field(description="sensor time of the last frame before the event was reported, ns")
     recorded_ns: int = Field(description="wall clock when it was on the disk, ns")
     size_bytes: Count
-    sha256: str = Field(description="of the whole file, hexadecimal")
+    sha256: str = Field(description="hash of the whole file, hexadecimal")
 
 
 class WindowsReply(Message):
@@ -428,9 +440,9 @@ class StreamStatus(Part):
 
     received: Count = 0
     accepted: Count = 0
-    waiting: Count = Field(default=0, description="samples that came and are not decoded yet")
-    age_s: float | None = Field(default=None, ge=0, description="since the last sample came, s; null before the first")
-    losses: Counts = Field(default_factory=dict, description="by cause")
+    waiting: Count = Field(default=0, description="received samples that are not decoded yet")
+    age_s: float | None = Field(default=None, ge=0, description="time since the last sample, s; null before the first")
+    losses: Counts = Field(default_factory=dict, description="lost samples by cause")
 
 
 class PairStatus(Part):
@@ -439,9 +451,9 @@ class PairStatus(Part):
     name: str
     camera: StreamStatus = StreamStatus()
     lidar: StreamStatus = StreamStatus()
-    ego: StreamStatus | None = Field(default=None, description="null when no ego-motion is configured")
+    ego: StreamStatus | None = Field(default=None, description="null if no ego-motion is configured")
     pairs: Count = Field(default=0, description="pairs formed")
-    held: Count = Field(default=0, description="pairs that wait until what was seen before them is judged")
+    held: Count = Field(default=0, description="pairs that wait for the judgement of earlier frames")
     unanswered: Count = Field(default=0, description="checks and windows whose answer has not come")
     selected: Count = Field(default=0, description="pairs chosen for the open window")
     unwritten: Count = Field(default=0, description="chosen pairs that wait for the disk")
@@ -450,34 +462,34 @@ class PairStatus(Part):
     windows: Count = Field(default=0, description="windows recorded")
     solved: Count = Field(default=0, description="windows evaluated")
     checks: Count = Field(default=0, description="checks of the monitor at the served extrinsic")
-    transitions: Counts = Field(default_factory=dict, description="changes of health, by the state that was entered")
+    transitions: Counts = Field(default_factory=dict, description="changes of health, by the new state")
     commands: Counts = Field(default_factory=dict, description="commands, by name and outcome")
     awaits: tuple[Reason, ...] = Field(
-        default=(), description="what is missing of the nominal calibration that the configuration leaves out"
+        default=(), description="what the configuration leaves out and the service has not found yet"
     )
     found: dict[str, str] = Field(
         default_factory=dict,
-        description="where the values come from that the configuration leaves out, by their places in it",
+        description="sources of the values that the configuration leaves out, by key of the configuration",
     )
 
 
 class WorkerStatus(Part):
-    """The process that infers and solves."""
+    """The process that runs the depth network and solves windows."""
 
     state: Literal["starting", "idle", "busy", "stopped"]
     pid: int | None = None
     restarts: Count = 0
     queued: Count = Field(default=0, description="jobs that wait")
     waiting: Counts = Field(
-        default_factory=dict, description="jobs that wait by kind, `backlog`: windows of an earlier run"
+        default_factory=dict, description="jobs that wait, by kind; `backlog`: windows of an earlier run"
     )
-    job: str | None = Field(default=None, description="kind of what is with the worker; null when nothing is")
-    job_age_s: float | None = Field(default=None, ge=0, description="how long it has been there, s")
+    job: str | None = Field(default=None, description="kind of the job that the worker has; null if it has none")
+    job_age_s: float | None = Field(default=None, ge=0, description="how long the worker has had this job, s")
     outcomes: Counts = Field(
-        default_factory=dict, description="jobs that have ended: result, failed, superseded, deadline_passed"
+        default_factory=dict, description="ended jobs by outcome: result, failed, superseded, deadline_passed"
     )
     losses: Counts = Field(
-        default_factory=dict, description="jobs without a result, and inferences ahead that were dropped, by cause"
+        default_factory=dict, description="jobs without a result, and dropped inferences made ahead, by cause"
     )
     faults: Counts = Field(default_factory=dict, description="worker processes that were replaced, by cause")
 
@@ -488,29 +500,32 @@ class BudgetShare(Part):
     look_s: float | None = Field(ge=0, description="what a check costs, s of processor time; null before the first")
     window_s: float | None = Field(
         ge=0,
-        description="what a window costs, with depth of its images, s of processor time; null before the first",
+        description="what a window costs, with the depth of its images, s of processor time; null before the first",
     )
-    unseen_s: float | None = Field(ge=0, description="since the worker last looked, s; null before the first look")
-    suspected: bool = Field(description="there is a suspicion: its checks come first, and may borrow")
+    unseen_s: float | None = Field(
+        ge=0, description="time since the worker last checked the pair, s; null before the first check"
+    )
+    suspected: bool = Field(description="the pair is suspected: its checks come first and may borrow")
     waiting: bool = Field(description="a check waits for its turn")
-    active: bool = Field(description="its streams bring pairs for checks")
+    active: bool = Field(description="its streams bring frame pairs for checks")
 
 
 class BudgetStatus(Part):
-    """What the pairs spend of the processor between them, in cores: s of processor time a second."""
+    """How much processor time all pairs together spend, in cores: s of processor time per second."""
 
-    cores: float = Field(description="what may be spent for checks and windows, by the clock of the sensors")
+    cores: float = Field(description="what checks and windows may spend, per second of sensor time")
     spent: float = Field(
-        ge=0, description="what the worker took in the last three minutes, whatever for, by the steady clock"
+        ge=0,
+        description="what the worker spent on everything in the last three minutes, per second of the steady clock",
     )
-    wanted: float = Field(ge=0, description="what every check and every window of all active pairs would take")
+    wanted: float = Field(ge=0, description="what all checks and windows of all active pairs would take")
     stretched_by: float = Field(
-        ge=1, description="periods of checks and slices of windows are so many times as long as configured"
+        ge=1, description="factor by which periods of checks and slices of windows are longer than configured"
     )
-    in_store_s: float = Field(description="s of processor time that are not spent; below 0: borrowed for a suspicion")
+    in_store_s: float = Field(description="unspent processor time, s; below 0: borrowed for a suspicion")
     spent_s: dict[str, float] = Field(
-        description="processor time of the worker since the start by what it was for, s: check, solve, prefetch "
-        "(depth for a window), start, idle, backlog, overlay, picture, commission"
+        description="processor time of the worker since the start by purpose, s: check, solve, prefetch (depth for a "
+        "window), start, idle, backlog, overlay, picture, commission"
     )
     pairs: dict[str, BudgetShare]
 
@@ -520,23 +535,23 @@ class StorageStatus(Part):
 
     bytes_used: Count
     bytes_free: Count
-    losses: Counts = Field(default_factory=dict, description="by cause")
+    losses: Counts = Field(default_factory=dict, description="losses by cause")
 
 
 class ConfigurationStatus(Part):
-    """What became of the configuration file when it was read last: at the start, or again on SIGHUP."""
+    """What became of the configuration file when it was last read: at the start, or on SIGHUP."""
 
-    read_ns: int = Field(description="wall clock, ns since 1970")
-    reloads: Count = Field(default=0, description="times that it was read again and taken, wholly or in part")
-    taken: tuple[str, ...] = Field(default=(), description="places of values that hold since then")
-    waiting: tuple[str, ...] = Field(default=(), description="places of values that wait for a restart")
+    read_ns: int = Field(description="wall clock when it was read, ns since 1970")
+    reloads: Count = Field(default=0, description="how often it was read again and applied, wholly or in part")
+    taken: tuple[str, ...] = Field(default=(), description="keys whose new values apply since then")
+    waiting: tuple[str, ...] = Field(default=(), description="keys whose new values wait for a restart")
     refused: str | None = Field(
-        default=None, description="why the file on the disk was refused; what held before holds on"
+        default=None, description="why the file on the disk was refused; then the earlier values stay in force"
     )
 
 
 class StatusReply(Message):
-    """The daemon."""
+    """Status of the daemon."""
 
     version: str
     vehicle: str
@@ -544,7 +559,7 @@ class StatusReply(Message):
     reasons: tuple[Reason, ...] = ()
     started_ns: int = Field(description="wall clock, ns since 1970")
     uptime_s: float
-    config_hash: str = Field(description="of the effective configuration, after every reload")
+    config_hash: str = Field(description="hash of the configuration in effect, reloads included")
     configuration: ConfigurationStatus | None = Field(default=None, description="null from an older service")
     pairs: tuple[PairStatus, ...]
     worker: WorkerStatus
@@ -554,7 +569,7 @@ class StatusReply(Message):
 
 
 class Acknowledgement(Message):
-    """The answer to a command: it was understood, and is carried out or not."""
+    """The answer to a command that was understood: whether it is carried out."""
 
     vehicle: str
     pair: str
@@ -565,8 +580,8 @@ class Acknowledgement(Message):
     window_id: str | None = Field(default=None, description="the window it acts on")
     durable: bool | None = Field(
         default=None,
-        description="whether what was done is on the disk, and outlives a power cut; false: not yet, `health` says "
-        "what ails the disk; null where nothing was done",
+        description="whether the effect is on the disk, safe from a power cut; false: not yet, and `health` says what "
+        "is wrong with the disk; null if nothing was done",
     )
 
 

@@ -1,5 +1,5 @@
-"""Documents of `coec sim rig-moves --json`: how well the sensors of a rig that moved are told, and how much better the
-rig knows its pairs than they do by themselves."""
+"""Documents of `coec sim rig-moves --json` and `coec sim rig-drives --json`: how well the sensor of a rig that moved is
+named, and how much better the rig estimate knows the pairs than each pair's own window."""
 
 from __future__ import annotations
 
@@ -17,40 +17,46 @@ class MovesRow(Part):
     rig: str
     fault: str
     drives: Count
-    right: Count = Field(description="drives on which exactly those that moved were named within the time allowed")
-    undecided: Count = Field(description="on which not all of these were, and no other")
-    wrong: Count = Field(description="on which ever one was named that had not moved")
-    delay_s: tuple[float, ...] = Field(description="from the fault until all were named, of those that were, in order")
+    right: Count = Field(description="drives on which exactly the moved sensors were named within the time allowed")
+    undecided: Count = Field(description="drives on which not all of them were named, and no other sensor was")
+    wrong: Count = Field(description="drives on which a sensor that had not moved was ever named")
+    delay_s: tuple[float, ...] = Field(
+        description="times from the fault until all were named, of the right drives, ascending"
+    )
 
 
 class JointRow(Part):
-    """Windows of all pairs of a rig at one time, combined."""
+    """One window of each pair of a rig, all from one time, combined."""
 
     rig: str
-    rigs: Count = Field(description="drawn")
-    pairs: Count = Field(description="of one rig")
+    rigs: Count = Field(description="rigs that were drawn")
+    pairs: Count = Field(description="pairs of one rig")
     rms_ratio: Vector6 = Field(description="rms error of the rig estimate over that of the windows, per axis")
-    rms_ratio_all: float = Field(description="root of the mean of their squares")
-    nees: float = Field(description="mean squared error of the rig estimate over what it claims, per axis: 1 is honest")
-    consistent: Count = Field(description="rigs whose pairs were said to fit each other")
-    biased_found: Count = Field(description="rigs, with one window 1° off, of which that window alone was left out")
-    biased_missed: Count = Field(description="of which the pairs were said to fit each other all the same")
+    rms_ratio_all: float = Field(description="root mean square of `rms_ratio`")
+    nees: float = Field(
+        description="mean squared error of the rig estimate over its claimed variance, per axis: 1 is honest"
+    )
+    consistent: Count = Field(description="rigs whose pairs were reported to fit each other")
+    biased_found: Count = Field(description="rigs with one window 1° off, where only that window was left out")
+    biased_missed: Count = Field(description="rigs with one window 1° off, where the pairs were reported to fit")
 
 
 class KnockedRow(Part):
-    """One window of each pair of a rig after a LiDAR of it was knocked, combined with what was known before."""
+    """One window of each pair of a rig after one of its LiDARs was knocked, combined with what was known before."""
 
     rig: str
-    rigs: Count = Field(description="drawn")
-    pairs: Count = Field(description="of one rig")
+    rigs: Count = Field(description="rigs that were drawn")
+    pairs: Count = Field(description="pairs of one rig")
     rms_ratio: Vector6 = Field(description="rms error of the rig estimate over that of the windows, per axis")
-    rms_ratio_all: float = Field(description="root of the mean of their squares")
-    rms_ratio_without: float = Field(description="the same of an estimate by these windows alone")
-    nees: float = Field(description="mean squared error of the rig estimate over what it claims, per axis: 1 is honest")
-    worst_deg: float = Field(description="error of the worst pair of all rigs")
-    worst_of_pairs_deg: float = Field(description="the same of the windows")
-    consistent: Count = Field(description="rigs whose windows were said to fit what was known before")
-    also_missed: Count = Field(description="of rigs of which a camera was turned by 0.5° as well, those said to fit")
+    rms_ratio_all: float = Field(description="root mean square of `rms_ratio`")
+    rms_ratio_without: float = Field(description="`rms_ratio_all` of an estimate from these windows alone")
+    nees: float = Field(
+        description="mean squared error of the rig estimate over its claimed variance, per axis: 1 is honest"
+    )
+    worst_deg: float = Field(description="error of the worst pair of all rigs, by the rig estimate")
+    worst_of_pairs_deg: float = Field(description="error of the worst pair of all rigs, by the windows")
+    consistent: Count = Field(description="rigs whose windows were reported to fit what was known before")
+    also_missed: Count = Field(description="rigs reported to fit although a camera was turned by 0.5° as well")
 
 
 class RigMovesReport(Message):
@@ -63,7 +69,7 @@ class RigMovesReport(Message):
 
 
 class Mounts(StrEnum):
-    """Which sensor of a pair is not where it was built."""
+    """Which sensor of a pair was moved from where it was built in."""
 
     AS_BUILT = "as_built"
     CAMERA = "camera"
@@ -71,8 +77,8 @@ class Mounts(StrEnum):
 
 
 class RigLook(Part):
-    """One look at one pair of a rendered rig: see `Observation`, of which it holds what attribution and the change
-    detector take. Radians and metres; axes rx ry rz tx ty tz about and along the camera axes."""
+    """One look at one pair of a rendered rig: those fields of `Observation` that attribution and the change detector
+    take. Radians and metres; axes rx ry rz tx ty tz about and along the camera axes."""
 
     edge: str
     mounts: Mounts
@@ -93,26 +99,27 @@ class RigDriveRow(Message):
 
     name: str
     seed: Count
-    camera: str = Field(description="of every camera of the rig, as `fisheye350`")
+    camera: str = Field(description="lens of every camera of the rig, such as `fisheye350`")
     looks: tuple[RigLook, ...]
     failure: str | None = Field(default=None, description="why the drive has no result")
 
 
 class RigDriveMoves(Part):
-    """What was said of one fault on one rendered drive; seconds of driving after the fault, null where it was not."""
+    """What was reported of one fault on one rendered drive. Times are seconds of driving after the fault; null if the
+    event did not happen."""
 
     name: str
     moved: tuple[str, ...] = Field(description="sensors that were knocked")
-    named_s: float | None = Field(description="when exactly these were named")
-    alarm_s: float | None = Field(description="when the first pair that has one of them was sure that its mount moved")
-    wrong: tuple[str, ...] = Field(description="sensors that were ever named and had not been knocked")
-    wrong_s: float | None = Field(description="when the first of these was, of a drive that begins at the fault")
+    named_s: float | None = Field(description="when exactly these sensors were named")
+    alarm_s: float | None = Field(description="when the first pair with one of them was sure that its mount had moved")
+    wrong: tuple[str, ...] = Field(description="sensors that were ever named but had not been knocked")
+    wrong_s: float | None = Field(description="when the first of these was named, of a drive that begins at the fault")
 
 
 class RigDrivesRow(MovesRow):
-    """Of all rendered drives with one fault."""
+    """All rendered drives with one fault."""
 
-    alarms_s: tuple[float, ...] = Field(description="of those with an alarm, see `alarm_s`, in order")
+    alarms_s: tuple[float, ...] = Field(description="`alarm_s` of the drives with an alarm, ascending")
     each: tuple[RigDriveMoves, ...]
 
 
@@ -121,9 +128,9 @@ class RigDrivesReport(Message):
 
     allowed_s: float
     camera: str
-    drives: Count = Field(description="that were drawn and have a result")
-    failed: Count = Field(description="that have none")
+    drives: Count = Field(description="drives with a result")
+    failed: Count = Field(description="drives without a result")
     looks: Count
     faint: Count = Field(description="looks with faint edges")
-    blind: Count = Field(description="looks with a cause in their data")
+    blind: Count = Field(description="looks with something wrong in their data")
     moves: tuple[RigDrivesRow, ...]

@@ -1,7 +1,7 @@
-"""The reply of `rig`: what all pairs of a vehicle say together. Which of its sensors moved, and where they all are.
+"""The reply of `rig`: what all pairs of a vehicle together say about which sensor moved and where all sensors are.
 
-A sensor that moved by x has moved about its own axes: x (deg, then m) is on the left of the pose of the rig in its
-frame. Sensor time throughout; a number that could not be computed is null.
+Moves are about a sensor's own axes: a move x (deg, then m) multiplies, from the left, the pose of the rig in the
+sensor's frame. All times are sensor time; a number that could not be computed is null.
 """
 
 from __future__ import annotations
@@ -27,116 +27,124 @@ class SensorMove(Part):
 
 
 class SensorReply(Part):
-    """A camera or a LiDAR of the vehicle, whatever pairs it is of."""
+    """A camera or a LiDAR of the vehicle, over all its pairs."""
 
     name: str
     kind: SensorKind
     state: SensorState = Field(
-        description="`undecided`: something moved or is disturbed, and this may be it; `unknown`: nothing looked. "
-        "One that moved is so called until every pair of it serves another extrinsic"
+        description="`undecided`: something moved or is disturbed, and it may be this sensor; `unknown`: no look yet. "
+        "`camera_moved` and `lidar_moved` last until every pair of the sensor serves another extrinsic"
     )
-    probability: Probability | None = Field(description="that it moved; null where nothing can tell")
-    since_ns: int | None = Field(description="sensor time since which it is in this state, ns; null before any look")
-    moved: SensorMove | None = Field(description="set where it moved, or may have")
-    pairs: tuple[str, ...] = Field(description="that have it")
-    reasons: tuple[Reason, ...] = Field(description="why it is in this state; the first one says most")
+    probability: Probability | None = Field(description="probability that the sensor moved; null if nothing can tell")
+    since_ns: int | None = Field(description="sensor time at which this state began, ns; null before any look")
+    moved: SensorMove | None = Field(description="set if the sensor moved, or may have")
+    pairs: tuple[str, ...] = Field(description="pairs of this sensor")
+    reasons: tuple[Reason, ...] = Field(description="why the sensor is in this state; the first one says most")
 
 
 class JointPair(Part):
-    """A pair, as all pairs together put it."""
+    """The extrinsic of a pair, estimated from all pairs together."""
 
     pair: str
     camera: str
     lidar: str
-    measured: bool = Field(description="whether a window of its own is in it; else the others put it there")
+    measured: bool = Field(description="whether a window of its own is included; otherwise it follows from the others")
     camera_from_lidar: Transform
     sigma: Vector6 = Field(description="standard deviations (deg, m)")
     covariance: Maybe6x6 = Field(description="about the axes of the camera (rad, m), exact")
-    step: Vector6 = Field(description="from what the pair serves to this: rx ry rz (deg), tx ty tz (m)")
+    step: Vector6 = Field(
+        description="from the extrinsic that the pair serves to this one: rx ry rz (deg), tx ty tz (m)"
+    )
 
 
 class OpenLoop(Part):
-    """A way along pairs and links that should end where it begins, and does not."""
+    """A loop along pairs and links that does not close: it should end where it begins."""
 
-    names: tuple[str, ...] = Field(description="of the pairs and links, in their order")
-    rotation_deg: float = Field(description="by which it does not close")
-    translation_m: float | None = Field(description="likewise; null where a pair on it does not tell")
-    p_value: Probability = Field(description="chance of one as large")
+    names: tuple[str, ...] = Field(description="pairs and links of the loop, in order")
+    rotation_deg: float = Field(description="rotation by which it does not close")
+    translation_m: float | None = Field(
+        description="translation by which it does not close; null if a pair in it does not tell"
+    )
+    p_value: Probability = Field(description="chance of a gap at least as large")
 
 
 class JointReply(Part):
-    """Where everything is, by the latest windows of all pairs."""
+    """Where all sensors are, from the latest windows of all pairs."""
 
-    stamp_ns: int = Field(description="of the newest window in it, ns")
+    stamp_ns: int = Field(description="stamp of the newest window in it, ns")
     pairs: tuple[JointPair, ...]
-    chi2: float = Field(ge=0, description="sum of squares of what the pairs miss each other by")
-    freedom: Count = Field(description="its degrees of freedom: six for each loop; 0 where no loop closes")
-    p_value: Probability = Field(description="chance of a sum as large")
-    consistent: bool = Field(description="whether the pairs fit each other; else they say `inconsistent_rig`")
-    left_out: str | None = Field(description="the pair that alone did not fit, if one did")
+    chi2: float = Field(ge=0, description="sum of squared normalised residuals between the pairs")
+    freedom: Count = Field(description="degrees of freedom of `chi2`: six for each loop; 0 if there is no loop")
+    p_value: Probability = Field(description="chance of a `chi2` at least as large")
+    consistent: bool = Field(description="whether the pairs fit each other; if not, they report `inconsistent_rig`")
+    left_out: str | None = Field(description="the one pair that did not fit and was left out, if any")
     open_loops: tuple[OpenLoop, ...] = Field(description="loops that do not close, the least likely first")
-    widened: float = Field(ge=1, description="factor on all standard deviations, for what the loops miss")
+    widened: float = Field(ge=1, description="factor on all standard deviations, to cover the gaps of the loops")
 
 
 class RigMove(Part):
-    """A move of one or two sensors: from when they were named until every pair of them serves another extrinsic."""
+    """A move of one or two sensors. It lasts from their naming until every pair of them serves another extrinsic."""
 
     sensors: tuple[str, ...]
     since_ns: int = Field(description="sensor time at which they were named, ns")
     stepped_ns: int = Field(description="sensor time before which they moved, ns")
-    over_ns: int | None = Field(description="sensor time at which it was put right, ns; null while it is not")
-    by: dict[str, SensorMove] = Field(description="by sensor, as it was known when they were named")
+    over_ns: int | None = Field(description="sensor time at which the move was corrected, ns; null until then")
+    by: dict[str, SensorMove] = Field(description="size of the move by sensor, as known when they were named")
 
 
 class LidarsReply(Part):
-    """Two LiDARs of the vehicle, by the surfaces that both see: no camera has a part in it."""
+    """Two LiDARs of the vehicle, compared by the surfaces that both see, without any camera."""
 
-    name: str = Field(description="of the edge, as in `disturbed` and `looks`")
+    name: str = Field(description="name of the edge, as in `disturbed` and `looks`")
     a: str
     b: str
     state: LidarsState = Field(
-        description="`measured`: the latest look tells where b sits in a; `refused`: it does not, or there was none; "
-        "`waiting`: there was none yet; `not_measured`: nothing looks"
+        description="`measured`: the latest look tells the pose of b in a; `refused`: it does not, or no look came of "
+        "the latest sweep; `waiting`: no look yet; `not_measured`: not looked at"
     )
-    reasons: tuple[Reason, ...] = Field(description="of the state; empty where it is `measured`")
-    stamp_ns: int | None = Field(description="of the latest look, or of the sweep that made none, ns; null: none came")
-    measured_ns: int | None = Field(description="of the latest look that told something, of which the rest is, ns")
+    reasons: tuple[Reason, ...] = Field(description="reasons for the state; empty if it is `measured`")
+    stamp_ns: int | None = Field(
+        description="stamp of the latest look, or of the sweep that gave no look, ns; null: no sweep came"
+    )
+    measured_ns: int | None = Field(description="stamp of the latest useful look, from which the figures below are, ns")
     a_from_b: Transform | None = Field(description="maps coordinates of b to those of a; null before any look")
     sigma: Vector6 | None = Field(description="standard deviations about and along the axes of a (deg, m)")
-    correction: Vector6 | None = Field(description="from how they were built to this: rx ry rz (deg), tx ty tz (m)")
-    range_bias_m: float | None = Field(description="by how much b measures longer than a, m")
+    correction: Vector6 | None = Field(description="from the nominal pose to this one: rx ry rz (deg), tx ty tz (m)")
+    range_bias_m: float | None = Field(description="by how much b measures longer ranges than a, m")
     range_bias_sigma_m: float | None
-    rms_m: float | None = Field(description="distance of the points of b from the surfaces of a, m")
-    share: Probability | None = Field(description="of the points of b that lie on a surface of a")
-    looks: Count = Field(description="that told something")
+    rms_m: float | None = Field(description="rms distance of the points of b from the surfaces of a, m")
+    share: Probability | None = Field(description="share of the points of b that lie on a surface of a")
+    looks: Count = Field(description="useful looks")
     losses: Counts = Field(description="looks and sweeps that were lost, by cause")
 
 
 class RigCorrection(Part):
-    """A move of one or two sensors, put right in all of their pairs at once."""
+    """The correction of a move of one or two sensors, applied to all of their pairs at once."""
 
     stamp_ns: int = Field(description="sensor time at which it was decided, ns")
-    from_ns: int = Field(description="sensor time from which the pairs are looked at with it, ns")
+    from_ns: int = Field(description="sensor time from which the pairs are checked with it, ns")
     sensors: tuple[str, ...]
     pairs: tuple[str, ...]
 
 
 class RigReply(Message):
-    """All sensors of a vehicle. A reply exists before the first look: all `unknown`."""
+    """All sensors of a vehicle. Before the first look all of them are `unknown`."""
 
     vehicle: str
-    stamp_ns: int | None = Field(description="all that was asked up to this sensor time is in it, ns; null: nothing is")
+    stamp_ns: int | None = Field(
+        description="sensor time up to which everything that was asked for is included, ns; null: nothing yet"
+    )
     sensors: tuple[SensorReply, ...]
-    nobody: Probability | None = Field(description="that no sensor moved; null before the first look")
+    nobody: Probability | None = Field(description="probability that no sensor moved; null before the first look")
     disturbed: dict[str, Probability] = Field(
-        description="that something else lastingly disturbs a pair, or an edge between two LiDARs, by name"
+        description="by pair, or by edge between two LiDARs: probability that something else disturbs it lastingly"
     )
-    joint: JointReply | None = Field(description="null before the first accepted window, or of a single pair")
-    correction: RigCorrection | None = Field(description="the latest; null before the first")
+    joint: JointReply | None = Field(description="null before the first accepted window, and for a single pair")
+    correction: RigCorrection | None = Field(description="the latest correction; null before the first")
     move: RigMove | None = Field(
-        default=None, description="the latest, over or not; null before the first since the service was started"
+        default=None, description="the latest move since the service started, over or not; null before the first"
     )
-    lidars: tuple[LidarsReply, ...] = Field(default=(), description="every two of them")
-    reasons: tuple[Reason, ...] = Field(default=(), description="what keeps the pairs from being put together")
-    looks: Counts = Field(description="checks that were put together, by pair, and looks at two LiDARs, by edge")
-    losses: Counts = Field(description="what was not, or out of order, by cause")
+    lidars: tuple[LidarsReply, ...] = Field(default=(), description="every two LiDARs")
+    reasons: tuple[Reason, ...] = Field(default=(), description="what prevents combining the pairs")
+    looks: Counts = Field(description="combined checks by pair, and looks at two LiDARs by edge")
+    losses: Counts = Field(description="looks that were not combined, or came out of order, by cause")

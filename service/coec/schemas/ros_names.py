@@ -1,4 +1,4 @@
-"""Names under which ROS 2 sees the service: of its node, its topics, its diagnostics and its frames."""
+"""Names under which ROS 2 sees the service: its node, its topics, its diagnostics and its frames."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ def ros_name(name: str) -> str:
 
 
 def camera_info_topic(pair: str) -> str:
-    """Of the intrinsics of a pair's camera, beside nobody's images: they are the service's own word of them."""
+    """Topic of the intrinsics of a pair's camera, as the service knows them. No images are published beside it."""
     return f"/coec/{ros_name(pair)}/camera/camera_info"
 
 
 def overlay_topic(pair: str) -> str:
-    """Of the picture of points on an image. No `camera_info` belongs to it: it has a title and a scale."""
+    """Topic of the picture of points on an image. It has no `camera_info`, as the picture has a title and a scale."""
     return f"/coec/{ros_name(pair)}/overlay/compressed"
 
 
 def sensor_status_name(sensor: str) -> str:
-    """Of a sensor among the diagnostics."""
+    """Name of a sensor's status among the diagnostics."""
     return f"{NODE}: {sensor}_mount"
 
 
 def status_name(pair: str) -> str:
-    """Of a pair among the diagnostics: `node: name`, as aggregators and Autoware's graph take it apart."""
+    """Name of a pair's status among the diagnostics: `node: name`, as aggregators and Autoware's graph parse it."""
     return f"{NODE}: {pair}_calibration"
