@@ -57,9 +57,10 @@ class MovedStatistics(Part):
     clear: Count = Field(description="all other checks")
     flagged: Count = Field(description="clear checks that are flagged")
     flagged_low: float | None = Field(
-        description="lower end of the 95 % interval (Wilson) of the flagged share of clear checks; null without any"
+        description="lower end of the 95 % interval (Wilson) of the flagged share of clear checks, `flagged_high` the "
+        "upper end; null without clear checks"
     )
-    flagged_high: float | None = Field(description="upper end of it")
+    flagged_high: float | None
     suspected: Count = Field(description="drives on which the detector suspected the mount")
     confirmed: Count = Field(description="drives on which the detector became certain")
     delay_checks: tuple[Count, ...] = Field(description="checks until it became certain, for each of those drives")
