@@ -1,4 +1,4 @@
-"""Where the points of a sweep lie, seen from the sensor."""
+"""Azimuth, elevation and range of the points of a sweep, seen from the sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _A, _B, _C, _D = (
     np.float32(8.05374449538e-2), np.float32(-1.38776856032e-1), np.float32(1.99777106478e-1),
     np.float32(-3.33329491539e-1),
 )  # fmt: skip
-"""Of the arctangent up to an eighth of a turn (S. L. Moshier, Cephes, `atanf`: to 2e-7 rad)."""
+"""Coefficients of the arctangent up to an eighth of a turn (S. L. Moshier, Cephes, `atanf`: to 2e-7 rad)."""
 
 _BLOCK = 4096
 """Points that a thread takes at a time."""
@@ -24,8 +24,8 @@ _BLOCK = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bearings:
-    """Of N points, each (N,) float32: `azimuth` (-π to π, from x to y) and `elevation` (from the xy plane), radians,
-    and `range_m`."""
+    """Bearings of N points, each (N,) float32: `azimuth` (-π to π, from x to y) and `elevation` (from the xy plane),
+    radians, and `range_m`."""
 
     azimuth: NDArray[np.float32]
     elevation: NDArray[np.float32]
@@ -33,9 +33,9 @@ class Bearings:
 
 
 def bearings(xyz_m: NDArray[np.float32]) -> Bearings:
-    """Of points (N, 3). Angles are right to 5e-7 rad; that of the origin is zero."""
+    """Bearings of points (N, 3). Angles are right to 5e-7 rad; those of the origin are zero."""
     points_m = np.ascontiguousarray(xyz_m, np.float32).view()
-    # Compiled once, whether a sweep may be written to or not.
+    # Always read-only, so that the kernel is compiled for one type of array only.
     points_m.setflags(write=False)
     return Bearings(*_bearings(points_m))
 
@@ -59,8 +59,8 @@ def _bearings(
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _angle(y: np.float32, x: np.float32) -> np.float32:
-    """The angle of (x, y). Selections and no branches: the loop runs in vector registers, at a tenth of the time of the
-    library's function."""
+    """The angle of (x, y). It uses selections instead of branches, so that the loop runs in vector registers, in a
+    tenth of the time of the library's function."""
     across, along = abs(y), abs(x)
     less, more = (across if across < along else along), (along if across < along else across)
     t = less / (more if more > np.float32(0.0) else np.float32(1.0))
@@ -79,8 +79,8 @@ def _angle(y: np.float32, x: np.float32) -> np.float32:
 def grid_counts(
     elevation: NDArray[np.float32], azimuth: NDArray[np.float32], low: float, high: float, bands: int, sectors: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Of the points (N,) between two elevations how many lie in each of so many bands of them, and in each of so many
-    sectors of azimuth: (bands,) and (sectors,)."""
+    """Counts of the points (N,) between two elevations: by band of elevation (bands,) and by sector of azimuth
+    (sectors,)."""
     of_bands, of_sectors = np.zeros(bands, np.int64), np.zeros(sectors, np.int64)
     per_band, per_sector = bands / (high - low), sectors / (2.0 * math.pi)
     for i in range(elevation.shape[0]):

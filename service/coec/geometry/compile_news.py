@@ -1,4 +1,5 @@
-"""Who hears that kernels are being compiled: once on a machine, for about a minute. Imports no compiler itself."""
+"""Tells listeners that kernels are being compiled, which happens once on a machine and takes about a minute. This
+module imports no compiler itself."""
 
 from __future__ import annotations
 
@@ -6,14 +7,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 Hearer = Callable[[str], None]
-"""Called with the name of a kernel, again and again while it is compiled, by the thread that does."""
+"""Called with the name of a kernel, repeatedly while it is compiled, on the compiling thread."""
 
 _hearers: list[Hearer] = []
 
 
 @contextmanager
 def heard_by(hearer: Hearer) -> Iterator[None]:
-    """Within, this hearer is told. Kernels that are read from the cache are no news."""
+    """Inside the context, `hearer` is called for each step. Kernels read from the cache cause no calls."""
     _hearers.append(hearer)
     try:
         yield
@@ -22,6 +23,6 @@ def heard_by(hearer: Hearer) -> Iterator[None]:
 
 
 def tell(kernel: str) -> None:
-    """A step of the compilation of this kernel begins."""
+    """Tell all hearers that a step of the compilation of this kernel begins."""
     for hearer in tuple(_hearers):
         hearer(kernel)

@@ -1,10 +1,10 @@
-"""numba, as every kernel of this program imports it: with its on-disk cache in a directory of the user's, and with the
-formulas of the camera models known to it.
+"""numba, as every kernel of this program imports it: with its on-disk cache in a directory of the user, and with the
+formulas of the camera models registered.
 
-The directory is keyed by a hash of the sources in `coec.geometry`: numba itself only looks at the file that holds the
-outermost kernel, so after an edit to a camera formula a kernel in another file would be served stale.
+The directory is keyed by a hash of the sources in `coec.geometry`. numba itself only looks at the file that holds the
+outermost kernel, so that after an edit to a camera formula it would use a stale kernel from another file.
 
-Who imports this loads a compiler: 70 MB and a third of a second, which the process that serves queries does without.
+Importing this module loads a compiler: 70 MB and a third of a second, which the process that serves queries avoids.
 """
 
 import fcntl
@@ -32,10 +32,10 @@ __all__ = ["PRANGE", "njit", "on_one_thread", "prange"]
 _ARRAY_OPERATIONS = ("comprehension", "fusion", "inplace_binop", "numpy", "reduction", "setitem", "stencil")
 
 PRANGE: Any = ParallelOptions({"prange": True} | dict.fromkeys(_ARRAY_OPERATIONS, False))
-"""For `parallel=`: a kernel's `prange` is shared among threads, and nothing else of it. Left to itself numba makes a
-parallel loop of every operation on an array, too, however short: each takes a second to compile."""
+"""For `parallel=`: only a kernel's `prange` loops are shared among threads. By default numba would also make a parallel
+loop of every operation on an array, however short, and each of those takes a second to compile."""
 
-# Twelve hexadecimal digits are 48 bits: enough to tell the edits of one code base apart.
+# Twelve hexadecimal digits are 48 bits, enough to distinguish the edits of one code base.
 _HASH_DIGITS = 12
 
 
@@ -49,7 +49,7 @@ def _sources_hash(package: Path) -> str:
 
 
 def _user_cache_root() -> Path:
-    """$XDG_CACHE_HOME, or ~/.cache. Raises RuntimeError where the user has no home."""
+    """$XDG_CACHE_HOME, or ~/.cache. Raises RuntimeError if the user has no home."""
     configured = os.environ.get("XDG_CACHE_HOME", "")
     return Path(configured) if Path(configured).is_absolute() else Path.home() / ".cache"
 
@@ -91,26 +91,27 @@ def kernel_cache_directory(package: Path) -> Path:
 
 
 _WIDE = "+avx512vbmi2"
-"""A feature of the processors that hold their clock in registers of 512 bits: Intel's from Ice Lake on, AMD's from
-Zen 4 on."""
+"""A feature of the processors that do not lower their clock for registers of 512 bits: Intel's from Ice Lake on, AMD's
+from Zen 4 on."""
 
 
 def with_wide_registers(features: str) -> str:
-    """The features of a processor, as LLVM lists them, with registers of 512 bits where they cost no clock.
+    """The features of a processor, as LLVM lists them, plus registers of 512 bits if they do not lower its clock.
 
-    LLVM keeps to half of that on any Intel processor, as the first ones with such registers slowed down with them. One
-    MI of 25 frames through a lens of the MEI model takes 5.7 ms of one thread that way, and 4.2 ms in full. Sums are
-    taken in the same order either way.
+    LLVM uses 256 bits on every Intel processor, because the first ones with wider registers slowed down with them. One
+    MI of 25 frames through a lens of the MEI model takes 5.7 ms of one thread with 256 bits, and 4.2 ms with 512. The
+    order of sums is the same either way.
     """
     return f"{features},-prefer-256-bit" if _WIDE in features.split(",") else features
 
 
 @contextmanager
 def on_one_thread() -> Iterator[None]:
-    """Kernels that the calling thread calls meanwhile run on that thread alone. Results are the same to the last bit.
+    """Inside the context, kernels called by this thread run on it alone. Results are the same to the last bit.
 
-    For work of many kernels of some 50 µs each: to wake another thread and to wait for it takes as long, and of the
-    processor more: a look at six pairs of 1400×1400 takes 94 ms of the processor on one thread, 152 ms on two.
+    For work that consists of many kernels of some 50 µs each. Waking another thread and waiting for it takes as long
+    and costs more processor time: a look at six pairs of 1400×1400 takes 94 ms of the processor on one thread, 152 ms
+    on two.
     """
     before = numba.get_num_threads()
     numba.set_num_threads(1)
@@ -121,18 +122,19 @@ def on_one_thread() -> Iterator[None]:
 
 
 # Threads of a parallel kernel must not spin while they wait: with other processes on the cores, spinning made a small
-# solve take 1 to 5 s instead of 0.1 s. Read by the OpenMP runtime when numba loads it; a choice of the user's wins.
+# solve take 1 to 5 s instead of 0.1 s. The OpenMP runtime reads this when numba loads it; a value set by the user wins.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# But a little: to wake a thread takes as long as many a kernel. So many turns are some 150 µs, after which a thread
-# sleeps. A fused solve of 25 frames takes 0.75 s of two quiet cores instead of 0.92 s, and on busy ones what it took.
+# They spin for a short time, though, because waking a thread takes as long as many a kernel: 3000 turns are some 150
+# µs, after which a thread sleeps. On two quiet cores a fused solve of 25 frames then takes 0.75 s instead of 0.92 s; on
+# busy cores it takes as long as without.
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
-if numba.config.CPU_FEATURES is None:  # type: ignore[attr-defined]  # features chosen by the user win
+if numba.config.CPU_FEATURES is None:  # type: ignore[attr-defined]  # features set by the user win
     numba.config.CPU_FEATURES = with_wide_registers(get_host_cpu_features())  # type: ignore[attr-defined]
 
-if not os.environ.get("NUMBA_CACHE_DIR"):  # a directory chosen by the user wins
-    # numba's configuration is a module that fills itself at run time.
+if not os.environ.get("NUMBA_CACHE_DIR"):  # a directory set by the user wins
+    # mypy does not know the attribute: numba's configuration module fills itself at run time.
     numba.config.CACHE_DIR = str(kernel_cache_directory(Path(__file__).parent))  # type: ignore[attr-defined]
 
 
@@ -140,18 +142,19 @@ _save = IndexDataCacheFile.save
 
 
 def _save_alone(self: IndexDataCacheFile, key: Any, data: Any) -> None:
-    """One process at a time. Left to itself numba reads which files of a kernel there are, takes the next number, and
-    writes: of two processes that compile it for different types at once, one finds the machine code of the other."""
+    """Save, one process at a time. Without the lock numba lists the files of a kernel, takes the next number, and
+    writes. Of two processes that compile a kernel for different types at once, one would then find the other's machine
+    code."""
     with Path(self._cache_path, "lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         _save(self, key, data)
 
 
-IndexDataCacheFile.save = _save_alone  # type: ignore[method-assign]  # it has no other handle
+IndexDataCacheFile.save = _save_alone  # type: ignore[method-assign]  # there is no other hook
 
 
 class _Passes(event.Listener):
-    """A kernel from the cache goes through no pass of the compiler."""
+    """Reports each compiler pass. A kernel from the cache goes through none."""
 
     def on_start(self, event: Any) -> None:
         compile_news.tell(event.data["qualname"])

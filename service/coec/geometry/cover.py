@@ -1,4 +1,4 @@
-"""Very many poses, spread evenly over a ball of rotations and one of translations."""
+"""Very many poses, spread evenly over a ball of rotations and a ball of translations."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _RATIO = 1.2207440846057596
 """The real root of x⁴ = x + 1."""
 
 _STEPS = ((1.0 / _RATIO) ** 1, (1.0 / _RATIO) ** 2, (1.0 / _RATIO) ** 3)
-"""By which the R₃ sequence goes on along each side of the unit cube."""
+"""Step of the R₃ sequence along each side of the unit cube."""
 
 
 @njit(cache=True)
 def unit_ball(count: int) -> NDArray[np.float64]:
-    """(count, 3) points of the unit ball: those of the R₃ sequence (Roberts 2018, "The unreasonable effectiveness of
-    quasirandom sequences") in the cube around it that lie inside."""
+    """(count, 3) points of the unit ball: the R₃ sequence (Roberts 2018, "The unreasonable effectiveness of quasirandom
+    sequences") in the cube around it, without the points outside of the ball."""
     ball, found, number = np.empty((count, 3)), 0, 0
     while found < count:
         number += 1
@@ -35,12 +35,12 @@ def unit_ball(count: int) -> NDArray[np.float64]:
 def moved_by(
     pose: NDArray[np.float64], turn_rad: NDArray[np.float64], shift_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(K, 4, 4) a pose (4, 4), turned by rotation vectors (K, 3) and then shifted by (K, 3), on the left."""
+    """(K, 4, 4): a pose (4, 4), turned by rotation vectors (K, 3) and then shifted by (K, 3), on the left."""
     moved = np.zeros((turn_rad.shape[0], 4, 4))
     for k in prange(turn_rad.shape[0]):
         a, b, c = turn_rad[k]
         angle = math.sqrt(a * a + b * b + c * c)
-        # Rodrigues, by half the angle; at no turn at all the quotient is its limit.
+        # Rodrigues' formula with half angles; for a zero turn, sin(angle/2)/angle is its limit 1/2.
         half, of_half = 0.5, math.cos(0.5 * angle)
         if angle > 0.0:
             half = math.sin(0.5 * angle) / angle

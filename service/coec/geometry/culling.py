@@ -1,8 +1,8 @@
-"""Points that cannot be in view: left out once for a whole search, or in bundles of neighbours at each pose.
+"""Culling of points that cannot be in view: once for a whole search, or in bundles of neighbours at each pose.
 
-A bundle is a run of `BUNDLE` points of one frame. Seen from the LiDAR its points lie within an angle of its axis; seen
-from the camera, within that angle and their parallax. Where this cone and the field of view do not meet, none of them
-is in the image: they are neither read nor projected.
+A bundle is a run of `BUNDLE` points of one frame. Seen from the LiDAR, its points lie in a cone: within some angle of
+the bundle's axis. Seen from the camera, the cone is wider by their parallax. If the cone misses the field of view, none
+of the points is in the image, and they are neither read nor projected.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from coec.geometry.cameras import Camera, domain_angle_rad
 from coec.geometry.projection import unproject
 
 FIELD_OF_VIEW_PX = 8
-"""Side of the squares of pixels over which the field of view is measured: a few thousand rays instead of a million."""
+"""Side of the squares of pixels at whose corners the field of view is measured: a few thousand rays, not a million."""
 
 BUNDLE = 512
-"""Points per bundle: their coordinates and pixels (8 kB) stay in the first-level cache while they are dealt with."""
+"""Points per bundle: their coordinates and pixels (8 kB) stay in the first-level cache while they are processed."""
 
 SECTORS = 64
-"""Sectors of azimuth by which a sweep is ordered: of 5.6 degrees, some three bundles of a 64-beam sweep each."""
+"""Sectors of azimuth by which a sweep is ordered. Each has 5.6 degrees, some three bundles of a 64-beam sweep."""
 
 NEVER_OUT = -math.inf
-"""Least cosine of a bundle that is left out nowhere."""
+"""Least cosine of a bundle that is never left out."""
 
 MARGIN_RAD = 1e-6
 """Added to every angle, for rounding."""
@@ -36,8 +36,8 @@ MARGIN_RAD = 1e-6
 def half_field_of_view_rad(camera: Camera, lit: NDArray[np.bool_]) -> float:
     """Largest angle from the optical axis at which the image has a pixel that counts (`lit`, (height, width)).
 
-    Over squares of pixels that hold one: their corners, where all of those have a ray, else the end of the model's
-    domain (the image circle of a fisheye lies inside the image).
+    Measured at the corners of the squares of pixels that hold such a pixel. If a corner has no ray, it is the end of
+    the model's domain (the image circle of a fisheye lies inside the image).
     """
     rows, columns = (np.append(np.arange(0, size, FIELD_OF_VIEW_PX), size) for size in lit.shape)
     corners = np.stack(np.meshgrid(columns - 0.5, rows - 0.5), axis=-1)
@@ -54,8 +54,8 @@ def half_field_of_view_rad(camera: Camera, lit: NDArray[np.bool_]) -> float:
 def within_cone(
     xyz_m: NDArray[np.float32], T_camera_lidar: NDArray[np.float64], angle_rad: float, shift_m: float
 ) -> NDArray[np.bool_]:
-    """(N,) whether points (3, N) may lie within an angle of the optical axis of a camera at a pose (4, 4), or at one
-    that is shifted from there by up to `shift_m`. What is no number does."""
+    """(N,) whether points (3, N) may lie within an angle of the optical axis of a camera, at a pose (4, 4) or at one
+    shifted from it by up to `shift_m`. True for points that are not numbers."""
     x, y, z = xyz_m
     T = T_camera_lidar.astype(np.float32)
     a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
@@ -73,9 +73,9 @@ class Bundles:
 
     Attributes:
         axis: (B, 3) unit vectors, LiDAR frame.
-        least_cosine: (B,) a bundle is out of view where the z-component of its axis, turned into the camera frame, is
+        least_cosine: (B,) a bundle is out of view if the z-component of its axis, turned into the camera frame, is
             less.
-        shift_m: largest length of the pose's translation for which that holds.
+        shift_m: largest length of a pose's translation for which `least_cosine` holds.
     """
 
     axis: NDArray[np.float64]
@@ -83,14 +83,15 @@ class Bundles:
     shift_m: float
 
     def least_cosine_at(self, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(B,) `least_cosine` at a pose (4, 4): of none is it out of reach where the pose shifts by more."""
+        """(B,) `least_cosine` at a pose (4, 4); `NEVER_OUT` for all bundles if the pose shifts by more than
+        `shift_m`."""
         if float(np.linalg.norm(T_camera_lidar[:3, 3])) > self.shift_m:
             return np.full(len(self.axis), NEVER_OUT)
         return self.least_cosine
 
 
 def azimuth_order(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Indices (N,) that bring the points (N, 3) of a sweep into order of their sector, else as they were."""
+    """Indices (N,) that sort the points (N, 3) of a sweep by sector and keep their order within each sector."""
     azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
     sector = np.nan_to_num((azimuth + math.pi) * (SECTORS / (2.0 * math.pi))).astype(np.uint8)
     return np.argsort(sector, kind="stable")
@@ -105,7 +106,7 @@ def bundle(xyz_m: NDArray[np.float32], first_point: NDArray[np.int64], half_view
         half_view_rad: largest angle from the optical axis at which the image has a pixel.
         shift_m: largest length of a pose's translation.
     """
-    # A frame at a time: in double precision, all at once would be the most that a solve ever holds.
+    # One frame at a time: in double precision, all frames at once would take more memory than anything else in a solve.
     frames = [_of_frame(xyz_m[:, a:b], half_view_rad, shift_m) for a, b in pairwise(first_point) if b > a]
     axes, least = zip(*frames, strict=True)
     return Bundles(np.concatenate(axes), np.concatenate(least), shift_m)
@@ -125,6 +126,6 @@ def _of_frame(
     nearest_m = np.minimum.reduceat(range_m, starts)
     parallax = np.where(nearest_m > shift_m, np.arcsin(np.minimum(shift_m / nearest_m, 1.0)), math.pi)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0)) + parallax + half_view_rad + MARGIN_RAD
-    # NaN compares as false: a bundle with a point that is no number, or that reaches all around, is never left out.
+    # NaN compares as false: a bundle with a NaN, or one that reaches all around, is never left out.
     least = np.where(angle < math.pi, np.cos(np.minimum(angle, math.pi)), -2.0)
     return np.nan_to_num(axis.T.copy()), least

@@ -1,8 +1,8 @@
-"""Small dense linear algebra on stacks of matrices, element by element: the last bit of a BLAS or LAPACK product may
-differ between two processes, and what is decided has to be the same to the byte.
+"""Small dense linear algebra on stacks of matrices, without BLAS and LAPACK: the last bit of their products may differ
+between two processes, and decisions have to be the same to the byte.
 
 `linear` does the same for one matrix in plain floats. Here all matrices of a stack go through each step together, which
-is what makes some thousand of them, or one with a hundred rows, quick enough.
+is fast enough for some thousand of them, or for one with a hundred rows.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def cholesky(a: Array) -> Array:
 
 
 def log_determinant(factor: Array) -> Array:
-    """(...) of L·Lᵀ, from L (..., n, n)."""
+    """Logarithms (...) of the determinants of L·Lᵀ, from L (..., n, n)."""
     total = np.zeros(factor.shape[:-2])
     for k in range(factor.shape[-1]):
         total += np.log(factor[..., k, k])
@@ -62,7 +62,7 @@ def log_determinant(factor: Array) -> Array:
 
 
 def solved(factor: Array, right: Array) -> Array:
-    """X (..., n, p) of L·Lᵀ·X = B (..., n, p)."""
+    """The solution X (..., n, p) of L·Lᵀ·X = B (..., n, p)."""
     n = factor.shape[-1]
     shape = np.broadcast_shapes(factor.shape[:-2], right.shape[:-2])
     x = np.array(np.broadcast_to(right, (*shape, *right.shape[-2:])), np.float64)
@@ -76,7 +76,7 @@ def solved(factor: Array, right: Array) -> Array:
 
 
 def inverse(a: Array) -> Array:
-    """(..., n, n) of symmetric positive definite matrices, symmetric.
+    """Inverses (..., n, n), exactly symmetric, of symmetric positive definite matrices.
 
     Raises:
         ValueError: one of them is not positive definite.

@@ -1,8 +1,8 @@
-"""Motion compensation of a sweep: every point is carried to one instant by a constant twist.
+"""Motion compensation (deskew) of a sweep: a constant twist carries every point to one reference instant.
 
-A point p measured dt after the reference instant, in the sensor frame of its own instant, has in the sensor frame of
-the reference instant the coordinates exp(ξ·dt)·p, with ξ = (ω, v) the twist of the sensor in its own frame
-(METHOD, section 3, "Motion compensation is visible").
+Let p be a point measured dt after the reference instant, in the sensor frame at that time. In the sensor frame of the
+reference instant it has the coordinates exp(ξ·dt)·p, with ξ = (ω, v) the twist of the sensor in its own frame (METHOD,
+section 3, "Motion compensation is visible").
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from coec.geometry.compiler import njit
 
 SMALL_RAD = 0.01
-"""A turn below which two terms of a series do for sines: the next is a ten-thousandth of a millionth of the first. A
-sweep turns by less in all but sharp bends, and a sine takes as long as all the rest."""
+"""Below this turn two terms of a series replace the sines: the third is a ten-thousandth of a millionth of the first. A
+sweep turns by less except in sharp bends, and a sine takes as long as all the rest."""
 
 
 def deskew(
@@ -37,7 +37,7 @@ def deskew(
         (N, 3) float32: exp(ξ·dt)·p, the closed form of SE(3)'s exponential (Rodrigues).
     """
     points_m = np.ascontiguousarray(xyz_m, np.float32).view()
-    # Compiled once, whether a sweep may be written to or not.
+    # Always read-only, so that the kernel is compiled for one type of array only.
     points_m.setflags(write=False)
     moved_m: NDArray[np.float32] = _deskew(points_m, dt_s, angular_radps, linear_mps)
     return moved_m

@@ -12,11 +12,11 @@ from coec.geometry.projection import project
 from coec.geometry.vectors import lengths, rows_of
 
 FURTHEST_M = 1e4
-"""No LiDAR measures further, and nothing overflows that is nearer."""
+"""Longest range taken: no LiDAR measures further, and nearer points cause no overflow."""
 
 
 class InView(NamedTuple):
-    """The points in view, in the order in which they came.
+    """The points in view, in their original order.
 
     Attributes:
         uv_px: (n, 2) pixels, their centres at integers.
@@ -36,13 +36,13 @@ def points_in_view(
     mask: NDArray[np.bool_] | None,
     nearest_m: float,
 ) -> InView:
-    """Those of the points that lie in the image of a camera.
+    """The points that lie in the image of a camera.
 
     Args:
         T_camera_lidar: (4, 4).
         xyz_m: (N, 3) LiDAR frame.
         mask: (height, width) or None; points on pixels that are False are left out.
-        nearest_m: nearer points are the vehicle itself, and left out.
+        nearest_m: nearer points are on the vehicle itself and left out.
 
     Raises:
         ValueError: the points have another shape.

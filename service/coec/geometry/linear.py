@@ -1,5 +1,5 @@
-"""Small linear algebra in plain floats: the last bit of a BLAS product may differ between two processes, and what is
-decided or kept has to be the same to the byte."""
+"""Small linear algebra in plain floats, without BLAS: the last bit of its products may differ between two processes,
+and decisions and stored results have to be the same to the byte."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from math import copysign, fsum, hypot, sqrt
 Rows = Sequence[Sequence[float]]
 
 MAX_SWEEPS = 30
-"""Of rotations in `eigen`; six by six is done after five or six."""
+"""Most sweeps of rotations in `eigen`; a 6×6 matrix takes five or six."""
 
 
 def solved(matrix: Rows, right: Sequence[float]) -> list[float]:
@@ -60,7 +60,7 @@ def eigen(matrix: Rows) -> list[tuple[float, list[float]]]:
 
 
 def _rotate(a: list[list[float]], vectors: list[list[float]], p: int, q: int) -> None:
-    """Turns the plane of two axes so that they are uncorrelated."""
+    """Jacobi rotation in place: turns the plane of axes p and q so that `a[p][q]` becomes zero."""
     tau = (a[q][q] - a[p][p]) / (2.0 * a[p][q])
     tangent = copysign(1.0, tau) / (abs(tau) + hypot(1.0, tau))
     cosine = 1.0 / hypot(1.0, tangent)
@@ -86,7 +86,7 @@ def _cholesky(matrix: Rows) -> list[list[float]]:
 
 
 def _solved(factor: Rows, right: Sequence[float]) -> list[float]:
-    """Of L·Lᵀ·x = right, forwards and backwards."""
+    """The solution of L·Lᵀ·x = right, by forward and backward substitution."""
     n = len(right)
     forward: list[float] = []
     for i in range(n):

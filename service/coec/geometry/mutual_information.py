@@ -4,8 +4,8 @@
     MI = H(f^P) + H(f^D) - H(f^P, f^D)
 
 per frame, from the joint histogram of the points that fall on a pixel with a value. Both features arrive here as bin
-indices, frozen for a whole search: the range of a point does not depend on the pose, and a depth map is looked up,
-never interpolated. So the inner loop is: transform, project, one 8-bit look-up, one increment.
+indices that stay the same for a whole search: the range of a point does not depend on the pose, and depth maps are
+looked up without interpolation. So the inner loop is: transform, project, one 8-bit look-up, one increment.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Certainty, certain_pixel
 from coec.geometry.prefetch import prefetch
 
 TASK = 32 * BUNDLE
-"""Points per parallel task: small enough to balance two to sixteen threads over a handful of frames, large enough
-that zeroing and adding up a task's histograms (8 kB each at 32 bins) does not count."""
+"""Points per parallel task: small enough to balance two to sixteen threads over a handful of frames, and large enough
+to make the cost of zeroing and adding up a task's histograms (8 kB each at 32 bins) negligible."""
 
 MOST_COUNTS = 2_000_000
-"""Counts of the histograms of several poses at once: 8 MB."""
+"""Most histogram counts held for several poses at once: 8 MB."""
 
 NEIGHBOURS = 8
-"""Points of a sweep of which one stands for all when lines of a depth map are fetched: they lie within five pixels of a
-map of 512, and a line of the cache holds 64."""
+"""Neighbouring points of a sweep for which one cache line of a depth map is prefetched: they lie within five pixels on
+a map of 512, and a cache line holds 64."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BinnedFrames:
-    """What the kernel visits, as structure of arrays over the points of all frames.
+    """Input of the kernel: a structure of arrays over the points of all frames.
 
     Attributes:
         camera: intrinsics scaled to the resolution of the depth maps.
         xyz_m: (3, N) float32, LiDAR frame, frames one after the other.
         range_bin: (N,) uint8 or uint16, bin of the point's range.
         first_point: (F + 1,) int64, frame f holds the points first_point[f] to first_point[f + 1].
-        depth_bin: (F, h·w + 1) uint8 or uint16, bin of the depth at each pixel, row by row; `depth_bins` where there is
-            none (masked, no value). The last entry stands for "not in the image" and is `depth_bins`, too.
+        depth_bin: (F, h·w + 1) uint8 or uint16, bin of the depth at each pixel, row by row; `depth_bins` at pixels
+            without one (masked, no value). The last entry stands for "not in the image" and is `depth_bins`, too.
         depth_bins, range_bins: numbers of bins.
-        bundles: which runs of points a pose can leave out; None = none.
+        bundles: runs of points that can be culled at a pose; None = no culling.
     """
 
     camera: Camera
@@ -67,7 +67,8 @@ class BinnedFrames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameInformation:
-    """Per frame: `mi` (F,) in nats (0 where nothing is in view) and `points` (F,) that fell on a pixel with a value."""
+    """Per frame: `mi` (F,) in nats (0 if nothing is in view), and `points` (F,), how many fell on a pixel with a
+    value."""
 
     mi: NDArray[np.float64]
     points: NDArray[np.int64]
@@ -84,8 +85,8 @@ def mutual_information(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]
 
 
 def information_of_each(frames: BinnedFrames, poses: NDArray[np.float64]) -> list[FrameInformation]:
-    """The same at each of many poses (K, 4, 4) in one go: several threads share what is too short for them one by
-    one."""
+    """The same at each of many poses (K, 4, 4) in one call: one pose is too short to share among threads, many are
+    not."""
     if len(poses) == 1:
         counts, first_task = _histograms_of_tasks(frames, poses)
         return [FrameInformation(*_information(counts[0], first_task))]
@@ -98,7 +99,7 @@ def information_of_each(frames: BinnedFrames, poses: NDArray[np.float64]) -> lis
 
 
 def joint_histograms(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(F, depth_bins, range_bins) int64 counts of points by depth bin at their pixel and by range bin."""
+    """(F, depth_bins, range_bins) int64: counts of points by the depth bin at their pixel and by their range bin."""
     (counts,), first_task = _histograms_of_tasks(frames, T_camera_lidar[None])
     summed = [counts[a:b, :-1].sum(axis=0, dtype=np.int64) for a, b in pairwise(first_task)]
     return np.stack(summed)
@@ -107,8 +108,8 @@ def joint_histograms(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]) 
 def _histograms_of_tasks(
     frames: BinnedFrames, poses: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """The joint histogram of each task at each of K poses, with one more row for points on no value, and the first task
-    of each frame."""
+    """The joint histogram of each task at each of K poses, with an extra row for points on a pixel without a value, and
+    the first task of each frame."""
     poses = np.ascontiguousarray(poses, np.float64)
     bundles = _of_every_bundle(frames.first_point) if frames.bundles is None else frames.bundles
     least_cosine = np.stack([bundles.least_cosine_at(T) for T in poses])
@@ -122,7 +123,7 @@ def _histograms_of_tasks(
 
 
 def _of_every_bundle(first_point: NDArray[np.int64]) -> Bundles:
-    """Bundles of which none is left out."""
+    """Bundles that are never left out."""
     count = int((-(-np.diff(first_point) // BUNDLE)).sum())
     return Bundles(np.zeros((count, 3)), np.full(count, NEVER_OUT), math.inf)
 
@@ -135,13 +136,13 @@ def _count(
     depth_bins: int, range_bins: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:  # fmt: skip
     """Joint histogram of each task at each of K poses (K, 4, 4), and the first task of each frame, with the number of
-    tasks at the end. Integer counts: the sum does not depend on the number of threads.
+    tasks at the end. Counts are integers, so that their sum does not depend on the number of threads.
 
-    `near_m` (K,) takes the place of that of `limits`; `axis` (B, 3) and `least_cosine` (K, B) are those of `Bundles`.
+    `near_m` (K,) replaces `near_m` of `limits`; `axis` (B, 3) and `least_cosine` (K, B) are those of `Bundles`.
     """
     first_task, task_frame, task_start, task_stop, task_bundle = _tasks(first_point)
     tasks = task_frame.shape[0]
-    # One row more than there are depth bins: points that fall on no value are counted there, without a branch.
+    # One row more than there are depth bins: it counts the points on pixels without a value, without a branch.
     counts = np.zeros((poses.shape[0], tasks, depth_bins + 1, range_bins), np.int32)
     for job in prange(poses.shape[0] * tasks):
         k, task = job // tasks, job % tasks
@@ -160,8 +161,8 @@ def _count(
 def _tasks(
     first_point: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """First task of each frame, with their number at the end; frame, first point, end of the points and first bundle of
-    each task, with the number of bundles at the end."""
+    """Five arrays: the first task of each frame, with the number of tasks at the end; then of each task its frame, its
+    first point, the end of its points, and its first bundle, with the number of bundles at the end."""
     frames = first_point.shape[0] - 1
     first_task = np.zeros(frames + 1, np.int64)
     for f in range(frames):
@@ -185,11 +186,11 @@ def _count_points(
     axis: NDArray[np.float64], least_cosine: NDArray[np.float64], depth_bin: NDArray[np.unsignedinteger],
     counts: NDArray[np.int32],
 ) -> None:  # fmt: skip
-    """Adds the points of one task, those of bundles in view, to its joint histogram (depth_bins + 1, range_bins)."""
+    """Adds the points of one task that lie in bundles in view to its joint histogram (depth_bins + 1, range_bins)."""
     pixel = np.empty(BUNDLE, np.int32)
     columns, one = np.uint64(counts.shape[1]), np.int32(1)
-    # Two histograms, used in turn: neighbouring points often share a cell, and an increment that follows another on the
-    # same address has to wait for it.
+    # Two histograms, used in turn: neighbouring points often share a cell, and an increment has to wait for the one
+    # before it on the same address.
     even, odd = counts.ravel(), np.zeros(counts.size, np.int32)
     for index in range(axis.shape[0]):
         cosine = axis[index, 0] * T[2, 0] + axis[index, 1] * T[2, 1] + axis[index, 2] * T[2, 2]
@@ -198,17 +199,17 @@ def _count_points(
         begin = index * BUNDLE
         end = min(begin + BUNDLE, x.shape[0])
         xs, ys, zs, bins, pixels = x[begin:end], y[begin:end], z[begin:end], range_bin[begin:end], pixel[: end - begin]
-        # Pass 1, in vector registers.
+        # Pass 1, in vector registers: project.
         if certain_pixels(single, limits, T_single, xs, ys, zs, pixels) == OUTSIDE:
             continue
-        # In between: a map is read here and there, and a window of fifty has left the caches since the last pose. Lines
-        # that are asked for together come together (200 frames: 62 instead of 78 µs each).
+        # In between, prefetch: a map is read at scattered places, and the maps of fifty frames have left the caches
+        # since the last pose. Cache lines requested together arrive together (200 frames: 62, not 78 µs each).
         for group in range(np.uint64(pixels.shape[0] // NEIGHBOURS)):
             first = pixels[group * np.uint64(NEIGHBOURS)]
             if first >= 0:
                 prefetch(depth_bin, np.uint64(first))
-        # Pass 2: look up and count. A sweep enters and leaves the view in long runs: the branches cost next to nothing.
-        # Unsigned indices: numba would otherwise test each of them for being negative.
+        # Pass 2: look up and count. A sweep enters and leaves the view in long runs, so that the branches cost next to
+        # nothing. The indices are unsigned because numba would test signed ones for being negative.
         for pair in range(np.uint64(pixels.shape[0] // 2)):
             i = pair * np.uint64(2)
             j = i + np.uint64(1)
@@ -232,15 +233,15 @@ def _count_exactly(
     range_bin: np.unsignedinteger, depth_bin: NDArray[np.unsignedinteger], columns: np.uint64,
     counts: NDArray[np.int32],
 ) -> None:  # fmt: skip
-    """Adds one point in double precision."""
+    """Adds one point, projected in double precision."""
     pixel = exact_pixel(camera, T, np.float64(x), np.float64(y), np.float64(z))
     if pixel >= 0:
         counts[np.uint64(depth_bin[np.uint64(pixel)]) * columns + np.uint64(range_bin)] += np.int32(1)
 
 
 _TIMES_LOG = np.array([0.0, *(count * math.log(count) for count in range(1, 4096))])
-"""c·log c of the counts that nearly all cells have, nats: the logarithms were half of what a frame of some thousand
-points costs after it is counted."""
+"""Table of c·log c, nats, for the counts that nearly all cells have. Without it the logarithms are half of the cost of
+a frame of some thousand points after counting."""
 
 
 @njit(cache=True, inline="always")
@@ -254,7 +255,7 @@ def _information(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """MI in nats and number of points of each frame, with H = log n - (1/n) Σ c·log c over the counts c.
 
-    On one thread: a microsecond a frame, for 25 frames less than it takes to wake another thread.
+    On one thread: it takes a microsecond per frame, and 25 frames take less time than waking another thread.
     """
     frames, depth_bins, range_bins = len(first_task) - 1, counts.shape[1] - 1, counts.shape[2]
     mi = np.zeros(frames)
@@ -290,7 +291,7 @@ def _information(
 def _informations(
     counts: NDArray[np.int32], first_task: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """As `_information`, of the counts of K poses: (K, F) each."""
+    """As `_information`, for the counts of K poses: (K, F) each."""
     shape = (counts.shape[0], len(first_task) - 1)
     mi, points = np.empty(shape), np.empty(shape, np.int64)
     for k in prange(counts.shape[0]):

@@ -1,4 +1,4 @@
-"""Squares and blocks of an image in figures, in one pass."""
+"""Sums, differences and grey levels over squares or blocks of an image, each in one pass."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from coec.geometry.compiler import PRANGE, njit, prange
 
 @njit(cache=True, parallel=PRANGE)
 def square_sums(grey: NDArray[np.uint8], side: int) -> NDArray[np.uint32]:
-    """(h // side, w // side) sums of the pixels of each full square; a remainder at the right and the bottom is left
-    out. grey: (h, w)."""
+    """(h // side, w // side): sums of the pixels of each full square of an image `grey` (h, w). Pixels beyond the last
+    full square at the right and the bottom are left out."""
     rows, columns = grey.shape[0] // side, grey.shape[1] // side
     sums = np.zeros((rows, columns), np.uint32)
     for row in prange(rows):
@@ -29,9 +29,9 @@ def square_sums(grey: NDArray[np.uint8], side: int) -> NDArray[np.uint32]:
 
 @njit(cache=True, parallel=PRANGE)
 def neighbour_differences(grey: NDArray[np.uint8], block_rows: int, block_columns: int) -> NDArray[np.float64]:
-    """(block_rows, block_columns) means, over every second row of each block of an image (h, w), of the absolute
-    differences to the neighbours on the right and below in sum. Blocks are as large as so many fit; what is beyond
-    them does not count."""
+    """(block_rows, block_columns): for each block of an image (h, w), the mean over every second row of the sum of the
+    absolute differences to the right and the lower neighbour. Blocks are as large as fit; pixels beyond them do not
+    count."""
     rows, columns = grey.shape[0] // block_rows, grey.shape[1] // block_columns
     height, width = rows * block_rows, columns * block_columns
     means = np.zeros((block_rows, block_columns))
@@ -55,7 +55,7 @@ def neighbour_differences(grey: NDArray[np.uint8], block_rows: int, block_column
 
 @njit(cache=True)
 def level_counts(grey: NDArray[np.uint8], step: int) -> NDArray[np.int64]:
-    """(256,) how many pixels have each grey value, of every `step`-th pixel of every `step`-th row of an image
+    """(256,): how many pixels have each grey value, over every `step`-th pixel of every `step`-th row of an image
     (h, w)."""
     counts = np.zeros(256, np.int64)
     for y in range(0, grey.shape[0], step):
@@ -66,5 +66,6 @@ def level_counts(grey: NDArray[np.uint8], step: int) -> NDArray[np.int64]:
 
 @njit(cache=True, inline="always")
 def _apart(a: np.uint8, b: np.uint8) -> np.int32:
-    """In eight bits: sixteen times as many at once as in 64, which differences are taken in otherwise."""
+    """Absolute difference in eight bits. By default differences are taken in 64 bits, and a vector register holds many
+    more values of eight."""
     return np.int32(np.uint8(a - b) if a > b else np.uint8(b - a))

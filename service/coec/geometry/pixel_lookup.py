@@ -1,11 +1,11 @@
-"""The nearest pixel of many points at one pose: in single precision, sixteen points to an instruction, with double
-precision wherever single precision cannot tell. The outcome is that of double precision, point by point.
+"""The nearest pixel of many points at one pose: in single precision, sixteen points to an instruction, and in double
+precision where single precision cannot decide. For every point the outcome is that of double precision.
 
-A pixel is a rounded coordinate, so nearly every point lies far enough from the border of its pixel that the error of
-single precision does not matter: about one in a thousand does not. The loop marks those, and the caller asks
-`exact_pixel`. This is the floating-point filter of exact geometric predicates (J. R. Shewchuk, "Adaptive Precision
-Floating-Point Arithmetic and Fast Robust Geometric Predicates", 1997), with an error bound that is measured instead of
-derived: `filter_of` projects a sample of the field of view both ways and takes `SAFETY` times the largest difference.
+A pixel is a rounded coordinate. All but about one point in a thousand lie so far from the border of their pixel that
+the error of single precision does not matter. The loop marks the others, and for those the caller calls `exact_pixel`.
+This is the floating-point filter of exact geometric predicates (J. R. Shewchuk, "Adaptive Precision Floating-Point
+Arithmetic and Fast Robust Geometric Predicates", 1997), but its error bound is measured, not derived: `filter_of`
+projects a sample of the field of view in both precisions and takes `SAFETY` times the largest difference.
 """
 
 from __future__ import annotations
@@ -21,44 +21,45 @@ from coec.geometry.cameras import Camera, domain_angle_rad, image_point, in_sing
 from coec.geometry.compiler import njit
 
 OUTSIDE, UNSURE = -2, -1
-"""What stands for a pixel where there is none, and where single precision does not know. UNSURE is the larger: the
-largest entry of a block tells whether there is anything to do for it."""
+"""Codes in place of a pixel: there is none, or single precision cannot decide. UNSURE is the larger, so that the
+largest entry of a block tells whether there is anything to do for the block."""
 
 SAFETY = 4.0
-"""The bound, in units of the largest error of the sample. Rounding errors are sums of some twenty independent ones: a
-billion points are expected to exceed the largest of `SAMPLES` by a factor of 1.4."""
+"""The error bound, in units of the largest error of the sample. Rounding errors are sums of some twenty independent
+ones, so that the largest of a billion points is expected to be 1.4 times the largest of `SAMPLES`."""
 
 SAMPLES = 65_536
 """Points over which the error is measured: half a hundred per degree of a 180° lens."""
 
 EDGE_BAND = 1e-5
-"""Points whose z/d is this near to where the model's domain ends are left to double precision. Single precision knows
-z/d to some 3e-7."""
+"""Points whose z/d is this near to the end of the model's domain are left to double precision. Single precision has z/d
+to some 3e-7."""
 
 FAR_M = 1e6
-"""Points farther away than this are left to double precision, which also tells which are not numbers."""
+"""Points farther away than this are left to double precision, which also recognises those that are not numbers."""
 
 NEAR_M = 1e-3
-"""So are points nearer than this."""
+"""Points nearer than this are left to double precision, too."""
 
 # The largest whole number up to which a float32 counts by ones: pixels are numbered in it.
 _MAX_PIXELS = 2**24
 
-# Here, and only here, the compiler may fuse, re-associate and estimate reciprocals: it does so differently from one
-# compilation to the next, but by less than the bound. NaN and infinity keep their meaning.
+# Only here may the compiler fuse, re-associate and estimate reciprocals. The results differ from one compilation to the
+# next, but by less than the bound. NaN and infinity keep their meaning.
 _LOOSE = {"contract", "reassoc", "nsz", "arcp", "afn"}
 
 _HALF = np.float32(0.5)
 
 
 class Certainty(NamedTuple):
-    """What single precision can tell.
+    """Limits within which single precision can decide.
 
     Attributes:
-        reach_px: a coordinate this far from the centre of its pixel, or farther, may belong to the next; at most 0.5.
+        reach_px: a coordinate this far from the centre of its pixel, or farther, may belong to the next pixel; at most
+            0.5.
         edge_cosine: z/d (of a point at distance d) at which the model's domain ends.
-        near_m: points nearer to the camera than this are left to double precision; at least `NEAR_M` and the length of
-            the pose's translation, or the shift could cancel most of their coordinates.
+        near_m: points nearer to the camera than this are left to double precision. It is at least `NEAR_M` and at least
+            the length of the pose's translation, because the shift can cancel most of the coordinates of nearer points.
     """
 
     reach_px: np.float32
@@ -67,8 +68,8 @@ class Certainty(NamedTuple):
 
 
 class PixelFilter(NamedTuple):
-    """A camera with intrinsics as float32, and what can be told with it. A parallel loop takes no nested tuples, so the
-    two go into it one by one."""
+    """A camera with intrinsics as float32, and the limits of single precision for it. A parallel loop takes no nested
+    tuples, so that the two are passed to it separately."""
 
     camera: Camera
     certainty: Certainty
@@ -80,9 +81,9 @@ class PixelFilter(NamedTuple):
 
 @lru_cache(maxsize=32, typed=True)
 def filter_of(camera: Camera) -> PixelFilter:
-    """The filter of a camera, with its error bound measured.
+    """The filter of a camera, with its measured error bound.
 
-    Where no bound holds (an image of more than 16 million pixels, a formula that single precision cannot follow), every
+    If no bound holds (an image of more than 16 million pixels, a formula that single precision cannot follow), every
     point is left to double precision.
     """
     single = in_single_precision(camera)
@@ -98,8 +99,8 @@ def filter_of(camera: Camera) -> PixelFilter:
 def _sample(edge_rad: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """A pose (4, 4) and points (3, SAMPLES), LiDAR frame, all over the domain and a little beyond.
 
-    The pose shifts by one metre and the points are one metre and more from the camera: the worst case that the kernel
-    admits, for there the cancellation between a point's own coordinates and the shift is largest.
+    The pose shifts by one metre and the points are one metre or more from the camera. This is the worst case that the
+    kernel admits, because there the cancellation between a point's coordinates and the shift is largest.
     """
     rng = np.random.default_rng(0)
     theta = rng.uniform(0.0, min(edge_rad + 0.02, math.pi), SAMPLES)
@@ -125,8 +126,8 @@ def _largest_error_px(
     camera: Camera, single: Camera, edge_cosine: np.float32, T: NDArray[np.float64], T32: NDArray[np.float32],
     xyz: NDArray[np.float32],
 ) -> float:  # fmt: skip
-    """Largest difference between the two precisions of a coordinate of a point in the image; infinite where they do not
-    agree on whether there is a pixel, other than in the band around the edge."""
+    """Largest difference between the two precisions in a coordinate of a point in the image. Infinite if they disagree,
+    outside of the band around the edge of the domain, on whether there is a pixel."""
     largest = 0.0
     for i in range(xyz.shape[1]):
         x, y, z = float(xyz[0, i]), float(xyz[1, i]), float(xyz[2, i])
@@ -149,7 +150,7 @@ def certain_pixels(
     camera: Camera, limits: Certainty, T: NDArray[np.float32], x_m: NDArray[np.float32], y_m: NDArray[np.float32],
     z_m: NDArray[np.float32], pixel: NDArray[np.int32],
 ) -> np.int32:  # fmt: skip
-    """The pixel of each point (row · width + column), OUTSIDE or UNSURE, into `pixel`; returns the largest entry.
+    """Writes the pixel of each point (row · width + column), OUTSIDE or UNSURE into `pixel`; returns the largest entry.
 
     Args:
         camera, limits: the camera's filter, the limits at the pose.
@@ -162,12 +163,12 @@ def certain_pixels(
     zero, outside, unsure, far_m = np.float32(0.0), np.float32(OUTSIDE), np.float32(UNSURE), np.float32(FAR_M)
     band = np.float32(EDGE_BAND)
     largest = np.int32(OUTSIDE)
-    # No branch, and nothing wider than 32 bits: one 64-bit number or one count of truth values in this loop, and the
-    # compiler takes registers of half the width (1.05 instead of 0.55 ns per point).
+    # No branch, and nothing wider than 32 bits: with one 64-bit number or one count of truth values in this loop the
+    # compiler uses registers of half the width (1.05 instead of 0.55 ns per point).
     for i in range(pixel.shape[0]):
         x, y, z = moved(T, x_m[i], y_m[i], z_m[i])
         u, v, in_domain = image_point(camera, x, y, z)
-        # Far outside, a coordinate has no fraction left to tell anything by: nearer outside will do.
+        # Far outside of the image a coordinate has no fraction left: clamp it to just outside.
         across = min(max(u + _HALF, -_HALF), width + _HALF)
         down = min(max(v + _HALF, -_HALF), height + _HALF)
         column, row = np.floor(across), np.floor(down)

@@ -1,5 +1,5 @@
-"""Equation (1) written down plainly, twice: what the kernel of `mutual_information` is measured against, in the same
-run and on the same machine (`coec bench`)."""
+"""Two plain forms of equation (1). `coec bench` compares the kernel of `mutual_information` with them, in the same run
+and on the same machine."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from coec.geometry.mutual_information import BinnedFrames
 
 
 def by_numpy(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-    """MI of every frame (F,), nats, by NumPy: whole arrays at a time. Double sphere only (Usenko 2018, equations (40)
-    to (43)).
+    """MI of every frame (F,), nats, by NumPy on whole arrays. Double sphere only (Usenko 2018, equations (40) to (43)).
 
     Raises:
         TypeError: the camera is of another model.
@@ -44,7 +43,7 @@ def by_numpy(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]) -> NDArr
 
 
 def by_scalar_loop(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-    """MI of every frame (F,), nats, by the loop that one would write first: compiled, point by point, on one core."""
+    """MI of every frame (F,), nats, by a simple compiled loop, point by point, on one core."""
     pose = np.ascontiguousarray(T_camera_lidar, np.float64)
     joint = np.zeros((frames.frames, frames.depth_bins, frames.range_bins))
     _count(frames.camera, pose, frames.xyz_m, frames.range_bin, frames.first_point, frames.depth_bin, joint)
@@ -72,7 +71,7 @@ def _count(
 
 
 def _information(joint: NDArray[np.float64]) -> float:
-    """H(f^P) + H(f^D) - H(f^P, f^D) of a joint histogram, nats; 0 of an empty one."""
+    """H(f^P) + H(f^D) - H(f^P, f^D) of a joint histogram, nats; 0 if it is empty."""
     if not joint.any():
         return 0.0
     p = joint / joint.sum()

@@ -1,4 +1,4 @@
-"""Planes through points and their neighbours: what the surface is there, and how sure its tilt is."""
+"""Planes fitted to points and their neighbours: the local surface, and how certain its tilt is."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from coec.geometry.compiler import njit
 
 SWEEPS = 8
-"""Of Jacobi's rotations of a 3×3 matrix, which is diagonal to the last bit after four or five."""
+"""Sweeps of Jacobi's rotations over a 3×3 matrix; it is diagonal to the last bit after four or five."""
 
 
 class Planes(NamedTuple):
@@ -20,9 +20,9 @@ class Planes(NamedTuple):
         centre: (N, 3) mean of the neighbours.
         normal: (N, 3) unit; its sign is arbitrary.
         spread: (N, 3) standard deviations of the neighbours along the normal and along the two axes in the plane,
-            ascending, metres; NaN where there are fewer than three.
+            ascending, metres; NaN with fewer than three neighbours.
         axes: (N, 2, 3) the two unit axes in the plane.
-        used: (N,) how many neighbours.
+        used: (N,) number of neighbours used.
     """
 
     centre: NDArray[np.float64]
@@ -35,13 +35,13 @@ class Planes(NamedTuple):
 def planes_through(
     points: NDArray[np.float64], neighbours: NDArray[np.int64], squared_m2: NDArray[np.float64], reach_m: float
 ) -> Planes:
-    """The plane of least squares through the neighbours of each query.
+    """The least-squares plane through the neighbours of each query.
 
     Args:
         points: (M, 3).
         neighbours: (N, k) indices of points.
         squared_m2: (N, k) squared distances from the query.
-        reach_m: neighbours further from the query than this are left out.
+        reach_m: neighbours farther from the query than this are left out.
     """
     return Planes(*_planes(points, neighbours, squared_m2, reach_m * reach_m))
 
@@ -88,8 +88,8 @@ def _planes(
 
 @njit(cache=True)
 def _turned_to_axes(a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Makes a symmetric (3, 3) diagonal, in place; the columns of what is returned (3, 3) are its axes. Jacobi's
-    rotations (Golub, Van Loan 2013, section 8.5)."""
+    """Makes a symmetric (3, 3) matrix diagonal, in place, by Jacobi's rotations (Golub, Van Loan 2013, section 8.5).
+    Returns a (3, 3) whose columns are its axes."""
     v = np.eye(3)
     for _ in range(SWEEPS):
         for p in range(2):

@@ -1,4 +1,4 @@
-"""Asking for memory ahead of its use, from compiled loops."""
+"""Prefetching of memory from compiled loops."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 _READ, _SECOND_LEVEL, _DATA = 0, 2, 1
-"""Of LLVM's `prefetch`: to be read; kept in the second-level cache and below; data, not code."""
+"""Arguments of LLVM's `prefetch`: for reading; keep in the second-level cache and below; data, not code."""
 
 _SIGNATURE = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, *[cgutils.int32_t] * 3])
 
@@ -32,5 +32,5 @@ def _prefetch(context: Any, array: types.Array, index: types.Integer) -> tuple[A
 
 
 prefetch = cast("Callable[[NDArray[Any], np.integer], None]", _prefetch)
-"""`prefetch(array, index)` begins to fetch the cache line of an entry of an array (n,). Nothing waits for it, and an
-index outside of the array does no harm."""
+"""`prefetch(array, index)` begins to fetch the cache line of an entry of an array (n,). It does not wait, and an index
+outside of the array does no harm."""

@@ -1,4 +1,4 @@
-"""Projection of arrays by any camera model. The formulas are those of `coec.geometry.cameras`, compiled into a loop."""
+"""Projection of arrays with any camera model, by the formulas of `coec.geometry.cameras` compiled into a loop."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,10 +1,10 @@
 """Rotations and rigid transforms as NumPy arrays.
 
 A transform T is (4, 4) and named after its frames: T_camera_lidar maps LiDAR to camera. A vector xi is
-[rx ry rz tx ty tz] in radians and metres, and there are two readings of it:
+[rx ry rz tx ty tz] in radians and metres, and it has two meanings:
 
-- `perturbation` and `perturb`: rotation Exp(r) and translation t set apart, T(xi) = [Exp(r) | t] · T. A correction in
-  degrees and metres about the camera axes reads as a user expects it.
+- `perturbation` and `perturb`: a separate rotation Exp(r) and translation t, T(xi) = [Exp(r) | t] · T. A correction in
+  degrees and metres about the camera axes then reads as a user expects it.
 - `exp` and `log`: a twist, the motion at a constant velocity for one unit of time. Used for motion compensation.
 
 J. Solà, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, appendices B and D.
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Below this angle the coefficients of the exponential and logarithm are taken from their series, whose first dropped
-# term is then below 1e-15 of the first, and above it cancellation costs less than 1e-15 in the result. Unit: rad.
+# Below this angle the coefficients of the exponential and logarithm come from their series, whose first dropped term is
+# then below 1e-15 of the first. Above it, cancellation costs less than 1e-15 in the result. Unit: rad.
 _SMALL_ANGLE_RAD = 0.1
 
 
@@ -63,11 +63,11 @@ def rotation_exp(r: Array) -> Array:
 def rotation_log(rotation: Array) -> Array:
     """Rotation vector (3,), radians, length in [0, pi], of a rotation matrix (3, 3). Exact near 0 and near pi.
 
-    By way of the quaternion, whose vector part does not vanish near pi as the antisymmetric part of the matrix does.
+    Uses the quaternion, because its vector part does not vanish near pi as the antisymmetric part of the matrix does.
     """
     q = quaternion_xyzw_from_rotation(rotation)
     sine = float(np.linalg.norm(q[:3]))
-    # angle / sine; towards zero angle this is 2.
+    # angle / sine; its limit at zero angle is 2.
     scale = 2.0 * math.atan2(sine, q[3]) / sine if sine > 0.0 else 2.0
     return scale * q[:3]
 
@@ -80,7 +80,7 @@ def rotation_angle_rad(transform: Array) -> float:
 def quaternion_xyzw_from_rotation(rotation: Array) -> Array:
     """Unit quaternion [x y z w], w >= 0, of a rotation matrix (3, 3).
 
-    Divides by the largest of the four components, which is at least one half, so nothing cancels at any angle
+    Divides by the largest of the four components, which is at least one half, so that nothing cancels at any angle
     (S. W. Shepperd, "Quaternion from rotation matrix", Journal of Guidance and Control 1(3), 1978).
     """
     r = np.asarray(rotation, dtype=np.float64)
@@ -102,10 +102,10 @@ def quaternion_xyzw_from_rotation(rotation: Array) -> Array:
 
 
 def rotation_from_quaternion_xyzw(quaternion_xyzw: Array) -> Array:
-    """Rotation matrix (3, 3) of a quaternion [x y z w] of any length. Raises ValueError if it is zero or not finite, or
-    if its square is."""
+    """Rotation matrix (3, 3) of a quaternion [x y z w] of any length. Raises ValueError if it or its square is zero or
+    not finite."""
     q = _vector("quaternion_xyzw", quaternion_xyzw, 4)
-    with np.errstate(over="ignore", invalid="ignore"):  # a NaN may be a signalling one
+    with np.errstate(over="ignore", invalid="ignore"):  # a NaN may be signalling
         norm = float(np.linalg.norm(q))
     if not (norm > 0.0 and math.isfinite(norm)):
         raise ValueError(f"quaternion_xyzw must be finite and not zero, got {q.tolist()}")
@@ -157,7 +157,7 @@ def log(transform: Array) -> Array:
 
 
 def perturbation(xi: Array) -> Array:
-    """[Exp(r) | t] (4, 4) of xi = [r t] (6,): rotation vector in radians and translation in metres, set apart."""
+    """[Exp(r) | t] (4, 4) of xi = [r t] (6,): a rotation vector in radians and a separate translation in metres."""
     xi = _vector("xi", xi, 6)
     return transform_from(rotation_exp(xi[:3]), xi[3:])
 
@@ -168,10 +168,10 @@ def perturbation_log(transform: Array) -> Array:
 
 
 def perturb(transform: Array, xi: Array) -> Array:
-    """T(xi) = perturbation(xi) · T: for T_camera_lidar a turn about and a shift along the camera's axes."""
+    """T(xi) = perturbation(xi) · T: for T_camera_lidar, a turn about and a shift along the camera's axes."""
     a, b, c, *shift = _vector("xi", xi, 6).tolist()
     by_axis, by_square, _ = _coefficients(math.sqrt(a * a + b * b + c * c))
-    # Rodrigues, entry by entry: a search does this thousands of times, and arrays of nine numbers are mostly overhead.
+    # Rodrigues' formula, entry by entry: a search calls this thousands of times, and small arrays are mostly overhead.
     square = a * a + b * b + c * c
     rows = (
         (1.0 + by_square * (a * a - square), by_square * a * b - by_axis * c, by_square * a * c + by_axis * b),
@@ -192,8 +192,8 @@ def difference(transform_a: Array, transform_b: Array) -> Array:
 
 
 def adjoint(T_b_a: Array) -> Array:
-    """(6, 6) how a small perturbation about the axes of frame a reads about those of frame b, T_b_a (4, 4): rotations
-    turn, and shift the origin of b by their lever."""
+    """(6, 6) matrix that converts a small perturbation about the axes of frame a into one about those of frame b, with
+    T_b_a (4, 4). A rotation also shifts the origin of b, by its lever."""
     rotation, lever = T_b_a[:3, :3], T_b_a[:3, 3]
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = jacobian[3:, 3:] = rotation
@@ -210,7 +210,7 @@ def is_rigid(transform: Array, tolerance: float = 1e-6) -> bool:
     if t.shape != (4, 4) or not np.isfinite(t).all() or not np.array_equal(t[3], [0.0, 0.0, 0.0, 1.0]):
         return False
     rotation = t[:3, :3]
-    if np.abs(rotation).max() > 1.0 + tolerance:  # no rotation, and its square may be more than a double holds
+    if np.abs(rotation).max() > 1.0 + tolerance:  # no rotation, and its square may overflow
         return False
     orthonormal = bool(np.abs(rotation.T @ rotation - np.eye(3)).max() <= tolerance)
     return orthonormal and float(np.linalg.det(rotation)) > 0.0

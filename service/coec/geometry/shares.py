@@ -1,4 +1,4 @@
-"""Values as the number of the share that they are in: how what is compared becomes whole numbers, once for a search."""
+"""Converts values to the number of the share (bin) that they fall in, so that a search compares whole numbers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from coec.geometry.compiler import PRANGE, njit, prange
 def share_of_pixels(
     values: NDArray[np.float32], usable: NDArray[np.bool_], edges: NDArray[np.float32]
 ) -> NDArray[np.unsignedinteger]:
-    """(h·w + 1,) how many of the ascending edges (n,) the value of each pixel reaches, row by row: 0 to n; n + 1 where
-    a pixel is not `usable`, and once more at the end, for what lies outside of the map (h, w).
+    """(h·w + 1,): for each pixel, row by row, how many of the ascending edges (n,) its value reaches, 0 to n. It is n +
+    1 for a pixel that is not `usable`, and in the last entry, which stands for points outside of the map (h, w).
 
-    In the narrowest type that holds n + 1: what looks it up lives on cache.
+    The type is the narrowest that holds n + 1, because look-ups are bound by the cache.
     """
     none = len(edges) + 1
     share: NDArray[np.unsignedinteger] = np.empty(values.size + 1, np.uint8 if none < 256 else np.uint16)
@@ -30,11 +30,11 @@ def _count_reached(
     edges: NDArray[np.float32],
     share: NDArray[np.unsignedinteger],
 ) -> None:
-    """`share` (h·w + 1,) at the pixels that are usable."""
+    """Fills `share` (h·w + 1,) at the usable pixels."""
     h, w = values.shape
     for y in prange(h):
         row, reached = values[y], np.zeros(w, np.uint16)
-        # Edge by edge, not pixel by pixel: the loop over the pixels runs in vector registers.
+        # The loop over the pixels is the inner one, so that it runs in vector registers.
         for edge in edges:
             for x in range(w):
                 reached[x] += np.uint16(row[x] >= edge)

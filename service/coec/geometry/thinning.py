@@ -1,7 +1,7 @@
-"""Some of many, where all would take too long: points of a sweep, range edges, pixels.
+"""A random choice of some of many points of a sweep, range edges or pixels, where all would take too long.
 
-A stride would do it as fast, but a sweep comes in the order in which its beams fire: of a sensor of sixteen beams,
-every second point is eight of them. A choice at random has no beat that anything could fall in with.
+A stride would be as fast, but a sweep comes in the order in which its beams fire: with sixteen beams, every second
+point belongs to the same eight beams. A random choice has no such period.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 SEED = 16_384
-"""Any number. What is chosen depends on the two counts alone, so a replay chooses the same."""
+"""An arbitrary number. The choice depends on the two counts alone, so that a replay chooses the same."""
 
 KEPT_CHOICES = 16
-"""Choices that are remembered, of up to a hundred thousand numbers each (13 MB in all): the images of a window have one
-size, and so have the sweeps of many a sensor."""
+"""Choices kept in memory, of up to a hundred thousand numbers each (13 MB in all). They recur, because the images of a
+window have one size, and so have the sweeps of many sensors."""
 
 
 @lru_cache(maxsize=KEPT_CHOICES)
 def thinned(count: int, at_most: int) -> NDArray[np.int64]:
-    """Indices (n,) of `at_most` of `count` things, ascending, each as likely as any other; of all where there are no
-    more. Read-only: the same array is handed out to all who ask for these counts.
+    """Indices (n,), ascending, of `at_most` of `count` things, each chosen with the same probability; of all things if
+    there are not more. The array is read-only because every caller with these counts gets the same one.
 
-    The beginning of a seeded permutation (Fisher, Yates 1938), put in order so that memory is read in one direction.
+    The beginning of a seeded permutation (Fisher, Yates 1938), sorted so that memory is read in one direction.
 
     Raises:
         ValueError: a count is negative.

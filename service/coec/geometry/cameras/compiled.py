@@ -1,11 +1,11 @@
-"""The formulas of the camera models as numba compiles them into loops. Import `coec.geometry.compiler`, which does.
+"""Registers the formulas of the camera models with numba. Import `coec.geometry.compiler`, which imports this module.
 
 The model is chosen at compile time, by the type of the camera. A kernel therefore needs no branch and no code per
 model, and numba caches it on disk, which it does not do for a kernel that takes a function as an argument.
 
-No fastmath in any of them. numba compiles a parallel kernel anew for the process that first runs it and for the cache;
-with leave to re-associate and to fuse, the two differ in the last bit, and a decision has to replay to the byte. The
-loops vectorise all the same. (The one exception, `pixel_lookup.certain_pixels`, compiles these formulas for itself and
+None of them uses fastmath. numba compiles a parallel kernel twice: for the process that first runs it, and for the
+cache. If it may re-associate and fuse, the two differ in the last bit, but decisions have to replay to the byte. The
+loops vectorise anyway. (The one exception, `pixel_lookup.certain_pixels`, compiles these formulas for itself and
 answers only where the last bits do not matter.)
 """
 
@@ -23,8 +23,8 @@ from coec.geometry.cameras.polynomial import odd_polynomial, solve_odd_polynomia
 from coec.geometry.cameras.rational import rational_distort, rational_factor, rational_radius, rational_slope
 from coec.geometry.cameras.registry import model_of
 
-# A division by zero gives an infinity, not a branch to an exception. With options of their own, not those of the loop
-# around them: NaN stays invalid in a caller with fastmath.
+# A division by zero gives an infinity, not a branch to an exception. The formulas have options of their own instead of
+# their caller's, so that NaN stays invalid in a caller with fastmath.
 _OPTIONS: Any = {"error_model": "numpy"}
 
 for _formula in (

@@ -10,7 +10,7 @@ from coec.geometry.cameras.double_sphere import MAX_XI, MIN_XI, DoubleSphere
 from coec.geometry.cameras.registry import Camera
 from coec.geometry.projection import project, unproject
 
-# The parameters of the model: with fewer rays than that there is nothing to fit.
+# Parameters of the model: with fewer rays than this there is nothing to fit.
 _PARAMETERS = 6
 
 # The image is compared at the centres of this many columns and rows of equal cells: the six parameters of a smooth
@@ -18,8 +18,8 @@ _PARAMETERS = 6
 _GRID = 64
 
 # Starts (xi, alpha): the pinhole, then around the values of real lenses (xi of -0.3 to 0.1, alpha of 0.5 to 0.7) and
-# the far end of xi. To first order in xi, focal length and alpha can undo it, so xi = 0 is always stationary, if only
-# as a saddle: but for the pinhole, which is exact there, no start lies on it.
+# the far end of xi. To first order, focal length and alpha can undo a change of xi, so that xi = 0 is always
+# stationary, possibly as a saddle. Therefore no start lies on it except the pinhole, which is exact there.
 _STARTS = ((0.0, 0.0), (-0.25, 0.55), (-0.6, 0.4), (0.25, 0.5), (0.5, 0.65), (0.9, 0.2))
 
 _MAX_ITERATIONS = 100

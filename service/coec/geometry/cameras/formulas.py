@@ -1,7 +1,6 @@
 """What the formulas of all camera models share: guards, and an arc tangent that vectorises.
 
-Plain Python on numbers, without a branch where a loop over many points has none to spare: `compiled` hands them to
-numba as they are.
+Plain Python on numbers, which `compiled` hands to numba as it is. What runs in loops over many points has no branches.
 """
 
 import math
@@ -10,8 +9,8 @@ from typing import Protocol
 # A pixel further out than this is on no sensor; the bound keeps every coordinate inside int32. Unit: px.
 MAX_PIXEL_PX = 1e9
 
-# No point is nearer than a nanometre or farther than a million kilometres; beyond, squares would in the end lose their
-# meaning to underflow and overflow. Units: m, m^2.
+# No valid point is nearer than a nanometre or farther than a million kilometres; far beyond, squares would underflow or
+# overflow. Units: m, m^2.
 MAX_RANGE_M = 1e9
 MIN_RANGE2_M2 = 1e-18
 MAX_RANGE2_M2 = MAX_RANGE_M**2

@@ -1,7 +1,7 @@
 """The Kannala-Brandt camera closest to any other camera, with the residual in pixels that is left.
 
-For programs that know no other wide lens (ROS's `equidistant`). In plain Python: the process that serves has no
-compiler, and a few hundred rays need none.
+For programs that know no other wide lens (ROS's `equidistant`). It is plain Python, because the process that serves
+queries has no compiler and a few hundred rays need none.
 """
 
 from typing import NamedTuple
@@ -19,8 +19,9 @@ from coec.geometry.cameras.registry import Camera
 _POWERS = (1, 3, 5, 7, 9)
 _PARAMETERS = len(_POWERS) + 2
 
-# The image is compared at this many columns and rows of pixels, evenly from border to border, corners included: there
-# a wide lens leaves the most. The residual is a polynomial of ninth degree against a smooth function.
+# The image is compared at this many columns and rows of pixels, evenly from border to border. Corners are included,
+# because a wide lens has its largest residual there. The residual is that of a polynomial of ninth degree against a
+# smooth function.
 _GRID = 33
 
 
@@ -54,7 +55,7 @@ def fit_kannala_brandt(camera: Camera) -> KannalaBrandtFit:
     radial = (focal * sides)[:, :, None] * powers[:, None, :]
     centre = np.broadcast_to(np.eye(2), (len(theta), 2, 2))
     design = np.concatenate([radial, centre], axis=2).reshape(-1, _PARAMETERS)
-    # Columns differ by powers of theta: scaled to unit length, lest the small ones be rounded off.
+    # Columns differ by powers of theta: scale them to unit length, so that the small ones are not rounded off.
     scale = np.linalg.norm(design, axis=0)
     found = np.linalg.lstsq(design / scale, uv_px.reshape(-1), rcond=None)[0] / scale
     first, *higher = (float(value) for value in found[: len(_POWERS)])

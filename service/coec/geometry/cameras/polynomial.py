@@ -1,4 +1,5 @@
-"""The odd polynomial t (1 + c1 t^2 + c2 t^4 + c3 t^6 + c4 t^8) of radial distortion: where it grows, its inverse."""
+"""The odd polynomial t (1 + c1 t^2 + c2 t^4 + c3 t^6 + c4 t^8) of radial distortion: up to where it grows, and its
+inverse."""
 
 import math
 
@@ -7,8 +8,8 @@ from numpy.typing import NDArray
 
 from coec.geometry.cameras.formulas import like
 
-# A Newton step that halves its bracket when it fails gains a bit per step at worst: 52 bits of a float64 and the
-# doublings that find the bracket.
+# Newton's method halves its bracket when a step fails, so that it gains at least a bit per step: 52 steps for a
+# float64, and the doublings that find the bracket.
 _MAX_STEPS = 100
 
 
@@ -23,7 +24,7 @@ def monotonic_limit_squared(coefficients: tuple[float, ...]) -> float:
 
 def first_positive_root(polynomial: NDArray[np.float64]) -> float:
     """The smallest s > 0 at which a polynomial, its coefficients (N,) ascending, is zero; infinite if there is none.
-    Raises ValueError if they are of so different sizes that a double cannot hold their ratio: no lens is like that."""
+    Raises ValueError if a double cannot hold the ratio of two coefficients, which no real lens has."""
     trimmed = np.trim_zeros(polynomial, "b")
     with np.errstate(over="ignore", invalid="ignore"):
         if not np.isfinite(trimmed / trimmed[-1]).all():

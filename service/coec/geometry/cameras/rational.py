@@ -21,7 +21,7 @@ from coec.geometry.cameras.formulas import guarded_ray, like
 from coec.geometry.cameras.intrinsics import finite, sensor
 from coec.geometry.cameras.polynomial import first_positive_root
 
-# Doublings that find the bracket, and halvings of it: as in `polynomial`.
+# Most doublings that find the bracket, and most halvings of it, as in `polynomial`.
 _MAX_BISECTIONS = 100
 # Newton's method converges quadratically from the radial solution; real lenses need three to five steps.
 _MAX_STEPS = 30
@@ -122,8 +122,8 @@ def rational_distort(camera: Rational, x: float, y: float) -> tuple[float, float
 
 
 def rational_radius(camera: Rational, target: float) -> tuple[float, bool]:
-    """The radius r within the domain with r g(r^2) = target >= 0, and whether there is one: by bisection, from which
-    Newton's method goes on in two dimensions."""
+    """The radius r within the domain with r g(r^2) = target >= 0, and whether there is one, by bisection. Newton's
+    method in two dimensions starts from it."""
     limit = math.sqrt(camera.max_radius2)
     low = 0.0
     high = min(limit, 1.0)
@@ -160,7 +160,7 @@ def unproject_point(camera: Rational, u: float, v: float) -> tuple[float, float,
     xd = (u - camera.cx) / camera.fx
     yd = (v - camera.cy) / camera.fy
     distorted_radius = math.sqrt(xd * xd + yd * yd)
-    # Beyond the radial limit the tangential part may still reach back inside: from there it is tried as well.
+    # Beyond the radial limit the tangential part may still lead back inside, so start from the limit then.
     radius, _ = rational_radius(camera, distorted_radius)
     scale = radius / distorted_radius if distorted_radius > 0.0 else 1.0
     x = xd * scale

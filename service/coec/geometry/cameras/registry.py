@@ -1,4 +1,4 @@
-"""The models by name and by type, and what can be done with any camera without knowing its model."""
+"""The models by name and by type, and functions for cameras of any model."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ Camera = Pinhole | RadTan | Rational | KannalaBrandt | Mei | Eucm | DoubleSphere
 
 
 class Model(NamedTuple):
-    """What a camera model is made of. The scalar functions also run uncompiled."""
+    """The parts of a camera model. The scalar functions also run uncompiled."""
 
     name: str
     camera_type: type[Camera]
@@ -89,7 +89,8 @@ def intrinsics_of(camera: Camera) -> dict[str, float | int]:
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-    """The camera of a part of its image: so many columns and rows (above zero, else ValueError) from there on."""
+    """The camera of a part of the image: `width` columns and `height` rows (above zero, else ValueError) from column
+    `left` and row `top` on."""
     part = {"width": width, "height": height, "cx": camera.cx - left, "cy": camera.cy - top}
     return build(name_of(camera), **intrinsics_of(camera) | part)
 

@@ -1,4 +1,5 @@
-"""What a camera sees: which pixels there are, how far from the optical axis a point has one, and how fine they are."""
+"""What a camera sees: which pixels exist, how far from the optical axis points still have a pixel, and the angle that a
+pixel covers."""
 
 import math
 from functools import lru_cache
@@ -11,7 +12,7 @@ from coec.geometry.cameras.registry import Camera
 from coec.geometry.vectors import rows_of
 
 _STEP = 1e-3
-"""Radians: within it every camera model is linear."""
+"""Step in radians that is small enough for every camera model to be linear."""
 
 
 def in_image(camera: Camera, uv_px: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -23,8 +24,7 @@ def in_image(camera: Camera, uv_px: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=64, typed=True)
 def in_single_precision(camera: Camera) -> Camera:
-    """The same camera with intrinsics as float32: a formula in single precision runs in registers of twice the
-    points."""
+    """The same camera with intrinsics as float32: in single precision a vector register holds twice as many points."""
     return type(camera)(*(field if isinstance(field, int) else np.float32(field) for field in camera))  # type: ignore[arg-type]
 
 
@@ -46,8 +46,8 @@ def domain_angle_rad(camera: Camera) -> float:
 
 
 def pixel_rad(camera: Camera) -> float:
-    """The angle of a pixel on the optical axis, radians; where rows and columns differ, the larger. The focal length
-    of a fisheye is not in pixels per radian."""
+    """The angle that a pixel on the optical axis covers, radians; the larger one if rows and columns differ. It is
+    measured by projection, because the focal length of a fisheye is not in pixels per radian."""
     u, v, _ = project_point(camera, 0.0, 0.0, 1.0)
     beside = project_point(camera, _STEP, 0.0, 1.0), project_point(camera, 0.0, _STEP, 1.0)
     return _STEP / min(math.hypot(right - u, down - v) for right, down, _ in beside)

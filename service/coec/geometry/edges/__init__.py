@@ -1,1 +1,1 @@
-"""Range jumps and image edges, and how well they lie on each other."""
+"""Range edges and image edges, and how well they align."""

@@ -2,9 +2,9 @@
 
     z = Σ w·e / √Σ w²
 
-over the range edges in view, with e the standardised edge strength at their pixel and w their weight. Were the edges
-laid at random, z would have mean 0 and standard deviation about 1, however many are in view: looking away does not pay
-(METHOD, section 3, "significance").
+over the range edges in view, with e the standardised edge strength at their pixel and w their weight. For edges at
+random places z has mean 0 and standard deviation about 1, however many are in view, so that a pose does not gain by
+looking away (METHOD, section 3, "significance").
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.pixel_lookup import moved
 
 BLOCK = 256
-"""Points that are projected at a time: their pixels (8 kB with all that is looked up there) stay in the first-level
+"""Points that are projected at a time: their pixels and what is looked up there (8 kB) stay in the first-level
 cache."""
 
 LEAST_RANGE2_M2, MOST_RANGE2_M2 = np.float32(1e-18), np.float32(1e18)
-"""Squares between which a distance from the camera means something, as in `cameras.formulas`."""
+"""Limits of the squared distance of a valid point from the camera, as in `cameras.formulas`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +47,7 @@ class EdgeFrames:
     maps: NDArray[np.int8]
 
     def of_points(self, kept: NDArray[np.int64]) -> EdgeFrames:
-        """Those with the given indices, ascending, on the same maps."""
+        """The range edges with the given indices, ascending, on the same maps."""
         return replace(
             self,
             xyz_m=np.ascontiguousarray(self.xyz_m[:, kept]),
@@ -57,7 +57,7 @@ class EdgeFrames:
 
 
 LEAST_SQUARE = 1e-9
-"""Least Σ w² that a significance divides by: where nothing is in view it is 0, and not 0 / 0. A single range edge has
+"""Least Σ w² that a significance divides by, so that it is 0, not 0 / 0, if nothing is in view. A single range edge has
 more than 0.5."""
 
 
@@ -70,12 +70,12 @@ class Alignment:
 
     @property
     def significance(self) -> float:
-        """z of all frames together; 0 where nothing is in view."""
+        """z of all frames together; 0 if nothing is in view."""
         return float(self.strength.sum() / self._scale)
 
     @property
     def of_frames(self) -> NDArray[np.float64]:
-        """(F,) what each frame adds to z, F times: their mean is `significance`."""
+        """(F,) F times what each frame adds to z, so that their mean is `significance`."""
         return np.asarray(len(self.strength) * self.strength / self._scale)
 
     @property
@@ -100,11 +100,11 @@ class Alignments:
 
     @property
     def of_single_frames(self) -> NDArray[np.float64]:
-        """(K, F) z of each frame by itself; 0 where nothing is in view."""
+        """(K, F) z of each frame by itself; 0 if nothing is in view."""
         return np.asarray(self.strength / np.sqrt(np.maximum(self.square, LEAST_SQUARE)))
 
     def at(self, index: int) -> Alignment:
-        """At one of the poses."""
+        """The alignment at one of the poses."""
         return Alignment(self.strength[index], self.square[index])
 
 
@@ -114,13 +114,14 @@ def frame_alignment(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> 
 
 
 def alignments(frames: EdgeFrames, poses: NDArray[np.float64]) -> Alignments:
-    """The same at many poses (K, 4, 4) in one go: several threads share what is too short for them one by one."""
+    """As `frame_alignment`, at many poses (K, 4, 4) in one call: one pose is too short to share among threads, many are
+    not."""
     sums = _smooth_sums(*_arguments(frames), poses.astype(np.float32, order="C")[:, None])
     return Alignments(sums[:, :, 0], sums[:, :, 1])
 
 
 def alignment_of_each(frames: EdgeFrames, poses: NDArray[np.float64]) -> Alignment:
-    """The same with a pose for each frame (F, 4, 4); or one (1, 4, 4) for all."""
+    """As `frame_alignment`, with a pose for each frame (F, 4, 4), or with one (1, 4, 4) for all."""
     sums = _smooth_sums(*_arguments(frames), poses.astype(np.float32, order="C")[None])
     return Alignment(sums[0, :, 0], sums[0, :, 1])
 
@@ -128,15 +129,15 @@ def alignment_of_each(frames: EdgeFrames, poses: NDArray[np.float64]) -> Alignme
 def alignment_of_parts(
     frames: EdgeFrames, part: NDArray[np.uint8], parts: int, poses: NDArray[np.float64]
 ) -> PartedAlignments:
-    """The same at each of many poses (K, 4, 4), of each of so many `parts` of the range edges by itself; `part` (E,) is
-    where each belongs."""
+    """As `alignments`, at many poses (K, 4, 4), but separately for each of `parts` parts of the range edges; `part`
+    (E,) is the part that each edge belongs to."""
     sums = _smooth_sums_of_parts(*_arguments(frames), poses.astype(np.float32, order="C"), part, parts)
     return PartedAlignments(sums[:, :, :, 0], sums[:, :, :, 1])
 
 
 def strengths_on_each_map(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(F, F) Σ w·e of the range edges of each frame (rows) on the edge map of each (columns), at one pose (4, 4); on
-    the diagonal the strengths of `frame_alignment`."""
+    """(F, F) Σ w·e of the range edges of each frame (rows) on the edge map of each frame (columns), at one pose (4, 4).
+    The diagonal holds the strengths of `frame_alignment`."""
     return np.asarray(_sums_on_each_map(*_arguments(frames), T_camera_lidar.astype(np.float32, order="C")))
 
 
@@ -147,9 +148,10 @@ def alignments_of_late(
     late_s: NDArray[np.float32],
     poses: NDArray[np.float64],
 ) -> Alignments:
-    """The alignments at many poses (K, 4, 4), with e interpolated between pixels, of range edges that pass at (3, E)
-    m/s and were seen later than they were placed: by their shares (3, E) of three delays, s, those (K, 3) of each pose.
-    To the last bits that of `frame_alignment` of edges moved by as much."""
+    """The alignments at many poses (K, 4, 4), with e interpolated between pixels, of moved range edges. Edges pass at
+    `passing` (3, E) m/s and are seen later than they were placed. Their delay is the sum of their shares (3, E) of
+    three delays, s, which each pose has for itself in `late_s` (K, 3). Except for the last bits the result is that of
+    `frame_alignment` with the edges moved by as much."""
     passing, share, late_s = (np.ascontiguousarray(each, np.float32) for each in (passing, share, late_s))
     sums = _late_sums(*_arguments(frames), poses.astype(np.float32, order="C"), passing, share, late_s)
     return Alignments(sums[:, :, 0], sums[:, :, 1])
@@ -161,10 +163,10 @@ def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.
 
 
 def smooth_significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """z at many poses (K, 4, 4), with e interpolated between pixels: (K,). To the last bits that of
+    """z at many poses (K, 4, 4), with e interpolated between pixels: (K,), except for the last bits that of
     `frame_alignment`."""
     at = alignments(frames, poses)
-    # One frame after the other, whatever their number.
+    # Add one frame after the other, in the same order for any number of frames.
     strength, square = np.cumsum(at.strength, axis=1)[:, -1], np.cumsum(at.square, axis=1)[:, -1]
     return np.asarray(strength / np.sqrt(np.maximum(square, LEAST_SQUARE)))
 
@@ -173,7 +175,8 @@ _Arguments = tuple[Camera, NDArray[np.float32], NDArray[np.float32], NDArray[np.
 
 
 def _arguments(frames: EdgeFrames) -> _Arguments:
-    """Single precision places a point to a thousandth of a pixel, in half the time of double precision."""
+    """Arguments of the kernels, with a camera in single precision: it projects to a thousandth of a pixel, in half the
+    time of double precision."""
     return in_single_precision(frames.camera), frames.xyz_m, frames.weight, frames.first_point, frames.maps
 
 
@@ -186,7 +189,7 @@ def _smooth_sums(
     maps: NDArray[np.int8],
     poses: NDArray[np.float32],
 ) -> NDArray[np.float64]:
-    """(K, F, 2) at poses (K, F, 4, 4), or (K, 1, 4, 4): one for all frames."""
+    """(K, F, 2): Σ w·e and Σ w² at poses (K, F, 4, 4), or at poses (K, 1, 4, 4) that hold for all frames."""
     frames = first_point.shape[0] - 1
     sums = np.empty((poses.shape[0], frames, 2))
     for task in prange(poses.shape[0] * frames):
@@ -249,7 +252,7 @@ def _pass_by(
     late_s: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Points (3, n) where they are later, into `out` (3, at least n)."""
+    """Writes the points (3, n), moved by their delays, into `out` (3, at least n)."""
     for i in range(xyz_m.shape[1]):
         late = late_s[0] * share[0, i] + late_s[1] * share[1, i] + late_s[2] * share[2, i]
         for axis in range(3):
@@ -266,8 +269,8 @@ def smooth_sums_of_frame(
     last: int,
     edge_map: NDArray[np.int8],
 ) -> tuple[float, float]:
-    """Σ w·e and Σ w² over the range edges of one frame, those from `first` to before `last`."""
-    # One sum for each place of a block: they are added in vector registers.
+    """Σ w·e and Σ w² over the range edges of one frame, from `first` to before `last`."""
+    # One sum for each place in a block, so that they are added in vector registers.
     told, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
     edges, block = edge_map.ravel(), _block()
     for begin in range(first, last, BLOCK):
@@ -311,7 +314,7 @@ _Block = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int8]]
 
 @njit(cache=True)
 def _block() -> _Block:
-    """What a block of points is worked out in: (4, BLOCK) and (BLOCK,) numbers, and (4, BLOCK) strengths."""
+    """Scratch memory for a block of points: (4, BLOCK) and (BLOCK,) numbers, and (4, BLOCK) strengths."""
     return np.empty((4, BLOCK), np.float32), np.empty(BLOCK, np.int32), np.empty((4, BLOCK), np.int8)
 
 
@@ -326,9 +329,9 @@ def _between(
     edges: NDArray[np.int8],
     block: _Block,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """w·e, in steps, and w² of range edges (n,), LiDAR frame, on a map (h·w,), with e interpolated between pixels:
-    (n,) each, nothing where one of the four pixels around does not count. In passes: what looks up goes point by point,
-    what calculates runs in vector registers."""
+    """w·e, in steps, and w² of range edges (n,), LiDAR frame, on a map (h·w,), with e interpolated between pixels: (n,)
+    each, zero if one of the four pixels around does not count. Runs in passes: look-ups go point by point, calculations
+    run in vector registers."""
     n, width = x_m.shape[0], np.uint64(camera.width)
     numbers, places, strengths = block
     u, v, place = numbers[0, :n], numbers[1, :n], places[:n]
@@ -346,8 +349,8 @@ def _between(
 
 @njit(cache=True)
 def _split(width: int, height: int, u: NDArray[np.float32], v: NDArray[np.float32], place: NDArray[np.int32]) -> None:
-    """Pixel coordinates (n,) as the pixel above and to the left (row · width + column) into `place`, -1 where there is
-    none, and what is left of them, in place. Without a branch, as `_pixels`."""
+    """Splits pixel coordinates (n,): writes the pixel above and to the left (row · width + column) into `place`, -1 if
+    there is none, and leaves the fractions in `u` and `v`. Without a branch, as `_pixels`."""
     right, bottom, zero = np.float32(width - 1), np.float32(height - 1), np.float32(0.0)
     stride = np.int32(width)
     for i in range(u.shape[0]):
@@ -371,8 +374,9 @@ def _mix(
     told: NDArray[np.float32],
     square: NDArray[np.float32],
 ) -> None:
-    """Weighed and squared, of points (n,) so much aside of pixels of strengths p, with q to the right, r below and s
-    below that; nothing where there is no place or one of them is void."""
+    """Interpolates the strengths of points (n,) and weighs them into `told`, with the squared weights in `square`. A
+    point lies `right` and `down` of a pixel of strength p; q is to the right of p, r below p, and s below q. Zero if
+    there is no place or if one of the four is void."""
     for i in range(told.shape[0]):
         seen = (place[i] >= 0) & (p[i] != VOID) & (q[i] != VOID) & (r[i] != VOID) & (s[i] != VOID)
         upper = np.float32(p[i]) + right[i] * (np.float32(q[i]) - np.float32(p[i]))
@@ -474,8 +478,8 @@ def _pixels(
     u: NDArray[np.float32],
     v: NDArray[np.float32],
 ) -> None:
-    """Pixel coordinates of points (n,), LiDAR frame, into `u` and `v` (n,); -1 where there is none. A loop of its own,
-    without a branch, and nothing wider than 32 bits: it runs in vector registers."""
+    """Writes the pixel coordinates of points (n,), LiDAR frame, into `u` and `v` (n,); -1 if there is none. The loop is
+    separate, without a branch, and nothing in it is wider than 32 bits, so that it runs in vector registers."""
     nowhere = np.float32(-1.0)
     for i in range(x_m.shape[0]):
         x, y, z = moved(T, x_m[i], y_m[i], z_m[i])

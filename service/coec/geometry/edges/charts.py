@@ -1,12 +1,11 @@
-"""How significantly range edges fall on image edges at very many poses: the workhorse of the global stage.
+"""How significantly range edges fall on image edges at very many poses; most of the global search's work.
 
     z = Σ w·e / √Σ w²
 
-as in `alignment`, but on a chart: the edge map of an image resampled onto the stereographic projection of the
-directions about the optical axis. A direction (x, y, z) lies at (x, y) / (|p| + z) of the chart, for any lens and
-up to any field of view, so a point costs one root and one division instead of a camera model. Strengths and weights are
-whole numbers: their sums come out the same in any order, so that the loops may run in vector registers and a replay is
-still exact to the bit.
+as in `alignment`, but on a chart: the edge map of an image, resampled onto the stereographic projection of the
+directions about the optical axis. A point (x, y, z) lies at (x, y) / (|p| + z) of the chart, for any lens and any field
+of view, so that it costs one root and one division instead of a camera model. Strengths and weights are whole numbers,
+whose sums do not depend on their order. So the loops may run in vector registers, and a replay is exact to the bit.
 """
 
 from __future__ import annotations
@@ -24,19 +23,19 @@ from coec.geometry.pixel_lookup import OUTSIDE, exact_pixel
 from coec.geometry.projection import unproject
 
 CELLS_PER_BLUR = 2.5
-"""Cells of a chart per standard deviation of the blur: the nearest cell is then as good as interpolation."""
+"""Cells of a chart per standard deviation of the blur; then the nearest cell is as good as interpolation."""
 
 WEIGHT_STEPS = 64
 """Whole steps per unit of weight. With 127 steps of strength and a weight of √3, sums of 150,000 points fit 31 bits."""
 
 MAX_CHART_POINTS = 150_000
-"""So many points a chart may hold, for that reason."""
+"""Most points of a chart, so that its sums fit 31 bits."""
 
 CELLS_PER_WORD = 4
-"""Cells are read by words of 32 bits: a processor gathers words, and no bytes, sixteen at a time."""
+"""Cells are read in words of 32 bits, because a processor gathers sixteen words at a time, but no bytes."""
 
 MAX_FIELD_RAD = math.radians(110.0)
-"""Half field of view of a chart at most: beyond no lens sees."""
+"""Largest half field of view of a chart: no lens sees beyond it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +44,7 @@ class EdgeCharts:
 
     Attributes:
         cells: (1 + F·height·width,) int8, and up to three more that fill the last word; strengths as in `EdgePyramid`,
-            `VOID` where the image shows nothing. Cell 0 stands for everything outside of the charts.
+            `VOID` if the image shows nothing there. Cell 0 stands for everything outside of the charts.
         size: height and width of one frame's chart.
         cells_per_unit: cells per unit of the stereographic plane.
         centre: (2,) float32, column and row of the optical axis.
@@ -68,7 +67,7 @@ class EdgeCharts:
         return (self.first_cell.astype(np.int64) - 1) // (self.size[0] * self.size[1])
 
     def of_points(self, index: NDArray[np.int64]) -> EdgeCharts:
-        """With some of the range edges only."""
+        """The charts with only the range edges of the given indices."""
         xyz_m = np.ascontiguousarray(self.xyz_m[:, index])
         return replace(self, xyz_m=xyz_m, weight=self.weight[index], first_cell=self.first_cell[index])
 
@@ -92,7 +91,7 @@ def edge_charts(
         frame: (E,) the frame of each point.
 
     Raises:
-        ValueError: there are more points, whose sums might not fit.
+        ValueError: there are more points, so that their sums might not fit.
     """
     if xyz_m.shape[1] > MAX_CHART_POINTS:
         raise ValueError(f"a chart holds up to {MAX_CHART_POINTS} points, got {xyz_m.shape[1]}: thin them")
@@ -143,7 +142,7 @@ def _extent(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     rays, valid = unproject(camera, np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2))
     rays = rays[valid & (rays[:, 2] > math.cos(MAX_FIELD_RAD))]
     plane = rays[:, :2] / (1.0 + rays[:, 2:])
-    # A margin of some cells holds what lies between the samples.
+    # The margin of some cells covers what lies between the samples.
     return plane.min(axis=0) - 0.02, plane.max(axis=0) + 0.02
 
 
@@ -160,7 +159,8 @@ def climb(
     centre: NDArray[np.float64],
     reach: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pattern search from many poses at once (Hooke and Jeeves 1961): the axes in turn, steps halved when none helps.
+    """Pattern search from many poses at once (Hooke and Jeeves 1961): it tries the axes in turn and halves the steps
+    when none helps.
 
     Args:
         charts: edges and charts at one blur.
@@ -210,7 +210,7 @@ def _charted_z_at(
     r00, r01, r02, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, ty = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     r20, r21, r22, tz = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    # Rounding to the nearest cell is truncation half a cell further on.
+    # Adding half a cell before truncation rounds to the nearest cell.
     half = np.float32(0.5)
     left, top = centre[0] + half, centre[1] + half
     right, bottom, stride, zero = np.float32(width), np.float32(height), np.int32(width), np.float32(0.0)
@@ -221,20 +221,20 @@ def _charted_z_at(
         c = r20 * x + r21 * y + r22 * z + tz
         scale = unit / (np.sqrt(a * a + b * b + c * c) + c)
         u, v = a * scale + left, b * scale + top
-        # Selections and no branches: the loop runs in vector registers. Infinities and NaN compare false.
+        # Selections instead of branches, so that the loop runs in vector registers. Infinities and NaN compare false.
         inside = (u >= zero) & (u < right) & (v >= zero) & (v < bottom)
         column, row = np.int32(u if inside else zero), np.int32(v if inside else zero)
         cell[i] = first_cell[i] + row * stride + column if inside else np.int32(0)
     strength, square = np.int32(0), np.int32(0)
     for i in range(xyz.shape[1]):
-        # The byte of the word that the cell is, the first one lowest, brought to the top and down again with its sign.
+        # Take the cell's byte out of its word (the first byte is the lowest): shift it to the top, then down with sign.
         place = np.uint32(cell[i])
         word = words[np.uint64(place >> np.uint32(2))]
         e = np.int32(word << (np.int32(24) - np.int32((place & np.uint32(3)) << np.uint32(3)))) >> np.int32(24)
         w = weight[i] if e != VOID else np.int32(0)
         strength += w * e
         square += w * w
-    # Both in steps: a step of weight cancels, one of strength is left.
+    # Both sums are in steps: the steps of weight cancel, those of strength are divided out.
     return strength / (STRENGTH_STEPS * math.sqrt(max(float(square), 1.0)))
 
 
@@ -283,8 +283,8 @@ def _climb(
         best = _charted_z_at(words, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
         step = steps.copy()
         halved, axis, last, way = 0, 0, -1, 0.0
-        # Axes in a row that led nowhere. After all six there is nothing left at this step; after five, the sixth is the
-        # one that was stepped along last, and the way back is known to be worse.
+        # Axes in a row that did not help. After six of them there is nothing left to try with these steps. After five,
+        # the sixth is the axis of the last step, and the way back along it is known to be worse.
         idle = 0
         for _ in range(6 * MAX_SWEEPS):
             idle += 1
@@ -316,7 +316,7 @@ def _climb(
 
 @njit(cache=True)
 def _narrow(pose: NDArray[np.float64], out: NDArray[np.float32]) -> None:
-    """The upper rows of a pose (4, 4) in single precision, into `out` (3, 4)."""
+    """Writes the upper rows of a pose (4, 4) in single precision into `out` (3, 4)."""
     for i in range(3):
         for j in range(4):
             out[i, j] = pose[i, j]
@@ -335,12 +335,12 @@ def _within(pose: NDArray[np.float64], centre: NDArray[np.float64], reach: NDArr
                 centre[0, j] * centre[0, 3] + centre[1, j] * centre[1, 3] + centre[2, j] * centre[2, 3]
             )
         shift2 += (pose[i, 3] - moved) ** 2
-    # A micrometre of grace: with no translation to search, rounding must not stop the rotation.
+    # A micrometre of tolerance: if no translation is searched, rounding must not stop the rotation.
     return bool(trace >= 1.0 + 2.0 * math.cos(min(reach[0], math.pi)) and shift2 <= (reach[1] + 1e-6) ** 2)
 
 
 MAX_SWEEPS = 40
-"""Bound on the sweeps over the axes of one climb: a basin is some ten steps wide."""
+"""Most sweeps of one climb over the axes; a basin is some ten steps wide."""
 
 
 @njit(cache=True)
@@ -360,8 +360,8 @@ def _moved(pose: NDArray[np.float64], axis: int, amount: float) -> NDArray[np.fl
 
 @njit(cache=True)
 def keep_apart(poses: NDArray[np.float64], order: NDArray[np.int64], count: int, limit: float) -> NDArray[np.int64]:
-    """The first `count` indices of `order` whose poses (K, 4, 4) lie apart in rotation: the trace of R_a·R_bᵀ, which is
-    the sum of the products of the entries and 1 + 2 cos(angle), is at most `limit` for any two."""
+    """The first `count` indices of `order` whose poses (K, 4, 4) lie apart in rotation: for any two of them the trace
+    of R_a·R_bᵀ is at most `limit`. The trace is 1 + 2 cos(angle), and the sum of the products of the entries."""
     kept = np.empty(min(count, order.shape[0]), np.int64)
     found = 0
     for index in order:

@@ -1,7 +1,7 @@
-"""Climbs of the alignment of range edges from many poses at once, each over frames of its own.
+"""Climbs of the alignment of range edges from many poses at once, each over its own frames.
 
-A frame scores z = Σ w·e / √Σ w² by itself, and a pose the sum over the frames of its climb. A step of one climb takes a
-twentieth of a millisecond: several climbs at once, each on one thread, are the least work that is worth sharing.
+Each frame scores z = Σ w·e / √Σ w² by itself, and a pose scores the sum over the frames of its climb. A step of one
+climb takes a twentieth of a millisecond, too little to share among threads. So each thread makes whole climbs.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, smooth_sums_of_frame
 
 MAX_SWEEPS = 8
-"""Of a climb over its moves: it begins within two steps of its end."""
+"""Most sweeps of a climb over its moves; it begins within two steps of its end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Climb:
-    """One of many: a pose (4, 4) where it begins or ends, and the frames that it is about, those from `first` to before
-    `last`."""
+    """The start of a climb: a pose (4, 4), and its frames, from `first` to before `last`."""
 
     pose: NDArray[np.float64]
     first: int
@@ -32,20 +31,20 @@ class Climb:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Summit:
-    """Where a climb ended: pose (4, 4), and what its frames score there."""
+    """The end of a climb: a pose (4, 4), and the score of its frames there."""
 
     pose: NDArray[np.float64]
     score: float
 
 
 def climbed(frames: EdgeFrames, climbs: list[Climb], moves: NDArray[np.float64]) -> list[Summit]:
-    """The end of each climb: every move in turn is tried on the left of the pose and kept if it helps; when none does,
-    the finer ones are, and after the finest it ends.
+    """The end of each climb. A climb tries every move in turn, on the left of the pose, and keeps those that help. When
+    none helps it goes on with the finer moves, and after the finest it ends.
 
     Args:
-        frames: with the frames of all climbs.
+        frames: the frames of all climbs.
         climbs: where they begin.
-        moves: (L, M, 4, 4) the moves of each of L finenesses.
+        moves: (L, M, 4, 4) M moves for each of L levels, from coarse to fine.
     """
     spans = np.array([(climb.first, climb.last) for climb in climbs], np.int64)
     poses = np.array([climb.pose for climb in climbs])
@@ -67,7 +66,8 @@ def _climb(
     moves: NDArray[np.float64],
     poses: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(K,) the scores at the ends of climbs over the frames `spans` (K, 2), into `poses` (K, 4, 4) where they began."""
+    """(K,) the scores at the ends of the climbs over the frames `spans` (K, 2). `poses` (K, 4, 4) holds their starts
+    and receives their ends."""
     scores = np.empty(poses.shape[0])
     for k in prange(poses.shape[0]):
         first, last = spans[k, 0], spans[k, 1]
@@ -111,7 +111,7 @@ def _score(
 
 @njit(cache=True)
 def _on_the_left(move: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """move · pose, as `se3.perturb` adds it up."""
+    """move · pose, added up in the order of `se3.perturb`."""
     out = pose.copy()
     for i in range(3):
         for j in range(4):

@@ -1,11 +1,11 @@
-"""How much of an edge there is at every pixel, at several scales: what range edges are laid onto.
+"""Edge strength at every pixel, at several scales: the maps onto which range edges are laid.
 
-Gradient magnitude, less of what lies along the axis of the LiDAR, clipped, divided by its local mean (so that a hedge
-does not outshine a house), and of that the bands of a Laplacian pyramid (Burt, Adelson 1983): each level blurred by two
-pixels, less the next level. What is wider than a level's blur is the layout of the scene, rich in edges below the
-horizon and poor above, which fits many wrong poses: without it the true pose stands twice as far from the others
-(measured: 12 against 4.3 standard deviations on a suburban street, 7.5 against 3.9 in a garage, 4.9 against 1.8 on one
-raw fisheye frame, where the layout preferred a wrong pose).
+It is the gradient magnitude, reduced along the axis of the LiDAR, clipped, and divided by its local mean (so that a
+hedge does not outweigh a house). Of that, the maps are the bands of a Laplacian pyramid (Burt, Adelson 1983): each
+level blurred by two pixels, minus the next level. What is wider than a level's blur is the layout of the scene, with
+many edges below the horizon and few above, which fits many wrong poses. Without the layout the true pose stands at
+least twice as far from the others (measured: 12 against 4.3 standard deviations on a suburban street, 7.5 against 3.9
+in a garage, 4.9 against 1.8 on one raw fisheye frame, where the layout preferred a wrong pose).
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.thinning import thinned
 
 CLIP_SHARE = 0.95
-"""Gradients are clipped at this quantile: reflections and lamps would outweigh the rest."""
+"""Gradients are clipped at this quantile, as reflections and lamps would outweigh the rest."""
 
 UPRIGHT_SHARE = math.sqrt(0.5)
-"""Of a gradient along the axis of the LiDAR, so much counts: half of its energy. Range jumps are found along its scan
-lines, and what they belong to crosses those. Not less: roofs and kerbs, which slant, tell pitch, roll and height
-(without them, roll scatters by a third more on simulated drives), and slow traffic under a bridge is mostly such
-edges."""
+"""Share of a gradient along the axis of the LiDAR that counts: half of its energy. Range jumps are found along scan
+lines, so that the edges that cause them cross those lines. The share is not smaller, because slanting roofs and kerbs
+determine pitch, roll and height (without them, roll scatters by a third more on simulated drives), and slow traffic
+under a bridge shows mostly such edges."""
 
 SAMPLES = 25_000
-"""Pixels of an image from which that quantile (flat ones apart) and the mean gradient are taken."""
+"""Pixels of an image from which the quantile of `CLIP_SHARE` (without flat ones) and the mean gradient are taken."""
 
 MEAN_RADIUS_PX = 20
 """The local mean is over a square of 41 px (METHOD: 40 px)."""
 
 FLOOR_SHARE = 0.25
-"""Added to the local mean, as a share of the mean of the whole image: noise of flat regions is not blown up to
+"""Added to the local mean, as a share of the mean of the whole image, so that noise in flat regions is not amplified to
 edges."""
 
 BLUR_ROWS = 32
-"""Rows that are blurred at a time: with those around them they stay in the cache between the two directions."""
+"""Rows that are blurred at a time: with the rows around them they stay in the cache between the two directions."""
 
 STRIP_ROWS = 128
-"""Rows whose local means are carried from one to the next, three times as many as a mean spans."""
+"""Rows of a strip within which local means are carried from row to row; three times the rows that a mean spans."""
 
 GAIN_SQUARE_PX = 16
-"""Side of the squares in which a mask is looked at: more than a blur reaches."""
+"""Side of the squares in which a mask is examined; more than the reach of a blur."""
 
 LEAST_SHARE = 1e-3
-"""Least weight of the pixels that count under a blur, where hardly any does."""
+"""Least total weight, under a blur, of the pixels that count; a bound for places where hardly any counts."""
 
 STRENGTH_STEPS = 16
-"""Whole steps of edge strength per standard deviation. A byte holds eight deviations, a few edges in a million are
-stronger; what rounding adds to the strength of one edge is a fiftieth of what the edges differ by."""
+"""Whole steps of edge strength per standard deviation. A byte holds eight deviations; a few edges in a million are
+stronger. Rounding adds to the strength of one edge a fiftieth of the spread of strengths."""
 
 VOID = np.int8(-128)
 """Stands for a pixel that is masked."""
@@ -62,14 +62,14 @@ BLUR_SIGMA_PX = 2.0
 """Blur of each level, in pixels of that level: 2, 4, 8 ... pixels of the image."""
 
 SHARP_SIGMA_PX = 0.6
-"""Blur of the sharpest map. What lies beside an edge draws a blurred one to itself, above all the road below a kerb:
-in simulated drives through a fisheye of 4.4 px per degree the optimum is 0.3 to 0.5 degrees off in pitch at 2 px, 0.15
-to 0.2 on its band, 0.05 to 0.09 at 0.6 px and up to 0.07 on that band. What is narrower than 2 px by itself is less
-biased still, but where edges are few it has more maxima than one. Narrower than 0.6 px only aliases."""
+"""Blur of the sharpest map. Structure beside an edge draws a blurred edge towards itself, above all the road below a
+kerb. In simulated drives through a fisheye of 4.4 px per degree, the optimum is off in pitch by 0.3 to 0.5 degrees at a
+blur of 2 px, by 0.15 to 0.2 on its band, by 0.05 to 0.09 at 0.6 px, and by up to 0.07 on that band. Structure narrower
+than 2 px alone has even less bias, but several maxima if edges are few. A blur below 0.6 px only aliases."""
 
 
 def _gaussian(sigma_px: float) -> NDArray[np.float32]:
-    """The middle and one side of a normalised Gaussian."""
+    """The middle and one side of a normalised Gaussian kernel."""
     taps = math.ceil(3.5 * sigma_px)
     kernel = np.exp(-0.5 * (np.arange(taps + 1) / sigma_px) ** 2)
     normalised: NDArray[np.float32] = (kernel / (kernel[0] + 2.0 * kernel[1:].sum())).astype(np.float32)
@@ -81,13 +81,13 @@ _BLUR, _SHARP = _gaussian(BLUR_SIGMA_PX), _gaussian(SHARP_SIGMA_PX)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgePyramid:
-    """Edge maps of an image, int8: steps of a deviation from the mean over the pixels that count, `STRENGTH_STEPS` to a
-    standard deviation; `VOID` at masked ones.
+    """Edge maps of an image, int8: deviations from the mean over the pixels that count, in steps of which
+    `STRENGTH_STEPS` are a standard deviation; `VOID` at masked pixels.
 
     Attributes:
-        bands: level k at 1/2^(finest + k) of the resolution: what is as wide as its blur.
-        whole: all that is as wide as the blur of `bands[0]` or wider, at half of its resolution.
-        sharp: `bands[0]` with what is narrower, blurred by `SHARP_SIGMA_PX` only.
+        bands: level k, at 1/2^(finest + k) of the resolution, shows structure as wide as its blur.
+        whole: all structure as wide as the blur of `bands[0]` or wider, at half of its resolution.
+        sharp: `bands[0]` plus narrower structure, blurred by `SHARP_SIGMA_PX` only.
     """
 
     bands: tuple[NDArray[np.int8], ...]
@@ -106,22 +106,22 @@ class Rectangle:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Of an array (h, w)."""
+        """The same part of an array (h, w), as slices."""
         return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
 
     def halved(self, times: int) -> Rectangle:
-        """The same part at a resolution that was halved so many times; a pixel at least."""
+        """The same part at a resolution halved `times` times; at least one pixel."""
         left, top = self.left >> times, self.top >> times
         return Rectangle(left, top, max(self.width >> times, 1), max(self.height >> times, 1))
 
     def within(self, other: Rectangle) -> Rectangle:
-        """The same part, seen from where another begins."""
+        """The same part, relative to the corner of another."""
         return Rectangle(self.left - other.left, self.top - other.top, self.width, self.height)
 
 
 class EdgeScales:
-    """How the images of one camera become pyramids, one after the other: what they share, the mask at every level, is
-    dealt with once."""
+    """Makes pyramids from the images of one camera, one after the other. The mask at every level, which they share, is
+    prepared once."""
 
     def __init__(
         self,
@@ -136,8 +136,8 @@ class EdgeScales:
             lit: (h, w) bool; False = ignore this pixel.
             finest: halvings of the resolution of the first level.
             coarsest: halvings of the resolution of the last level.
-            upright: (2,) right and down, what the image shows of a unit vector along the axis of the LiDAR; nothing
-                where the camera looks along it, and no gradient counts less.
+            upright: (2,) right and down: image of a unit vector along the axis of the LiDAR. Zero if the camera looks
+                along that axis; then no gradient counts less.
             counted: the part of the images from which mean and deviation of the maps are taken; None: all.
         """
         self._counted = Rectangle(0, 0, lit.shape[1], lit.shape[0]) if counted is None else counted
@@ -151,19 +151,19 @@ class EdgeScales:
             self._lit.append(_halved_mask(self._lit[-1]))
         self._gain = [_gain(lit, _BLUR) for lit in self._lit]
         self._sharp_gain = _gain(self._lit[0], _SHARP)
-        # Arrays of the size of an image are made once: to map them anew took as long as to fill them.
+        # Arrays of the size of an image are made once, because allocating them takes as long as filling them.
         self._gradient, self._edges = np.empty((2, *self._inner.shape), np.float32)
         self._smooth = np.empty(self._lit[0].shape, np.float32)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the images: (h, w)."""
+        """Shape of the images: (h, w)."""
         return self._inner.shape
 
     def pyramid(self, grey: NDArray[np.uint8]) -> EdgePyramid:
-        """Standardised edge maps of an image (h, w), and of no other size.
+        """Standardised edge maps of an image, which must have the shape `shape`.
 
-        `_less` works in place: what is needed as it is comes before.
+        `_less` works in place, so that maps are used before it changes them.
         """
         edges = [_normalised_gradient(grey, self._inner, self._upright, self._gradient, self._edges)]
         for _ in range(self._finest):
@@ -187,8 +187,8 @@ class EdgeScales:
         )
 
     def _standardised(self, values: NDArray[np.float32], level: int) -> NDArray[np.int8]:
-        """In whole steps of `STRENGTH_STEPS` to a deviation from the mean over the pixels that count; `VOID` where
-        masked."""
+        """Deviations from the mean over the pixels that count, in whole steps, `STRENGTH_STEPS` to a standard
+        deviation; `VOID` at masked pixels."""
         lit, part = self._lit[level], self._counted.halved(self._finest + level).slices
         (top, bottom, _), (left, right, _) = (cut.indices(size) for cut, size in zip(part, values.shape, strict=True))
         count, total, square = (math.fsum(column) for column in _row_sums(values, lit, top, bottom, left, right).T)
@@ -200,16 +200,17 @@ class EdgeScales:
 
 
 def _gain(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a blur of the pixels that count has to be multiplied by: a mask is no valley."""
+    """Factor for a blur over the pixels that count, so that a mask does not look like a valley."""
     if lit.all():
-        # Every pixel is the same then: one tells all.
+        # All pixels have the same factor: compute one.
         return np.full(lit.shape, _gain_over(lit[:1, :1], kernel)[0, 0])
     return _gain_over(lit, kernel)
 
 
 @njit(cache=True, parallel=PRANGE)
 def _gain_over(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """By squares: far from the border of a mask every pixel is the same, and most squares are far from it."""
+    """The same by squares: far from the border of a mask all pixels have the same factor, and most squares are far
+    from it."""
     h, w = lit.shape
     taps, side = kernel.shape[0] - 1, GAIN_SQUARE_PX
     rows, columns = -(-h // side), -(-w // side)
@@ -260,7 +261,7 @@ def _normalised_gradient(
     gradient: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """The gradient over its local mean; zero but at `inner` pixels. `gradient` (h, w) is scratch; returns `out`."""
+    """The gradient over its local mean; zero outside of `inner`. `gradient` (h, w) is scratch; returns `out`."""
     _gradient(grey, inner, upright, gradient)
     sample = gradient.ravel()[thinned(gradient.size, SAMPLES)]
     steep = sample[sample > 0.0]
@@ -273,15 +274,14 @@ def _normalised_gradient(
 def _gradient(
     grey: NDArray[np.uint8], inner: NDArray[np.bool_], upright: NDArray[np.float32], out: NDArray[np.float32]
 ) -> None:
-    """Magnitude of the Sobel gradient, less what `upright` (2,) takes of it; zero on the border and but at `inner`
-    pixels."""
+    """Magnitude of the Sobel gradient, reduced along `upright` (2,); zero on the border and outside of `inner`."""
     h, w = grey.shape
-    # |g|² less (1 - share²) of the square of its part along the axis: that part is left with its share.
+    # |g|² minus (1 - share²) times the square of its part along the axis, so that `UPRIGHT_SHARE` of that part is left.
     spared = np.float32(math.sqrt(1.0 - UPRIGHT_SHARE**2))
     right, down = spared * upright[0], spared * upright[1]
     out[0], out[h - 1], out[:, 0], out[:, w - 1] = 0.0, 0.0, 0.0, 0.0
     for y in prange(1, h - 1):
-        # Rows of floats, in which all of this is exact: the loops over the pixels run in vector registers.
+        # Rows of floats, in which these sums are exact, so that the loops over the pixels run in vector registers.
         across, along = np.empty(w, np.float32), np.empty(w, np.float32)
         for x in range(w):
             above, here, below = np.float32(grey[y - 1, x]), np.float32(grey[y, x]), np.float32(grey[y + 1, x])
@@ -299,14 +299,14 @@ def _gradient(
 def _over_local_mean(
     values: NDArray[np.float32], clip: np.float32, floor: np.float32, out: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Values up to `clip`, divided by `floor` and their mean over the square of `MEAN_RADIUS_PX` around each pixel, as
-    far as it lies in the image. Returns `out`."""
+    """Values clipped at `clip`, divided by the sum of `floor` and their mean over the square of `MEAN_RADIUS_PX` around
+    each pixel, as far as it lies in the image. Returns `out`."""
     h, w = values.shape
     r = MEAN_RADIUS_PX
     columns = np.empty(w, np.float32)
     for x in range(w):
         columns[x] = min(x + r, w - 1) - max(x - r, 0) + 1
-    # The strips do not depend on the number of threads, so the rounding of their running sums does not either.
+    # The strips do not depend on the number of threads, and so neither does the rounding of their running sums.
     for strip in prange(-(-h // STRIP_ROWS)):
         first, last = strip * STRIP_ROWS, min((strip + 1) * STRIP_ROWS, h)
         of_column = np.zeros(w, np.float32)
@@ -337,7 +337,7 @@ def _over_local_mean(
 
 
 def _eroded(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Without the pixels within two rows and columns of a masked one: the border of a mask is an edge of nothing."""
+    """The mask without the pixels within two rows and columns of a masked one: the border of a mask is no real edge."""
     return lit if lit.all() else _eroded_by(lit, 2)
 
 
@@ -369,7 +369,7 @@ def _smoothed(
     kernel: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Blurred along the rows and along the columns, over the pixels that count; the border is repeated outside.
+    """Blurs along the rows and along the columns, over the pixels that count; the border is repeated outside.
 
     Args:
         values, lit, gain: (h, w).
@@ -400,8 +400,8 @@ def _smoothed(
     return out
 
 
-# Rows as arrays of their own, and not rows of an image: the compiler then knows where they lie and takes whole vectors
-# (1.3 instead of 5.1 ns per pixel).
+# These take rows as separate arrays, not as rows of an image: the compiler then knows that they are contiguous and uses
+# whole vectors (1.3 instead of 5.1 ns per pixel).
 @njit(cache=True)
 def _weigh(values: NDArray[np.float32], weight: np.float32, out: NDArray[np.float32]) -> None:
     for x in range(out.shape[0]):
@@ -428,15 +428,15 @@ def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _halved_mask(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """True where all four are."""
+    """The mask at half the resolution: true where all four pixels are."""
     h, w = (lit.shape[0] // 2) * 2, (lit.shape[1] // 2) * 2
     return lit[:h:2, :w:2] & lit[1:h:2, :w:2] & lit[:h:2, 1:w:2] & lit[1:h:2, 1:w:2]
 
 
 @njit(cache=True, parallel=PRANGE)
 def _less(fine: NDArray[np.float32], coarse: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`fine` less `coarse`, a map of half its size that is interpolated between its pixels and repeated beyond its
-    border. In place: returns `fine`."""
+    """`fine` minus `coarse`, a map of half its size, interpolated between its pixels and repeated beyond its border. In
+    place: returns `fine`."""
     h, w = coarse.shape
     height, width = fine.shape
     near, far = np.float32(0.75), np.float32(0.25)
@@ -457,7 +457,8 @@ def _less(fine: NDArray[np.float32], coarse: NDArray[np.float32]) -> NDArray[np.
 def _row_sums(
     values: NDArray[np.float32], lit: NDArray[np.bool_], top: int, bottom: int, left: int, right: int
 ) -> NDArray[np.float64]:
-    """(bottom - top, 3): of each row of a part the number of pixels that count, their sum, the sum of their squares."""
+    """(bottom - top, 3): for each row of a part, the number of pixels that count, their sum and the sum of their
+    squares."""
     sums = np.zeros((bottom - top, 3))
     for row in prange(bottom - top):
         of_row, counted = values[top + row, left:right], lit[top + row, left:right]

@@ -1,15 +1,14 @@
-"""Where a sweep jumps from a near surface to a far one: the points whose image should lie on an image edge.
+"""Range edges: where a sweep jumps from a near surface to a far one. Their image should lie on an image edge.
 
-Every point is compared with its two neighbours along the scan line, which are found without knowing the sensor: points
-are sorted by row (the ring where the cloud has one, else a band of elevation) and azimuth, and within a band only
-points of nearly the same elevation are neighbours. So organised, unorganised, 16- and 128-beam clouds are all treated
-alike.
+Every point is compared with its two neighbours along the scan line. They are found without knowing the sensor: points
+are sorted by row (the ring if the cloud has one, else a band of elevation) and azimuth, and within a band only points
+of nearly the same elevation are neighbours. So organised, unorganised, 16- and 128-beam clouds are treated alike.
 
-The silhouette passes between the last beam that came back from the near surface and the first that went by: half a
-spacing outside of the last near point, wherever that happened to lie. A beam is a cone, though, and comes back from the
-near surface as soon as some of it falls there: that half is less by what spills over (`SPILL_RAD`). Where beams lie too
-far apart for that (`WIDE_RAD`), the last near point stands for the edge. What both neighbours of a point lie behind is
-thinner than two spacings: one edge, a ridge, at the point itself.
+The silhouette passes between the last beam that came back from the near surface and the first that missed it: on
+average half a spacing outside of the last near point. A beam is a cone, though, and comes back from the near surface as
+soon as some of it falls there, so that the half spacing is reduced by this spill (`SPILL_RAD`). If beams lie too far
+apart for that (`WIDE_RAD`), the last near point stands for the edge. If both neighbours of a point lie behind it, the
+object is thinner than two spacings and makes one edge, a ridge, at the point itself.
 """
 
 from __future__ import annotations
@@ -26,38 +25,38 @@ from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.edges.scan_lines import BAND_RAD, telling
 
 BANDS = math.ceil(0.5 * math.pi / BAND_RAD)
-"""Of a quarter of a turn, from the horizon up or down."""
+"""Bands of elevation in a quarter of a turn, from the horizon up or down."""
 
 SAME_LINE_RAD = math.radians(0.15)
-"""Largest difference of elevation between neighbours of a band: below half the spacing of common 64-beam sensors, so
-that the ground, which differs from ring to ring, is no jump."""
+"""Largest difference of elevation between neighbours in a band. It is below half the spacing of common 64-beam sensors,
+so that the ground, whose range differs from ring to ring, makes no jump."""
 
 NEIGHBOUR_RAD = math.radians(1.0)
-"""Largest difference of azimuth between neighbours: five columns of a slow sensor; beyond lies a hole, not a
+"""Largest difference of azimuth between neighbours: five columns of a slow sensor. A larger gap is a hole, not a
 surface."""
 
 LOOK_AHEAD = 6
-"""Points of a band that are tried as the neighbour: some rings share a band."""
+"""Points of a band that are tried as the neighbour, because several rings may share a band."""
 
 MIN_JUMP_M, MIN_JUMP_SHARE = 0.5, 0.05
-"""A jump is at least so many metres, and so much of the nearer range: well above range noise, below the depth of a
-car."""
+"""Least jump, in metres and as a share of the nearer range; well above range noise and below the depth of a car."""
 
 MAX_WEIGHT_M = 3.0
-"""Jumps of more metres weigh no more than this: a wall behind a pole proves as much at 5 m as at 50 m."""
+"""Larger jumps weigh no more than this one: a wall behind a pole proves as much at 5 m as at 50 m."""
 
 MIN_RANGE_M = 2.0
 """Nearer points are the vehicle itself."""
 
 SPILL_RAD = math.radians(0.06)
-"""How far the axis of a beam passes a near surface that it still measures: the half angle of a beam of 2 mrad (data
-sheets of spinning sensors: 2 to 3 mrad in all). Of two echoes the stronger one counts, and that of the nearer surface
-is the stronger one with little of the beam."""
+"""How far the axis of a beam can pass beside a near surface that it still measures: the half angle of a beam of 2 mrad
+(data sheets of spinning sensors: 2 to 3 mrad in all). The stronger of two echoes counts, and the nearer surface gives
+the stronger echo even with a small part of the beam."""
 
 WIDE_RAD = math.radians(0.25)
-"""Beams farther apart than this tell nothing of where between them a silhouette passes: either a return is missing, or
-the sensor has few columns and gathers light over all of each, so that near surfaces grow by half a column (an OS1 of
-1024 columns, 0.35° apart: half a column farther out, other poses fit its garage nearly as well as the true one)."""
+"""Beams farther apart than this do not tell where between them a silhouette passes. Either a return is missing, or the
+sensor has few columns and gathers light over the whole column, so that near surfaces grow by half a column. (For an OS1
+of 1024 columns, 0.35° apart, with the edges half a column farther out, other poses fit its garage nearly as well as the
+true one.)"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +64,7 @@ class RangeEdges:
     """Where the silhouettes of near surfaces pass.
 
     Attributes:
-        index: (E,) into the cloud, the point on the near side: when the edge was measured.
+        index: (E,) into the cloud, the point on the near side; its time is that of the edge.
         shift_m: (E, 3) float32, from that point to the edge, at the point's range.
         weight: (E,) float32, √(jump in metres), capped.
     """
@@ -78,25 +77,25 @@ class RangeEdges:
 def range_edges(
     xyz_m: NDArray[np.float32], ring: NDArray[np.uint16] | None, seen: Bearings | None = None
 ) -> RangeEdges:
-    """The silhouettes that the range jumps of a sweep tell (METHOD, section 3, "Edge alignment").
+    """The silhouettes at the range jumps of a sweep (METHOD, section 3, "Edge alignment").
 
     Args:
         xyz_m: (N, 3) float32, sensor frame, as measured (motion compensation would tear scan lines apart).
         ring: (N,) uint16 or None.
-        seen: the bearings of the points, where the caller has them.
+        seen: the bearings of the points, if the caller has them.
     """
     seen = bearings(xyz_m) if seen is None else seen
     ring = telling(ring)
     if ring is None:
-        # A point without an elevation lands in the highest band: it is near to none there.
+        # A point without an elevation (NaN) lands in the highest band, where it is near to no other.
         band = np.fmin(np.floor(seen.elevation / BAND_RAD), BANDS - 1)
         row, rows, same_line = (band + BANDS).astype(np.uint16), 2 * BANDS, SAME_LINE_RAD
     else:
         row, rows, same_line = ring, int(ring.max(initial=0)) + 1, math.pi
-    # Compiled once, whether a sweep may be written to or not.
+    # Always read-only, so that the kernel is compiled for one type of array only.
     row = np.ascontiguousarray(row).view()
     row.setflags(write=False)
-    # Where all of a row are of one line, only who is next counts, and not how high.
+    # If all points of a row are on one scan line, only their order counts, not their elevation.
     beside = same_line >= math.pi
     order, first, azimuth, elevation, range_m = _along_the_rows(
         row, rows, seen.azimuth, seen.elevation, seen.range_m, beside
@@ -111,8 +110,8 @@ _Rows = tuple[
 ]  # fmt: skip
 
 _RISING, _TURNED, _FALLING, _MIXED = 0, 1, 2, 3
-"""How the azimuths of a row come: in order; in order, but begun in the middle of a turn; against it, begun anywhere; or
-anyhow."""
+"""Order of the azimuths of a row: ascending; ascending, but begun in the middle of a turn; descending, begun anywhere;
+or no order."""
 
 
 @njit(cache=True)
@@ -124,12 +123,12 @@ def _along_the_rows(
     range_m: NDArray[np.float32],
     beside: bool,
 ) -> _Rows:
-    """The points that are not the vehicle itself in order of their row, and within a row of their azimuth, else as they
-    were: their indices; where each row begins, (rows + 1,); and azimuth, elevation (none where all of a row count as
-    `beside` each other) and range.
+    """Sorts the points, without those on the vehicle itself, by row and then by azimuth; ties keep their order. Returns
+    their indices; where each row begins, (rows + 1,); and their azimuth, elevation (empty if all points of a row count
+    as `beside` each other) and range.
 
-    Rows are looked at before any point is placed: those of most sweeps are in order, one way or the other, or begin in
-    the middle of a turn, and every point goes to its place at once.
+    A first pass examines the rows. In most sweeps they are ascending, descending, or begin in the middle of a turn, so
+    that the second pass puts every point into its final place at once.
     """
     count, begun, latest = np.zeros(rows, np.int64), np.empty(rows, np.float32), np.empty(rows, np.float32)
     falls, rises = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
@@ -185,7 +184,7 @@ def _along_the_rows(
 
 @njit(cache=True)
 def _take(values: NDArray[Any], sequence: NDArray[np.int64]) -> None:
-    """Values (n,) in another sequence, in place."""
+    """Reorders values (n,) in place."""
     before = values.copy()
     for i in range(sequence.shape[0]):
         values[i] = before[sequence[i]]
@@ -200,7 +199,7 @@ def _jumps(
     same_line: float,
     beside: bool,
 ) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-    """Places of the near sides, the azimuth from there to the edge, and weights; of points (N,) in the order of
+    """Positions of the near sides, azimuths from there to the edge, and weights, for points (N,) in the order of
     `_along_the_rows`."""
     rows, count = first.shape[0] - 1, azimuth.shape[0]
     index, turn_rad = np.empty(count, np.int32), np.empty(count, np.float32)
@@ -209,7 +208,7 @@ def _jumps(
         begin, end = first[r], first[r + 1]
         at = begin
         for k in range(begin, end):
-            if beside:  # whoever has no farther neighbour is told at once
+            if beside:  # quick test: skip a point without a farther neighbour
                 before = range_m[k - 1] if k > begin else np.float32(0.0)
                 behind = range_m[k + 1] if k + 1 < end else np.float32(0.0)
                 if (before if before > behind else behind) - range_m[k] <= MIN_JUMP_M:
@@ -246,7 +245,7 @@ def _jumps(
 
 
 def _about_the_axis(xyz_m: NDArray[np.float32], turn_rad: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(E, 3) by how much points (E, 3) move when they are turned about the sensor's axis, each by its own angle."""
+    """(E, 3): how far points (E, 3) move when each is turned about the sensor's axis by its own angle."""
     sine, less = np.sin(turn_rad, dtype=np.float64), 1.0 - np.cos(turn_rad, dtype=np.float64)
     x_m, y_m = xyz_m[:, 0].astype(np.float64), xyz_m[:, 1].astype(np.float64)
     shift_m = np.zeros(xyz_m.shape, np.float32)
