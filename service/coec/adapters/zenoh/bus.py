@@ -1,7 +1,7 @@
-"""The Zenoh session: subscriptions that never block its receive thread, queries that are always answered, one exit.
+"""The service's Zenoh session: subscriptions never block its receive thread, and every query is answered.
 
-Callbacks run on Zenoh's own threads (`indirect=False`): they copy bytes into a bounded queue, or answer from what is
-already serialised. Everything slower goes to the thread of its kind behind a bounded queue. No exception leaves a
+Callbacks run on Zenoh's own threads (`indirect=False`). They copy bytes into a bounded queue, or answer with bytes that
+are already serialised. Slower answers are made on a thread per lane, behind a bounded queue. No exception leaves a
 callback, and every query is finished, because an unfinished one makes its client wait for the whole timeout.
 """
 
@@ -38,18 +38,18 @@ MAX_COMMAND_BYTES = 65_536
 """Largest payload of a query; commands are a few numbers."""
 
 LATCHED_SAMPLES = 100
-"""Of what publishers keep for whoever comes later, taken from each; rmw_zenoh's own."""
+"""Most samples taken from each publisher that keeps some for late subscribers; the value of rmw_zenoh."""
 
 POLL_S = 0.2
 
 
 class Lane(Enum):
-    """Where an answer is made: at once on Zenoh's thread, or on a thread that keeps only its own kind waiting."""
+    """Where an answer is made: at once on Zenoh's thread, or on a thread that serves only queries of one kind."""
 
     AT_ONCE = "at-once"
-    """Microseconds: what is serialised already."""
+    """The answer is already serialised; takes microseconds."""
     COMMANDS = "commands"
-    """Waits for those who carry a command out, and for nobody who reads files."""
+    """Waits until a command is carried out, but never behind queries that read files."""
     FILES = "files"
     """Reads a disk, or much of the history."""
     DRAWING = "drawing"
@@ -57,14 +57,14 @@ class Lane(Enum):
 
 
 WAITING = {Lane.COMMANDS: 32, Lane.FILES: 32, Lane.DRAWING: 8}
-"""Queries that may wait for a thread; the next is told `busy`. Commands of all pairs, as many as a rig may have; those
-that read keep 16 MB each when they are answered, pictures a second of the worker."""
+"""Most queries that wait for each thread; the next one is answered `busy`. Commands: one for each pair that a vehicle
+may have. Answers from files take 16 MB of memory each, pictures a second of the worker."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A query, as far as an answer depends on it. `key` is concrete; `attachment` tells who asks, in whatever form;
-    `received_s` is when it came (steady clock): it may have waited since."""
+    """The parts of a query that an answer depends on. `key` has no wildcards; `attachment` says, in any form, who asks;
+    `received_s` is when the query came (steady clock), since it may have waited."""
 
     key: str
     parameters: str
@@ -75,7 +75,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Bytes and what they are."""
+    """Bytes and their encoding."""
 
     payload: bytes
     encoding: str
@@ -83,7 +83,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """Who answers a key, and where."""
+    """The function that answers a key, and the lane that it runs in."""
 
     key: str
     answer: Callable[[Request], Answer]
@@ -91,7 +91,7 @@ class Route:
 
 
 def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
-    """A peer that connects and reconnects to the router, or the router itself.
+    """The session of a peer that connects and reconnects to the router, or of the router itself.
 
     Raises:
         ConfigError: as `settings_of`.
@@ -107,7 +107,7 @@ def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
 
 
 def closed(session: zenoh.Session, deadline_s: float) -> bool:
-    """Close a session; False when it did not close within `deadline_s` (under loss it can take 10 s)."""
+    """Close a session; False if it did not close within `deadline_s` (on a lossy network it can take 10 s)."""
     closer = threading.Thread(target=session.close, name="zenoh-close", daemon=True)
     closer.start()
     closer.join(deadline_s)
@@ -118,14 +118,14 @@ _Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route], float]]
 
 
 class _Undeclarable(Protocol):
-    """A subscriber, of whatever kind."""
+    """A subscriber of any kind."""
 
     def undeclare(self) -> None: ...
 
 
 class Bus:
-    """Everything the service declares in a session. Calls come from the daemon's threads; `threads` answer what is not
-    answered at once."""
+    """Everything the service declares in a session. Its methods are called from the daemon's threads; `threads` make
+    the answers that are not made at once."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
@@ -140,11 +140,11 @@ class Bus:
 
     @property
     def prompt_threads(self) -> tuple[ServiceThread, ...]:
-        """Those of `threads` that wait neither for a disk nor for the worker."""
+        """The `threads` that wait neither for a disk nor for the worker."""
         return tuple(thread for lane, thread in zip(self._waiting, self.threads, strict=True) if lane is Lane.COMMANDS)
 
     def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
-        """Call `on_sample` for every put on the stream, on Zenoh's thread. Returns what ends it."""
+        """Call `on_sample` for every put on the stream, on Zenoh's thread. Returns a function that ends this."""
         receive = self._receiver(stream, on_sample)
         token = self._shown(stream)
         declared = [self._session.declare_subscriber(each, _direct(receive)) for each in stream.expressions]
@@ -161,8 +161,8 @@ class Bus:
         return end
 
     def subscribe_latched(self, stream: Input, on_sample: Callable[[Sample], None]) -> None:
-        """As `subscribe`, and for what was put before, where its publisher keeps it for whoever comes later (ROS calls
-        that transient local). What this session puts itself is not heard."""
+        """As `subscribe`, and also for earlier samples if their publisher keeps them for late subscribers (ROS calls
+        that transient local). Puts of this session itself are not heard."""
         receive = self._receiver(stream, on_sample)
         self._shown(stream)
         for expression in stream.expressions:
@@ -178,7 +178,7 @@ class Bus:
             self._subscribers.append(subscriber)
 
     def _shown(self, stream: Input) -> zenoh.LivelinessToken | None:
-        """The token by which others see that somebody listens, while it is held; None where nobody wants to know."""
+        """Declares the liveliness token that shows others that this stream is subscribed; None if it has no token."""
         if stream.token is None:
             return None
         token = self._session.liveliness().declare_token(stream.token)
@@ -197,8 +197,8 @@ class Bus:
         return receive
 
     def serve(self, key: str, find: Callable[[str], Sequence[Route]], *, complete: bool = True) -> None:
-        """Answer queries that match `key`. `find` gets the query's key, which may hold wildcards, and returns who
-        answers (nobody: the query ends without a reply) or raises a `CoecError` for an error reply."""
+        """Answer queries that match `key`. `find` gets the query's key, which may hold wildcards. It returns the routes
+        that answer (none: the query ends without a reply), or raises a `CoecError` for an error reply."""
 
         def receive(query: zenoh.Query) -> None:
             try:
@@ -210,7 +210,7 @@ class Bus:
         self._queryables.append(self._session.declare_queryable(key, _direct(receive), complete=complete))
 
     def publish(self, key: str, answer: Answer) -> None:
-        """Put a value; silently lost while no router is there."""
+        """Put a value; it is silently lost while there is no router."""
         timestamp = self._session.new_timestamp()
         try:
             self._session.put(key, answer.payload, encoding=answer.encoding, express=True, timestamp=timestamp)
@@ -222,7 +222,7 @@ class Bus:
         self._tokens.append(self._session.liveliness().declare_token(key))
 
     def undeclare_inputs(self) -> None:
-        """Withdraw the tokens and take no more samples."""
+        """Withdraw the tokens and receive no more samples."""
         for token in self._tokens:
             token.undeclare()
         for subscriber in self._subscribers:
@@ -231,7 +231,7 @@ class Bus:
         self._subscribers.clear()
 
     def undeclare_queryables(self) -> None:
-        """Take no more queries, and finish those that wait."""
+        """Receive no more queries, and finish those that wait with an error reply."""
         for queryable in self._queryables:
             queryable.undeclare()
         self._queryables.clear()
@@ -243,16 +243,16 @@ class Bus:
 
     @property
     def waiting(self) -> dict[str, int]:
-        """Queries that wait, by queue."""
+        """Number of waiting queries, by queue."""
         return {lane.value: waiting.qsize() for lane, waiting in self._waiting.items()}
 
     def reaches_somebody(self) -> bool:
-        """Whether a router, or whoever else the session connects to, is there now."""
+        """Whether the session is connected to a router or a peer now."""
         info = self._session.info
         return bool(list(info.routers_zid()) or list(info.peers_zid()))
 
     def close(self, deadline_s: float) -> bool:
-        """Close the session; False when it did not close within `deadline_s`."""
+        """Close the session; False if it did not close within `deadline_s`."""
         return closed(self._session, deadline_s)
 
     def _receive(self, query: zenoh.Query, find: Callable[[str], Sequence[Route]]) -> None:
@@ -313,7 +313,7 @@ def _direct(callback: Callable[..., None]) -> zenoh.handlers.Callback[object]:
 
 
 def _reply_error(query: zenoh.Query, code: str, message: str) -> None:
-    """An error reply in the format that was asked for, whatever else is wrong with the query."""
+    """Sends an error reply in the requested format, whatever else is wrong with the query."""
     error = ErrorReply(code=code, message=message)
     if "format=json" in str(query.parameters).split(";"):
         query.reply_err(to_json(error), encoding=JSON)

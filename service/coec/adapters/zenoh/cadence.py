@@ -1,4 +1,4 @@
-"""A recording on the air at the cadence at which it was made."""
+"""Plays a recording at the pace at which it was made."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NS_PER_S = 1_000_000_000
 
 
 class Stamped(Protocol):
-    """Something that has its time."""
+    """An item with a time stamp."""
 
     @property
     def stamp_ns(self) -> int:
@@ -26,8 +26,8 @@ T = TypeVar("T", bound=Stamped)
 
 @dataclass(slots=True)
 class Played:
-    """What has been published: frames (or messages) by stream, bytes, and how far the latest was behind its time,
-    seconds."""
+    """What has been published: frames (or messages) by stream, bytes, and the delays behind the due times, seconds: the
+    largest (`late_s`) and that of the latest item."""
 
     frames: Counter[str]
     bytes: int = 0
@@ -45,15 +45,15 @@ def paced(
 ) -> Played:
     """Sends every item when it is due, `rate` times as fast as it was recorded; 0 = without waiting.
 
-    Times are counted from the first item, so that delays do not add up.
+    Due times count from the first item, so that delays do not add up.
 
     Args:
-        items: ascending by their stamps.
-        rate: times recorded speed.
-        stop: ends it before the next item.
-        send: publishes; gives the stream and the bytes.
-        heard: is told after each.
-        played: is counted on.
+        items: in ascending order of their stamps.
+        rate: multiple of the recorded speed.
+        stop: ends the playing before the next item.
+        send: publishes an item and returns its stream and number of bytes.
+        heard: called after each item.
+        played: counters to go on with; also returned.
     """
     start_s = time.monotonic()
     first_ns: int | None = None
@@ -78,8 +78,8 @@ def paced(
 def repeated(
     passes: Callable[[], Iterable[T]], later: Callable[[T, int], T], shift_ns: int, pause_ns: int, forever: bool
 ) -> Iterator[T]:
-    """The items of `passes()`, each `later` by `shift_ns`; if `forever`, again and again, each time `pause_ns` after
-    the last item of the pass before: time never steps back."""
+    """The items of `passes()`, each moved by `shift_ns` with `later`. If `forever`, this repeats: each pass begins
+    `pause_ns` after the last item of the pass before, so that time never steps back."""
     while True:
         first_ns, last_ns = None, 0
         for item in passes():

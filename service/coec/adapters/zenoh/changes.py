@@ -1,4 +1,4 @@
-"""What is so at a vehicle, and every change from then on, as it comes over a router."""
+"""The current extrinsic and health of a vehicle's pairs, and every change from then on, received through a router."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from coec.schemas.keys import Keys
 from coec.schemas.replies import ExtrinsicReply, HealthReply
 
 MAX_BYTES = 2**20
-"""Of one document that is taken in; health with all its figures has some 10 kB."""
+"""Largest document that is read; health with all its figures has some 10 kB."""
 
 
 MAX_KEYS = 4096
-"""Of a vehicle, three for each pair."""
+"""Most keys of a vehicle; each pair has three."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One thing that was said of a pair.
+    """One change of a pair.
 
     Attributes:
         key: whole key on the bus.
         pair: name of the pair.
         kind: `extrinsic`, `health`, or `alive`: whether the pair is served.
-        value: the reply as if it had been asked for; of `alive` True or False.
-        lost: changes before this one that were not taken: they came faster than they were, or were none of ours.
+        value: the reply, as a query would give it; True or False for `alive`.
+        lost: changes lost before this one: they came faster than they were taken, or could not be read.
     """
 
     key: str
@@ -52,10 +52,10 @@ def listening(
     take: Callable[[Change], None],
     refuse: Callable[[], None],
 ) -> Iterator[None]:
-    """Until the end of the block `take` is called for what a pair (`*`: each) says now, and for every change; and
-    `refuse` for what is no document of ours. Both are called on Zenoh's threads and must not wait. Nothing waits for
-    the answers of now, which come within `timeout_s` or not at all. A pair that comes is asked, too: what it said first
-    may have gone before anybody was known to listen."""
+    """Inside the block, `take` is called for the current state of a pair (`*`: of each pair) and for every change, and
+    `refuse` for every document that cannot be read. Both are called on Zenoh's threads and must not wait. The block
+    begins before the answers about the current state are there; they come within `timeout_s` or not at all. A pair that
+    appears later is queried, too, because its first words may have been sent before it knew of this subscriber."""
     heard: set[str] = set()
     order = threading.Lock()
     given_up = zenoh.CancellationToken()
@@ -78,7 +78,7 @@ def listening(
 
     def answered(reply: zenoh.Reply) -> None:
         with order:
-            # What was heard meanwhile is newer than this answer, or the same.
+            # A change that was heard meanwhile is as new as this answer, or newer.
             if reply.ok is not None and str(reply.ok.key_expr) not in heard:
                 give(reply.ok)
 
@@ -116,7 +116,7 @@ def listening(
 
 
 def _change(sample: zenoh.Sample) -> Change:
-    """Raises: DecodeError: no document of ours."""
+    """The change in a sample. Raises DecodeError if it is not a document of this schema."""
     key = str(sample.key_expr)
     _, pair, kind = key.rsplit("/", 2)
     if kind == "alive":

@@ -1,4 +1,4 @@
-"""The other end of the bus: a session that asks and publishes, for commands and tests."""
+"""The client end of the bus: a session that queries and publishes, for the command line and for tests."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ ENDPOINT = re.compile(r"[a-z0-9-]+/[^\s/].*")
 """PROTOCOL/ADDRESS, as Zenoh writes it."""
 
 ON_SITE = 0.9
-"""Share of the time that a command's acknowledgement is waited for that the service may take; the rest is for the way
-there and back."""
+"""Share of the client's waiting time that the service may take for a command; the rest is for the way there and
+back."""
 
 TIMEOUT_PAYLOAD = b"Timeout"
-"""What Zenoh itself replies with when nobody finished the query in time."""
+"""Zenoh's own reply if nobody finished the query in time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """One answer; `encoding` is what its sender says of the payload."""
+    """One answer; `encoding` is the sender's description of the payload."""
 
     key: str
     payload: bytes
@@ -43,8 +43,8 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """How a router is reached: at the first of the endpoints that answers, in a session that is set up as a file says
-    (Zenoh configuration, JSON5; None: by default)."""
+    """How to reach a router: at the first of the endpoints that answers, with the session settings of a file (Zenoh
+    configuration, JSON5; None: default settings)."""
 
     endpoints: tuple[str, ...]
     file: Path | None = None
@@ -52,20 +52,20 @@ class Way:
 
 @contextmanager
 def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session]:
-    """`connected_by` endpoints alone."""
+    """As `connected_by`, with endpoints and default settings."""
     with connected_by(Way(tuple(endpoints)), wait_s) as session:
         yield session
 
 
 @contextmanager
 def connected_by(way: Way, wait_s: float, max_message_bytes: int | None = None) -> Iterator[zenoh.Session]:
-    """A client session on the first of the routers that answers, closed at the end. `max_message_bytes`: the largest
-    message that it takes in; None: as the file says, or a gigabyte.
+    """A client session with the first router that answers, closed at the end. `max_message_bytes` is the largest
+    message that it receives; None: as the file says, or a gigabyte.
 
     Raises:
         UsageError: an endpoint is malformed.
         ConfigError: the file cannot be used.
-        ConnectionFailedError: none answered within `wait_s`.
+        ConnectionFailedError: no router answered within `wait_s`.
     """
     settings = zenoh.Config() if way.file is None else read_settings(way.file)
     for endpoint in way.endpoints:
@@ -81,7 +81,7 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int | None = None) 
     settings.insert_json5("connect/exit_on_failure", "true")
     if max_message_bytes is not None:
         settings.insert_json5("transport/link/rx/max_message_size", str(max_message_bytes))
-    # Publishers that keep their last message for latecomers need it.
+    # Publishers that keep their last message for late subscribers need timestamps.
     settings.insert_json5("timestamping/enabled", "true")
     try:
         settings.insert_json5("connect/endpoints", json.dumps(way.endpoints))
@@ -101,10 +101,10 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int | None = None) 
 
 
 def key_expression(text: str) -> str:
-    """A key, or an expression that stands for several, as it was given.
+    """`text`, checked to be a key or a key expression that stands for several.
 
     Raises:
-        UsageError: it is none; says why.
+        UsageError: it is neither; says why.
     """
     if "?" in text:
         raise UsageError(f"{text!r} is no key: parameters are given apart (`coec query KEY --param NAME=VALUE`)")
@@ -116,10 +116,10 @@ def key_expression(text: str) -> str:
 
 
 def single_key(text: str) -> str:
-    """A key that names one thing, as it was given.
+    """`text`, checked to be a key that names one thing.
 
     Raises:
-        UsageError: it is no key, or an expression that stands for several.
+        UsageError: it is no key, or it is an expression that stands for several.
     """
     if "*" in key_expression(text):
         raise UsageError(f"{text!r} stands for several keys: name one, without `*`")
@@ -127,7 +127,7 @@ def single_key(text: str) -> str:
 
 
 def _first_clause(text: str) -> str:
-    """What Zenoh says of a key, without the place in its source."""
+    """Zenoh's message about a key, without the place in Zenoh's source."""
     return text.partition(" at /")[0].partition("`: ")[2] or text
 
 
@@ -138,12 +138,12 @@ def ask(
     payload: bytes | None = None,
     attachment: bytes | None = None,
 ) -> list[Reply]:
-    """Every answer to a query, in the order of their keys; none is an empty list. The attachment says who asks, for
-    the log of who answers.
+    """Every answer to a query, in the order of their keys; an empty list if nobody answers. The attachment says who
+    asks, for the log of the service.
 
     Raises:
         UsageError: the selector does not begin with a key expression.
-        RemoteError: somebody replied with an error, or did not answer within `timeout_s` and nobody else did.
+        RemoteError: somebody replied with an error, or somebody timed out and nobody else answered.
     """
     asked = session.get(
         selector,
@@ -157,7 +157,7 @@ def ask(
 
 
 def target_of(selector: str) -> zenoh.QueryTarget:
-    """Who is asked: the nearest complete queryable answers for a key; a key expression is meant for all of them.
+    """Which queryables are asked: the nearest complete one for a key, all of them for a key expression.
 
     Raises:
         UsageError: the selector does not begin with a key expression.
@@ -167,10 +167,10 @@ def target_of(selector: str) -> zenoh.QueryTarget:
 
 
 def answered(selector: str, timeout_s: float, asked: Iterable[zenoh.Reply]) -> list[Reply]:
-    """What came in answer to a query, in the order of its keys.
+    """The answers to a query, in the order of their keys.
 
     Raises:
-        RemoteError: somebody replied with an error, or did not answer within `timeout_s` and nobody else did.
+        RemoteError: somebody replied with an error, or somebody timed out and nobody else answered.
     """
     replies: list[Reply] = []
     timed_out = False
@@ -189,25 +189,25 @@ def answered(selector: str, timeout_s: float, asked: Iterable[zenoh.Reply]) -> l
 
 
 def too_late(selector: str, timeout_s: float) -> RemoteError:
-    """The error of a query that somebody could have answered, and did not in time."""
+    """The error for a query that somebody received but did not answer in time."""
     return RemoteError("timeout", f"no answer to {selector} within {timeout_s:g} s: the service is too busy")
 
 
 def myself() -> bytes:
-    """Who says that he gives a command: for the log, and for a rate of his own. It proves nothing."""
+    """The name that a sender gives with a command, for the log and for a rate limit per sender. It proves nothing."""
     with suppress(OSError, KeyError):  # a user without a name
         return f"{getpass.getuser()}@{socket.gethostname()}".encode("ascii", errors="replace")
     return socket.gethostname().encode("ascii", errors="replace")
 
 
 def patience_ms(timeout_s: float) -> int:
-    """For how long a service may take over a command whose acknowledgement is waited for, ms: what it could not begin
-    by then is not done."""
+    """Time within which the service must begin a command, ms, if the client waits `timeout_s` for the acknowledgement;
+    later the service does not carry it out."""
     return min(max(round(timeout_s * 1e3 * ON_SITE), 1), MAX_COMMAND_TIMEOUT_MS)
 
 
 def ask_one(session: zenoh.Session, selector: str, timeout_s: float, payload: bytes | None = None) -> Reply:
-    """The answer to a query for one key.
+    """The answer to a query for one key, the first if there are several.
 
     Raises:
         NotFoundError: nobody answered; says what to check.
@@ -226,8 +226,8 @@ def is_alive(session: zenoh.Session, keys: Keys, timeout_s: float) -> bool:
 
 
 def nobody(selector: str, *, service_is_there: bool = False) -> NotFoundError:
-    """The error of a query that nobody answered: what a router's rules do not allow is not answered either, and neither
-    Zenoh nor this tells the two apart for certain."""
+    """The error for a query that nobody answered. A query that the router's rules forbid is not answered either;
+    neither Zenoh nor this function can distinguish the two for certain."""
     if service_is_there:
         return NotFoundError(
             f"no answer to {selector.partition('?')[0]}, though the service is there (its liveliness token is seen): "

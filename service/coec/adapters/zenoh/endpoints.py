@@ -1,4 +1,4 @@
-"""Endpoints of Zenoh, `PROTOCOL/ADDRESS[?METADATA][#CONFIGURATION]`: whom they let in, what of them may be shown."""
+"""Zenoh endpoints, `PROTOCOL/ADDRESS[?METADATA][#CONFIGURATION]`: whom they let in, and which parts may be shown."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from coec.errors import ConfigError
 
 WITH_PORT = frozenset({"tcp", "udp", "tls", "quic", "ws"})
 OF_THIS_COMPUTER = frozenset({"unixsock-stream", "unixpipe"})
-"""Who may open them is for the file system to say."""
+"""Protocols within this computer; the file system decides who may open them."""
 CERTIFIED = frozenset({"tls", "quic"})
-"""Those that can ask for the certificate of whoever connects."""
+"""Protocols that can ask a client for its certificate."""
 OTHERS = frozenset({"vsock", "serial"})
 
 MTLS = "enable_mtls"
-"""Of an endpoint's configuration, and of `transport/link/tls` for those that say nothing of it."""
+"""Key in an endpoint's configuration, and in `transport/link/tls` for endpoints that do not set it."""
 
 HARMLESS = frozenset({"bind", "dscp", "iface", "multistream", "prio", "rel", "so_rcvbuf", "so_sndbuf", MTLS})
 HARMLESS_ENDING = ("_certificate_file", "_private_key_file", "_on_connect", "_on_expiration")
-"""Parameters that may be shown: what they mean is known, and it is no secret. The rest may be anything."""
+"""Parameters that may be shown, because they are known to hold no secret. Any other might."""
 
 HIDDEN = "***"
 
@@ -32,7 +32,7 @@ _HOST_PORT = re.compile(r"(?P<host>.+):(?P<port>\d{1,5})", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """An endpoint in its parts; `metadata` and `settings` as they were written, empty where nothing was."""
+    """The parts of an endpoint; `metadata` and `settings` as written, empty if there are none."""
 
     protocol: str
     address: str
@@ -41,10 +41,10 @@ class Endpoint:
 
     @classmethod
     def parse(cls, text: str) -> Endpoint:
-        """The inverse of writing one.
+        """The endpoint in a text.
 
         Raises:
-            ConfigError: the text is none, whatever the network is like.
+            ConfigError: the text is no endpoint on any network.
         """
         match = _FORM.fullmatch(text)
         if match is None:
@@ -61,19 +61,19 @@ class Endpoint:
 
     @property
     def on_loopback(self) -> bool:
-        """Whether only programs on this computer are at it."""
+        """Whether only programs on this computer can reach it."""
         return self.protocol in OF_THIS_COMPUTER or (self.protocol in WITH_PORT and _is_loopback(self.address))
 
     @property
     def port(self) -> int:
-        """Of a protocol that has ports."""
+        """The port, for a protocol that has ports."""
         return int(self.address.rpartition(":")[2])
 
     def lets_in_whoever_comes(self, *, certificates_asked: bool) -> bool:
-        """Whether a program on another computer gets in without a certificate, when this is listened on.
+        """Whether a program on another computer gets in without a certificate if a session listens on this endpoint.
 
         Args:
-            certificates_asked: what holds where the endpoint itself does not say whether a certificate is asked for.
+            certificates_asked: whether clients need a certificate if the endpoint itself does not say.
         """
         if self.on_loopback:
             return False
@@ -83,8 +83,8 @@ class Endpoint:
 
 
 def redacted(text: str) -> str:
-    """An endpoint as it may be shown: who is meant stays, what is not known to be harmless is hidden. Of a text that is
-    no endpoint nothing stays behind the first `?` or `#`."""
+    """An endpoint as it may be shown: the address stays, parameters that are not known to be harmless are hidden. In a
+    text that is no endpoint, everything behind the first `?` or `#` is hidden."""
     match = _FORM.fullmatch(text)
     if match is None:
         head = re.split(r"[?#]", text, maxsplit=1)[0]
@@ -95,7 +95,7 @@ def redacted(text: str) -> str:
 
 
 def without_secrets(text: str, endpoints: tuple[str, ...]) -> str:
-    """A message of Zenoh's about these endpoints, as it may be shown."""
+    """A message from Zenoh about these endpoints, as it may be shown."""
     for endpoint in sorted(endpoints, key=len, reverse=True):
         text = text.replace(endpoint, redacted(endpoint))
     return re.sub(r"(base64|password)(\W{1,3})[^\s;,\"')\]]+", rf"\1\2{HIDDEN}", text)
@@ -111,7 +111,7 @@ def _shown(parameters: str) -> str:
 
 
 def _without_user(address: str) -> str:
-    """Neither the user nor the password that may stand before the host."""
+    """The address with a user and password before the host hidden."""
     return f"{HIDDEN}@{address.rpartition('@')[2]}" if "@" in address else address
 
 

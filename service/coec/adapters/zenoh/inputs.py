@@ -1,4 +1,4 @@
-"""Where the samples of a stream come from, and what is told beside them: by key, by rmw_zenoh or by its bridge."""
+"""Where the samples of a stream come from and what comes with them: on native keys, from rmw_zenoh or from a bridge."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from coec.errors import UsageError
 CDR = "application/cdr"
 
 NO_TYPE = "?"
-"""In place of a type, where a key has none that can be one."""
+"""Stands for the type of a message if its key holds none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A message as it came.
+    """A message as it was received.
 
     Attributes:
-        encoding: as the sender says it, `application/cdr;TYPE` for instance.
-        attachment: bytes beside the message where its sender should say its number and who it is; empty where they
-            cannot be such. None: nobody says that on this stream.
+        encoding: as the sender gives it, for example `application/cdr;TYPE`.
+        attachment: bytes beside the message in which the sender should give a sequence number and its id; empty if they
+            cannot be that. None: messages of this stream have no attachment.
     """
 
     payload: bytes
@@ -34,10 +34,10 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """How to listen to one stream: key expressions to subscribe to, and how to read what comes.
+    """How to listen to one stream: key expressions to subscribe to, and a function that reads the samples.
 
     Attributes:
-        token: liveliness token that says so to others; None where nobody wants to know.
+        token: liveliness token that shows the subscription to others; None if none is needed.
     """
 
     expressions: tuple[str, ...]
@@ -46,7 +46,7 @@ class Input:
 
 
 def input_of(stream: StreamConfig, config: Config) -> Input:
-    """That of a stream of this configuration."""
+    """The input of a stream of this configuration."""
     if stream.key is not None:
         return on_key(stream.key)
     if config.middleware == "ros2dds":
@@ -55,7 +55,7 @@ def input_of(stream: StreamConfig, config: Config) -> Input:
 
 
 def on_key(key: str) -> Input:
-    """That of whatever is put on one key."""
+    """The input for everything that is put on one key."""
     return Input((key,), _as_it_is)
 
 
@@ -64,7 +64,7 @@ def _as_it_is(sample: zenoh.Sample) -> Sample:
 
 
 def _typed_by_key(sample: zenoh.Sample) -> Sample:
-    """Of rmw_zenoh: the type stands in the key, and its encoding says nothing."""
+    """Reads a sample from rmw_zenoh, whose key holds the type; its encoding says nothing."""
     try:
         type_name = rmw_zenoh.TopicKey.parse(str(sample.key_expr)).type_name
     except UsageError:

@@ -1,4 +1,4 @@
-"""Whether anybody listens."""
+"""Whether a publisher has subscribers."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ import zenoh
 
 
 def is_heard(publisher: zenoh.Publisher) -> bool:
-    """Whether somebody subscribes to what it publishes."""
-    # The stubs of eclipse-zenoh 1.10 call it a bool; it is a `MatchingStatus`, which is always true.
+    """Whether somebody subscribes to the publisher's key."""
+    # The stubs of eclipse-zenoh 1.10 declare a bool, but it is a `MatchingStatus` object, which is always truthy.
     return cast("zenoh.MatchingStatus", publisher.matching_status).matching

@@ -1,4 +1,4 @@
-"""The frames of a recording on the keys of a pair, at the cadence at which they were recorded."""
+"""Publishes the frames of a recording on the keys of a pair, at the pace at which they were recorded."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Frame = CameraFrame | LidarFrame | EgoMotion
 
 @dataclass(frozen=True, slots=True)
 class Streams:
-    """The keys of a pair; `ego` None means that ego-motion is not published."""
+    """The keys of a pair; `ego` None: ego-motion is not published."""
 
     camera: str
     lidar: str
@@ -34,10 +34,10 @@ class Streams:
 
     @classmethod
     def of_pair(cls, pair: OpenPairConfig) -> Streams:
-        """Those of a configuration.
+        """The keys in a configuration.
 
         Raises:
-            UsageError: it names topics of ROS.
+            UsageError: the configuration names ROS topics.
         """
         topics = [stream.topic for stream in pair.streams.values() if stream.topic]
         if topics:
@@ -55,13 +55,13 @@ class Streams:
         return {stream: key for stream, key in named.items() if key is not None}
 
     def stream_of(self, frame: Frame) -> str:
-        """By the kind of the frame."""
+        """The stream of a frame, by the frame's kind."""
         return stream_of(frame)
 
 
 @dataclass(frozen=True, slots=True)
 class SensorKeys:
-    """A key for each sensor of a vehicle, by the frame of coordinates in which it speaks."""
+    """A key for each sensor of a vehicle; a sensor is named by its frame id."""
 
     sensors: tuple[str, ...]
 
@@ -70,13 +70,13 @@ class SensorKeys:
         return {sensor: f"sensors/{sensor}" for sensor in self.sensors}
 
     def stream_of(self, frame: Frame) -> str:
-        """By the sensor."""
+        """The stream of a frame, by its sensor."""
         return frame.frame_id
 
 
 class Player:
-    """Publishes the frames of a pair, or of all sensors. Senders wait rather than drop: what is lost is then lost by
-    the receiver, which counts it."""
+    """Publishes the frames of a pair, or of all sensors. The sender waits instead of dropping, so that only the
+    receiver loses frames, which it counts."""
 
     def __init__(
         self, session: zenoh.Session, streams: Streams | SensorKeys, encoding: Literal["msgpack", "cdr"]
@@ -91,7 +91,7 @@ class Player:
         self.played = Played(Counter())
 
     def wait_for_listener(self, timeout_s: float) -> list[str]:
-        """Until somebody subscribes to every stream, at most so long; the keys that nobody listens to."""
+        """Wait until every stream has a subscriber, at most `timeout_s`. Returns the keys that still have none."""
         deadline_s = time.monotonic() + timeout_s
         changed = threading.Event()
         listeners = [p.declare_matching_listener(lambda _: changed.set()) for p in self._publishers.values()]
@@ -112,7 +112,7 @@ class Player:
         stop: threading.Event,
         heard: Callable[[Frame, Played], None],
     ) -> Played:
-        """Publishes every frame when it is due, see `paced`; the frames of a stream that has no key are left out."""
+        """Publishes every frame when it is due, see `paced`; frames of a stream without a key are left out."""
         ours = (frame for frame in frames if self._stream_of(frame) in self._publishers)
         return paced(ours, rate, stop, self._send, heard, self.played)
 
@@ -148,7 +148,7 @@ def stream_of(frame: Frame) -> str:
 
 
 def shifted(frame: Frame, shift_ns: int) -> Frame:
-    """The frame with so much added to its stamp."""
+    """The frame with `shift_ns` added to its stamp."""
     return replace(frame, stamp_ns=frame.stamp_ns + shift_ns)
 
 

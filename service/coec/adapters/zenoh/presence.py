@@ -1,14 +1,15 @@
-"""One daemon per vehicle: each says that it is there by liveliness tokens, looks for others, and one stays.
+"""Ensures one daemon per vehicle: daemons show themselves by liveliness tokens and look for others, and only one stays.
 
-A daemon holds a claim from before it looks for others until it answers no more: `starting`, then `serving`. Routers
-hand nothing on between two peers, so that a peer looks through a client session of its own. What is seen there is what
-the router holds; once a daemon sees its own claim, whoever looks later sees it, too. Of two that start at once at least
-one therefore sees the other:
+A daemon holds a claim from before it looks for others until it stops answering: first `starting`, then `serving`.
+Routers forward nothing between two peers, so that a peer looks through a separate client session, which sees what the
+router holds. Once a daemon sees its own claim there, every daemon that looks later sees it, too. Therefore, of two that
+start at the same time, at least one sees the other:
 
-- Who sees one that serves leaves, and so does who sees one that starts with a smaller Zenoh id.
-- Who sees others that start with larger ids waits: they leave, or they had looked before and are about to serve.
-- Who sees nobody serves, and goes on looking: two that have started on different sides of a broken network, or before
-  their router, see each other when it is there, and the one with the larger id leaves.
+- A daemon leaves if it sees another that serves, or one that starts with a smaller Zenoh id.
+- A daemon waits if it sees others that start with larger ids. Either they leave, or they had looked before it started
+  and are about to serve.
+- A daemon that sees nobody serves, and goes on looking. Two daemons that started on different sides of a broken
+  network, or before their router, see each other once it is there; then the one with the larger id leaves.
 """
 
 from __future__ import annotations
@@ -33,27 +34,28 @@ from coec.schemas.keys import Claim, Keys
 _log = logging.getLogger(__name__)
 
 CONNECT_S = 1.0
-"""For a session to look with; a router on the same network answers in milliseconds."""
+"""Timeout for opening the session to look with; a router on the same network answers in milliseconds."""
 
 LOOK_S = 1.0
-"""For one look."""
+"""Timeout of one look."""
 
 SEEN_S = 5.0
-"""For the own claim to be seen: it is a message to the router, and the processor may be busy. Beyond, access control
-hides it."""
+"""Timeout until a daemon sees its own claim: it is a message to the router, and the processor may be busy. If it takes
+longer, access control hides the claim."""
 
 DECIDED_S = 5.0
-"""For others that start to leave or to serve; they need less than that, and one that hangs is not waited for."""
+"""How long to wait for other starting daemons to leave or to serve. They need less; one that hangs is not waited
+for."""
 
 POLL_S = 0.05
-"""Between two looks while something is waited for."""
+"""Pause between two looks while waiting."""
 
 WATCH_S = 5.0
-"""Between two looks while serving."""
+"""Pause between two looks while serving."""
 
 
 def next_step(own: str, others: Iterable[Claim]) -> Literal["serve", "wait", "leave"]:
-    """What a daemon with this Zenoh id does that starts and sees these claims."""
+    """What a starting daemon with this Zenoh id does if it sees these claims."""
     claims = list(others)
     if any(claim.serving or claim.daemon < own for claim in claims):
         return "leave"
@@ -61,17 +63,17 @@ def next_step(own: str, others: Iterable[Claim]) -> Literal["serve", "wait", "le
 
 
 def outranking(own: str, others: Iterable[Claim]) -> Claim | None:
-    """Of those that serve beside a daemon with this Zenoh id, one that it leaves the vehicle to."""
+    """A serving daemon to which the serving daemon with this Zenoh id must leave the vehicle; None: there is none."""
     return next((claim for claim in others if claim.serving and claim.daemon < own), None)
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the router holds of one vehicle.
+    """What the router holds about one vehicle.
 
     Attributes:
-        routed: whether a router is there to hold anything; not where the daemon is the router.
-        own: whether the own claim is there.
+        routed: whether there is a router that can hold anything; False if the daemon itself is the router.
+        own: whether the daemon's own claim is there.
         others: claims of other daemons.
         tokens: liveliness tokens of pairs, whoever holds them.
     """
@@ -83,21 +85,21 @@ class Seen:
 
 
 class Presence:
-    """That of one daemon. `thread` looks for others while it serves, and closes what it looks through.
+    """Presence of one daemon. `thread` looks for others while the daemon serves.
 
     Attributes:
-        rival: another daemon that this one leaves the vehicle to.
-        hidden: whether the router keeps the tokens to itself, so that no daemon sees another.
+        rival: another daemon to which this one has to leave the vehicle.
+        hidden: whether the router does not show the tokens, so that no daemon sees another.
     """
 
     def __init__(
         self, session: zenoh.Session, config: ZenohConfig, limits: LimitsConfig, keys: Keys, since_ns: int
     ) -> None:
-        """Says and looks for nothing yet.
+        """Neither claims nor looks yet.
 
         Args:
             session: the daemon's.
-            since_ns: wall clock at the start of the daemon, for others to tell.
+            since_ns: wall clock at the start of the daemon, for the messages of other daemons.
         """
         self.thread = ServiceThread("look-out", self._watch)
         self.rival: Claim | None = None
@@ -112,10 +114,10 @@ class Presence:
         self._stop = threading.Event()
 
     def claim(self, stop: threading.Event) -> None:
-        """Have the vehicle, if nobody else has. For a thread that may wait; returns early when `stop` is set.
+        """Claim the vehicle unless another daemon has it. For a thread that may wait; returns early if `stop` is set.
 
         Raises:
-            UnavailableError: another daemon serves the vehicle, or is about to; says which. Nothing is claimed then.
+            UnavailableError: another daemon serves the vehicle, or is about to; says which. Then nothing stays claimed.
         """
         self._declare(serving=False)
         try:
@@ -125,8 +127,8 @@ class Presence:
             raise
 
     def close(self, deadline_s: float) -> bool:
-        """Look no more, and claim nothing; for when nothing is answered any more. False when it took longer than the
-        deadline."""
+        """Stop looking and withdraw the claim; call it once the daemon has stopped answering. False if it took longer
+        than the deadline."""
         end_s = time.monotonic() + deadline_s
         self.thread.request_stop()
         self._stop.set()
@@ -146,7 +148,7 @@ class Presence:
                 )
             step = next_step(self._daemon, seen.others)
             if step == "serve":
-                # The first stays until the second is there: whoever looks finds one of them.
+                # The first token stays until the second is there, so that others always find one of them.
                 self._declare(serving=True)
                 self._tokens.pop(0).undeclare()
                 return
@@ -175,12 +177,12 @@ class Presence:
             if rival is not None:
                 self.rival = rival
             if seen.routed:
-                # A router that has just come back is told of the tokens within one look.
+                # A router that has just come back learns of the tokens within one look.
                 unseen = 0 if seen.own else unseen + 1
                 self.hidden = unseen > 1 or (self.hidden and not seen.own)
 
     def _look_until_seen(self, stop: threading.Event) -> Seen:
-        """The first look in which the own claim is there, or the last of `SEEN_S`."""
+        """The first look that sees the own claim, or the last look within `SEEN_S`."""
         deadline_s = time.monotonic() + SEEN_S
         while not (seen := self._look()).own:
             if not seen.routed and not list(self._session.info.routers_zid()):
@@ -193,7 +195,7 @@ class Presence:
         return seen
 
     def _look(self) -> Seen:
-        """What is there now; nothing, while no router is."""
+        """What the router holds now; nothing while there is no router."""
         if self._through is None:
             self._through = self._looking_glass()
         if self._through is None:
@@ -207,7 +209,8 @@ class Presence:
         )
 
     def _looking_glass(self) -> zenoh.Session | None:
-        """The own session, or where that is a peer one that sees what other peers say; None: no router is there."""
+        """The session to look through: the daemon's own, or, if that is a peer, a client session, which sees the tokens
+        of other peers. None: there is no router."""
         settings = settings_of(self._config, self._limits)
         if mode_of(settings) != "peer":
             return self._session
@@ -224,7 +227,7 @@ class Presence:
 
 
 def told(vehicle: str, other: Claim) -> str:
-    """Who has the vehicle, in a sentence for people."""
+    """A sentence for people that says which daemon has the vehicle."""
     since = datetime.fromtimestamp(other.since_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     does = "is served" if other.serving else "is about to be served"
     return (
@@ -234,7 +237,7 @@ def told(vehicle: str, other: Claim) -> str:
 
 
 def _tokens(session: zenoh.Session, key: str) -> list[str]:
-    """Keys that are held; none, while the router is away."""
+    """Keys of the tokens that are held; none while the router is away."""
     try:
         replies = list(session.liveliness().get(key, timeout=LOOK_S))
     except zenoh.ZError:

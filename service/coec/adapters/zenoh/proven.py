@@ -1,4 +1,4 @@
-"""A command whose sender proves who he is to the service, and the service to him, whatever router is in between."""
+"""Commands with proof: sender and service prove their names to each other, through any router in between."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ BUSY = "busy"
 """Code of an error reply: too many queries wait."""
 
 PAUSE_S = 0.05
-"""Before a busy service is asked again; it is through with a full queue of beginnings in about that time."""
+"""Pause before asking a busy service again; in about that time it works off a full queue of conversations that
+begin."""
 
 
 def give(
     session: zenoh.Session, selector: str, payload: bytes | None, timeout_s: float, speaker: Speaker, encoding: str
 ) -> Reply:
-    """The acknowledgement of a command, of which only the service can be the author.
+    """Gives a command and returns its acknowledgement, which is proven to come from the service.
 
     Args:
         selector: key and parameters of the command, as without proof.
@@ -31,8 +32,8 @@ def give(
 
     Raises:
         NotFoundError: nobody answered.
-        RemoteError: an error reply. These carry no proof: whoever is in between can always refuse.
-        NotProvenError: whoever answered is not the service.
+        RemoteError: an error reply. It carries no proof, because a router in between can always refuse.
+        NotProvenError: the answer does not come from the service.
     """
     key = selector.partition("?")[0]
     conversation = f"{key}?tls={secrets.token_hex(16)};format=json"
@@ -46,8 +47,8 @@ def give(
 
 
 def _told(session: zenoh.Session, conversation: str, timeout_s: float, goes: bytes) -> bytes:
-    """The answer to the next bytes. A service that is busy is told them again: a conversation is heard to its end once,
-    so that nothing is done twice, whoever said that it is busy."""
+    """The answer to the next bytes. If the service is busy, they are sent again. This is safe even if somebody else
+    replied "busy", because the service completes a conversation only once, so that nothing is done twice."""
     deadline_s = time.monotonic() + timeout_s
     while True:
         try:

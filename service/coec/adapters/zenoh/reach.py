@@ -1,4 +1,4 @@
-"""Who may reach a session: only programs on this computer, as far as it can be told, or others, too."""
+"""Whether programs on other computers may reach a session, as far as this computer can tell."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ OVER_UDP = frozenset({"udp", "quic"})
 
 
 class Reach:
-    """That of a session with these settings."""
+    """Reach of a session with these settings."""
 
     def __init__(
         self, settings: zenoh.Config, addresses: Callable[[Transport, int], set[Address]] = addresses_of_port
     ) -> None:
-        """`addresses(protocol, port)` tells where somebody waits at a port of this computer.
+        """`addresses(protocol, port)` returns the addresses of this computer at which somebody listens on a port.
 
         Raises:
-            ConfigError: an endpoint is none.
+            ConfigError: an endpoint is malformed.
         """
         self._listened = listened_of(settings)
         self._connected = connected_of(settings)
@@ -31,8 +31,8 @@ class Reach:
         self._addresses = addresses
 
     def outside(self) -> str | None:
-        """Why programs on other computers may reach the session, in a clause; None: they do not, as far as it can be
-        told. A router may be started and stopped at any time, so that it is looked at anew each time."""
+        """A clause that says why programs on other computers may reach the session; None: as far as this computer can
+        tell they cannot. Examined anew at each call, because a router may be started or stopped at any time."""
         if self._gossip:
             return "it connects to whom gossip tells it of"
         for text in (*self._listened, *self._connected):

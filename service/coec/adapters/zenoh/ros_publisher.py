@@ -1,7 +1,7 @@
-"""This session as a node of ROS 2, and its publishers: tokens that ROS's tools list, keys and attachments that its
-nodes read.
+"""Makes a session a ROS 2 node with publishers: its tokens are listed by ROS tools, its keys and attachments are read
+by ROS nodes.
 
-Seen on the wire against rmw_zenoh_cpp 0.6.7. Encodings stay unset, as those of ROS's own.
+Checked on the wire against rmw_zenoh_cpp 0.6.7. Encodings stay unset, as ROS nodes leave them.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from coec.adapters.zenoh.matching import is_heard
 _log = logging.getLogger(__name__)
 
 HEARTBEAT_S = 0.5
-"""How soon whoever missed the last message of a latched topic is told so; rmw_zenoh's own."""
+"""How soon a subscriber learns that it missed the last message of a latched topic; the value of rmw_zenoh."""
 
 
 class RosNode:
-    """The node that a session is. It numbers the session's entities: all of them have to ask the same one."""
+    """The ROS node of a session. It numbers the session's entities, so that a session must have only one."""
 
     def __init__(self, session: zenoh.Session, dialect: Dialect) -> None:
         self.dialect = dialect
@@ -32,22 +32,22 @@ class RosNode:
         self._token = None if dialect.node_token is None else self.hold(dialect.node_token)
 
     def number(self) -> int:
-        """Of the next entity."""
+        """Number of the next entity."""
         return next(self._numbers)
 
     def hold(self, token: str) -> zenoh.LivelinessToken:
-        """Show a token until it is undeclared, or the session ends."""
+        """Hold a token until it is undeclared or the session ends."""
         return self._session.liveliness().declare_token(token)
 
     def close(self) -> None:
-        """Be no node any more; entities withdraw their own tokens, before."""
+        """Withdraw the node. Its entities must have withdrawn their own tokens before."""
         if self._token is not None:
             self._token.undeclare()
             self._token = None
 
 
 class RosPublisher:
-    """One publisher; each belongs to one thread."""
+    """One publisher; use it from one thread only."""
 
     def __init__(
         self,
@@ -64,17 +64,17 @@ class RosPublisher:
 
     @property
     def key(self) -> str:
-        """Where it publishes."""
+        """The key on which it publishes."""
         return str(self._publisher.key_expr)
 
     @property
     def is_heard(self) -> bool:
-        """Whether somebody subscribes now; one that keeps its messages speaks to whoever comes later, always."""
+        """Whether somebody subscribes now; always True for a publisher that keeps messages for late subscribers."""
         return not isinstance(self._publisher, zenoh.Publisher) or is_heard(self._publisher)
 
     def put(self, payload: bytes, source_ns: int) -> None:
-        """Publish a message in CDR; `source_ns` is the wall clock of whoever made it. Silently lost while no router is
-        there, or as soon as the session is closed."""
+        """Publish a message in CDR; `source_ns` is the wall clock at which it was made. It is silently lost while there
+        is no router, and after the session is closed."""
         attachment = self._dialect.attachment(self._token, next(self._sequence), source_ns)
         try:
             self._publisher.put(payload, attachment=attachment)
@@ -82,13 +82,13 @@ class RosPublisher:
             _log.debug("a message of ROS could not be published", extra={"fields": {"why": str(error)}})
 
     def undeclare(self) -> None:
-        """Withdraw it: the token first, so that nobody waits for what does not come any more."""
+        """Withdraw it: the token first, so that nobody waits for more messages."""
         self._liveliness.undeclare()
-        self._publisher.undeclare()  # type: ignore[no-untyped-call]  # of zenoh.ext, whose stubs name no result
+        self._publisher.undeclare()  # type: ignore[no-untyped-call]  # the stubs of zenoh.ext name no result
 
 
 class RosPublishers:
-    """All that a session publishes to ROS."""
+    """All ROS publishers of a session."""
 
     def __init__(self, session: zenoh.Session, node: RosNode) -> None:
         self._session = session
@@ -102,7 +102,7 @@ class RosPublishers:
         qos: Qos,
         congestion_control: zenoh.CongestionControl = zenoh.CongestionControl.DROP,
     ) -> RosPublisher:
-        """Declare a publisher. A transient local one keeps the last `qos.depth` messages for whoever comes later."""
+        """Declare a publisher. A transient local one keeps the last `qos.depth` messages for late subscribers."""
         dialect = self._node.dialect
         key = dialect.key(topic, type_name)
         reliability = zenoh.Reliability.RELIABLE if qos.reliable else zenoh.Reliability.BEST_EFFORT

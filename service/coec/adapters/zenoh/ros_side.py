@@ -1,4 +1,4 @@
-"""A session on a vehicle that speaks ROS 2, or does not: the node that it is there, and what it sees of the others."""
+"""The ROS 2 side of a session, on vehicles with or without ROS: its own node, and the topics of other nodes."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from coec.schemas.ros_names import TF_STATIC
 
 
 class RosSide:
-    """Of one session.
+    """The ROS side of one session.
 
     Attributes:
-        node: None where the vehicle does not speak ROS.
+        node: None if the vehicle does not use ROS.
     """
 
     def __init__(self, session: zenoh.Session, config: Config) -> None:
-        """Be a node, and follow who publishes what."""
+        """Become a node and follow the publishers on the bus."""
         dialect = dialect_of(config, str(session.info.zid()))
         self._config = config
         self.node = None if dialect is None else RosNode(session, dialect)
         self._topics = None if dialect is None else RosTopics(session, config)
 
     def input_of(self, stream: AnyStreamConfig) -> Input:
-        """How to listen to a stream, with the token by which nodes and tools of ROS see who listens."""
+        """How to listen to a stream, with the token that shows the subscription to ROS nodes and tools."""
         return self._announced(input_of(stream, self._config), stream.topic, stream.assumed_type, SENSOR_DATA)
 
     def input_of_info(self, topic: str) -> Input:
-        """The same of a `CameraInfo`."""
+        """The same for a `CameraInfo` topic."""
         return self._announced(self._of_topic(topic), topic, messages.CAMERA_INFO, SENSOR_DATA)
 
     def input_of_static_transforms(self) -> Input:
-        """The same of `/tf_static`."""
+        """The same for `/tf_static`."""
         return self._announced(self._of_topic(TF_STATIC), TF_STATIC, messages.TF, STATIC_LISTENER)
 
     def _of_topic(self, topic: str) -> Input:
@@ -51,11 +51,11 @@ class RosSide:
         return replace(plain, token=self.node.dialect.subscriber_token(self.node.number(), topic, type_name, qos))
 
     def topics(self) -> Topics:
-        """What is published now. Any thread."""
+        """What is published now. May be called from any thread."""
         return Topics() if self._topics is None else self._topics.now()
 
     def close(self) -> None:
-        """Be nobody there any more."""
+        """Withdraw the node and stop following the publishers."""
         if self._topics is not None:
             self._topics.close()
         if self.node is not None:

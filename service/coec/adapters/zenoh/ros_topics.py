@@ -1,7 +1,7 @@
-"""What the vehicle's ROS publishes, as liveliness tokens tell it: who is there, on which topics, of which types.
+"""The ROS publishers on a vehicle, read from liveliness tokens: their nodes, topics and types.
 
-Whoever reaches the router may declare tokens: what tells of no publisher is counted and left out, and so is what
-exceeds `MAX_PUBLISHERS`.
+Anybody who reaches the router may declare tokens. Tokens that describe no publisher, and those beyond `MAX_PUBLISHERS`,
+are counted and left out.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from coec.config import Config
 _log = logging.getLogger(__name__)
 
 MAX_PUBLISHERS = 4096
-"""Twenty times those of a large vehicle; 2 MB."""
+"""Most publishers that are kept, 2 MB: twenty times those of a large vehicle."""
 
 OWN = "/coec/"
-"""Below it services say what they say themselves: no stream of theirs."""
+"""Topics below this are published by coec services themselves, so that they are no input streams."""
 
 SHOWN = 8
-"""Topics that a sentence names; the rest is a number."""
+"""Most topics that a sentence names; of the others it gives the number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,30 +35,30 @@ class Topics:
     """Publishers at one moment.
 
     Attributes:
-        left_out: tokens that told of no publisher (`malformed`), or of one too many (`too_many`).
+        left_out: number of tokens that describe no publisher (`malformed`), or one too many (`too_many`).
     """
 
     publishers: tuple[Publisher, ...] = ()
     left_out: Counter[str] = field(default_factory=Counter)
 
     def of(self, topic: str) -> tuple[Publisher, ...]:
-        """Those of a topic."""
+        """The publishers of a topic."""
         return tuple(one for one in self.publishers if one.topic == topic)
 
     def types(self) -> dict[str, tuple[str, ...]]:
-        """The types of each topic, both in the order of their names."""
+        """The types of each topic; topics and types are sorted by name."""
         found: dict[str, set[str]] = {}
         for one in self.publishers:
             found.setdefault(one.topic, set()).add(one.type_name)
         return {topic: tuple(sorted(found[topic])) for topic in sorted(found)}
 
     def nodes_of(self, gids: Iterable[bytes]) -> tuple[str, ...]:
-        """Names of the nodes whose publishers have these ids, as far as they are known."""
+        """Names of the nodes whose publishers have these ids, as far as known."""
         wanted = frozenset(gids)
         return tuple(sorted({one.node for one in self.publishers if one.node and one.gid in wanted}))
 
     def absent(self, topic: str, types: Collection[str]) -> str | None:
-        """A sentence where nobody publishes a topic: which ones of these types there are instead."""
+        """None if somebody publishes the topic; otherwise a sentence that lists the topics of these types instead."""
         if self.of(topic):
             return None
         there = self.types()
@@ -70,16 +70,16 @@ class Topics:
 
 
 def listed(names: Collection[str]) -> str:
-    """The first of them, and how many more."""
+    """The first names, and how many more there are."""
     shown = ", ".join(list(names)[:SHOWN])
     return shown if len(names) <= SHOWN else f"{shown} and {len(names) - SHOWN} more"
 
 
 class RosTopics:
-    """Follows the tokens of publishers but services like this one. `now` is for any thread."""
+    """Follows the tokens of publishers, except those of coec services. `now` may be called from any thread."""
 
     def __init__(self, session: zenoh.Session, config: Config) -> None:
-        """Those who are there come as those who come later do, within milliseconds of a router that answers."""
+        """Starts to follow. Tokens that exist already arrive like new ones, milliseconds after a router answers."""
         self._lock = threading.Lock()
         self._publishers: dict[str, Publisher] = {}
         self._left_out: Counter[str] = Counter()
@@ -91,7 +91,7 @@ class RosTopics:
         )
 
     def now(self) -> Topics:
-        """Who is there."""
+        """The publishers that exist now."""
         with self._lock:
             if self._changed:
                 self._now = Topics(tuple(self._publishers.values()), self._left_out.copy())
@@ -99,7 +99,7 @@ class RosTopics:
             return self._now
 
     def close(self) -> None:
-        """Follow them no more."""
+        """Stop following."""
         if self._subscriber is not None:
             self._subscriber.undeclare()
             self._subscriber = None
@@ -128,7 +128,7 @@ class RosTopics:
 
 
 def _tokens_of(config: Config) -> tuple[str, Callable[[str], Publisher | None]]:
-    """The key expression of tokens of publishers, and what reads one."""
+    """The key expression of publishers' tokens, and the function that reads one."""
     if config.middleware == "ros2dds":
         return ros2dds.PUBLISHER_TOKENS, lambda token: ros2dds.publisher_of(token, config.ros.namespace)
     return rmw_zenoh.publisher_tokens(config.ros.domain), rmw_zenoh.publisher_of

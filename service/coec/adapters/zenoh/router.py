@@ -1,4 +1,4 @@
-"""The router of a vehicle, from a configuration of Zenoh's own form (JSON5), as `zenohd` reads it."""
+"""A vehicle's router, started from a Zenoh configuration (JSON5) as `zenohd` reads it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ ROUTER = "router"
 
 
 def open_router(file: Path) -> zenoh.Session:
-    """A session that routes between all who connect, by the rules of the file, until it is closed.
+    """A session that routes between all clients by the rules of the file, until it is closed.
 
     Raises:
-        ConfigError: the file is none, is not a router's, or opens a door to everybody.
+        ConfigError: the file cannot be used, is not a router's, or lets anybody in.
         UnavailableError: a port is taken, an address is not there, or a certificate cannot be used.
     """
     zenoh.init_log_from_env_or("error")

@@ -1,4 +1,4 @@
-"""What a session is opened with: the configuration of the service over the file that it names."""
+"""Settings of a Zenoh session, from the service's configuration and the Zenoh file that it names."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
 
 DEAF_US = 2_000_000
-"""Who has not taken 64 kB for so long, microseconds, is cut off when something is to be sent to him that may not be
-dropped: meanwhile a router forwards nothing of that sender to anybody. By default it would be 5 s for each."""
+"""A receiver that has not taken 64 kB for this long, microseconds, is cut off when a message for it may not be dropped.
+Until then the router forwards nothing from that sender to anybody. Zenoh's default is 5 s for each receiver."""
 
 
 def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
-    """What `config.file` says stands; what it does not say opens no door: nobody listens, and nobody is looked for, who
-    was not told to.
+    """The session's settings. What `config.file` sets stands. Whatever it leaves out gets a safe value: the session
+    listens and searches for others only if told to.
 
     Raises:
-        ConfigError: the file or an endpoint is none, or a door is open to everybody and `config.insecure` is not set.
+        ConfigError: the file or an endpoint cannot be used, or an endpoint lets anybody in and `config.insecure` is not
+            set.
     """
     listen = config.listen if config.embedded_router else ()
     connect = tuple(endpoint for endpoint in config.connect if endpoint not in listen)
@@ -40,14 +41,14 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
         settings = read_settings(config.file) if config.file else zenoh.Config()
         unsaid = zenoh.Config()
         for key, value in silent.items():
-            # A peer listens on every interface by default, at any port.
+            # By default a peer listens on every interface, at any port.
             if settings.get_json(key) == unsaid.get_json(key):
                 settings.insert_json5(key, json.dumps(value))
         settings.insert_json5("scouting/multicast/enabled", "false")
         settings.insert_json5("timestamping/enabled", "true")
         settings.insert_json5("transport/link/rx/max_message_size", str(limits.max_message_bytes))
-        # The 16 MiB of every router and sender that is started anew would stay mapped until the service ends (Zenoh
-        # 1.10). Without them a frame is copied once more: at 35 MB/s one hundredth of a core.
+        # With shared memory, 16 MiB of every router and sender that is started anew would stay mapped until the service
+        # ends (Zenoh 1.10). Without it a frame is copied once more, which takes a hundredth of a core at 35 MB/s.
         settings.insert_json5("transport/shared_memory/enabled", "false")
     except (zenoh.ZError, ValueError) as error:
         raise ConfigError(f"{where(config)}: {without_secrets(str(error), endpoints_of(config))}") from None
@@ -62,11 +63,10 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
 
 
 def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
-    """Endpoints that are listened on, as they may be shown, where a program on another computer gets in without a
-    certificate.
+    """Endpoints on which the session listens and lets programs on other computers in without a certificate, redacted.
 
     Raises:
-        ConfigError: one of them is no endpoint.
+        ConfigError: one of them is malformed.
     """
     certificates_asked = bool(json.loads(settings.get_json(TLS)).get("enable_mtls"))
     return tuple(
@@ -77,11 +77,11 @@ def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
 
 
 def beside(settings: zenoh.Config, connect_s: float) -> zenoh.Config:
-    """Make of a session's settings those of a client beside it, which sees what the router hands to others; it is
-    opened within `connect_s`, or not at all."""
+    """Changes a session's settings, in place, into those of a client beside it, which sees what the router gives to
+    others. Opening the client takes at most `connect_s` or fails."""
     own = {
         "mode": "client",
-        "id": uuid.uuid4().hex.lstrip("0"),  # the file may name that of the service
+        "id": uuid.uuid4().hex.lstrip("0"),  # a new id, as the file may set the service's
         "listen/endpoints": [],
         "connect/timeout_ms": round(connect_s * 1000),
         "connect/exit_on_failure": True,
@@ -107,12 +107,12 @@ def mode_of(settings: zenoh.Config) -> str:
 
 
 def endpoints_of(config: ZenohConfig) -> tuple[str, ...]:
-    """All that the configuration names."""
+    """All endpoints in the configuration."""
     return (*config.listen, *config.connect)
 
 
 def where(config: ZenohConfig) -> str:
-    """What part of the configuration a complaint is about."""
+    """The part of the configuration that an error message is about."""
     if config.file:
         return f"zenoh.file {config.file}"
     listen = [redacted(endpoint) for endpoint in config.listen] if config.embedded_router else []
@@ -120,6 +120,7 @@ def where(config: ZenohConfig) -> str:
 
 
 def _of_mode(value: Any, mode: str) -> tuple[str, ...]:
-    """A list of endpoints, or one per mode; a list in the list is a choice of endpoints."""
+    """The endpoints of a mode. `value` is a list of endpoints, or holds one such list per mode; a list within the list
+    is a choice of endpoints."""
     found = value.get(mode, []) if isinstance(value, dict) else value
     return tuple(one for item in found or [] for one in ([item] if isinstance(item, str) else item))

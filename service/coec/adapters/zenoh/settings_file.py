@@ -1,4 +1,4 @@
-"""The Zenoh configuration (JSON5) that a configuration or a command names."""
+"""Reads the Zenoh configuration file (JSON5) that coec's configuration or a command names."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from coec.errors import ConfigError
 TLS = "transport/link/tls"
 
 MAX_BYTES = 2**20
-"""The shipped rules of a router have 8 kB."""
+"""Largest file; the shipped rules of a router have 8 kB."""
 
 MAX_BRACKETS = 10_000
-"""Opening ones; the shipped rules have 90. Zenoh's reader calls itself for each that is inside another, and takes the
-process with it when the stack is at its end: seen between 32,000 and 100,000 on a stack of 8 MB."""
+"""Most opening brackets of a file; the shipped rules have 90. Zenoh's reader recurses for each nested bracket and
+crashes the process when the stack is used up, which happens between 32,000 and 100,000 brackets on a stack of 8 MB."""
 
 _PLACE = re.compile(r"--> (\d+):(\d+)")
 _VALUE = re.compile(r"""(?<=variant )`[^`]*`|"[^"]*"?|'[^']*'?""")
@@ -29,8 +29,8 @@ def read_settings(path: Path) -> zenoh.Config:
     """The settings in a file.
 
     Raises:
-        ConfigError: it cannot be read, or holds no settings. The message holds nothing of its values: they may be
-            keys and passwords.
+        ConfigError: it cannot be read, or holds no settings. The message quotes none of its values, which may be keys
+            and passwords.
     """
     try:
         with path.open("rb") as stream:
@@ -52,7 +52,7 @@ def read_settings(path: Path) -> zenoh.Config:
 
 
 def credentials_in(settings: zenoh.Config) -> Credentials | None:
-    """Files of the certificate that a session with these settings shows when it connects; None: it names none."""
+    """Files of the certificate that a session with these settings shows when it connects; None: there are none."""
     tls = json.loads(settings.get_json(TLS))
     files = [tls.get(name) for name in ("connect_certificate", "connect_private_key", "root_ca_certificate")]
     if not all(isinstance(file, str) for file in files):
@@ -62,7 +62,7 @@ def credentials_in(settings: zenoh.Config) -> Credentials | None:
 
 
 def _harmless(text: str) -> str:
-    """What Zenoh says of a file, without what stands in it: either it quotes the line, or the value."""
+    """Zenoh's message about a file without the file's content: the message may quote a line or a value."""
     place = _PLACE.search(text)
     if place is not None:
         return f"line {place[1]}, column {place[2]}"

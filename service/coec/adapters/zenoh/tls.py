@@ -1,4 +1,4 @@
-"""Certificates of a session: what they say, and whether the other end takes them."""
+"""Certificates of a session: what they contain, and whether the other end accepts them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from coec.adapters.zenoh.endpoints import Endpoint
 from coec.adapters.zenoh.settings_file import TLS
 
 X509_V_FLAG_NO_CHECK_TIME = 0x200000
-"""Of OpenSSL: a certificate that has expired is looked at all the same."""
+"""OpenSSL flag: do not check the validity period, so that an expired certificate can be read, too."""
 
 HEARD_OUT_S = 0.5
-"""In TLS 1.3 the other end says that it does not take a certificate after the handshake, if at all."""
+"""How long to listen after the handshake, s: in TLS 1.3 the other end refuses a certificate only after it, if at
+all."""
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """Files by which one end of a link is known, and knows the other; None where none is named."""
+    """Files with which one end of a link identifies itself and checks the other end; None for a file that is not
+    set."""
 
     authority: Path | None
     certificate: Path | None
@@ -35,12 +37,12 @@ class Material:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What one says.
+    """Content of a certificate.
 
     Attributes:
         name: common name of its subject.
-        names: for which hosts it is good.
-        not_before_s, not_after_s: seconds since 1970.
+        names: hosts for which it is valid.
+        not_before_s, not_after_s: validity period, seconds since 1970.
     """
 
     name: str
@@ -50,11 +52,12 @@ class Certificate:
 
 
 class CertificateError(Exception):
-    """It cannot be used; says why."""
+    """A certificate cannot be used; says why."""
 
 
 def material_of(settings: zenoh.Config, endpoint: Endpoint, role: Literal["connect", "listen"]) -> Material:
-    """The files of an endpoint that is connected to, or listened on: what it says itself stands over what all say."""
+    """The files for an endpoint to connect to or listen on. What the endpoint sets itself overrides the common TLS
+    settings."""
     of_all: Mapping[str, Any] = json.loads(settings.get_json(TLS))
     own = dict(item.partition("=")[::2] for item in endpoint.settings.split(";") if item)
 
@@ -72,17 +75,17 @@ def material_of(settings: zenoh.Config, endpoint: Endpoint, role: Literal["conne
 
 
 def read_certificate(material: Material, role: Literal["connect", "listen"]) -> Certificate:
-    """The certificate of the material, which must come from its authority and have its key. That it has expired is for
-    the caller to see.
+    """The certificate of the material, which must be signed by its authority and fit its key. The caller has to check
+    whether it has expired.
 
     Raises:
-        CertificateError: a file cannot be read, key and certificate are of different pairs, the authority is another,
-            or the certificate is not for this role.
+        CertificateError: a file cannot be read, key and certificate do not belong together, another authority signed
+            it, or the certificate is not for this role.
     """
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
-    # Whose certificate is looked at is the end that shows it; the other checks it.
+    # One end shows the certificate, and the other end checks it.
     checks = server if role == "connect" else client
     checks.verify_mode = ssl.CERT_REQUIRED
     checks.verify_flags |= ssl.VerifyFlags(X509_V_FLAG_NO_CHECK_TIME)
@@ -107,11 +110,11 @@ def read_certificate(material: Material, role: Literal["connect", "listen"]) -> 
 
 
 def shake_hands(endpoint: Endpoint, material: Material, timeout_s: float) -> Certificate:
-    """The certificate of whoever answers at an endpoint, once both ends have taken each other's.
+    """The certificate of the server at an endpoint, after both ends have accepted each other's.
 
     Raises:
-        CertificateError: one of the ends does not take the other's, or this is no TLS.
-        OSError: nobody is there.
+        CertificateError: one end does not accept the other's certificate, or the server does not use TLS.
+        OSError: nobody answers.
     """
     host, port = host_and_port(endpoint)
     try:
@@ -135,7 +138,7 @@ def shake_hands(endpoint: Endpoint, material: Material, timeout_s: float) -> Cer
 
 
 def host_and_port(endpoint: Endpoint) -> tuple[str, int]:
-    """Of an endpoint with both."""
+    """Host and port of an endpoint that has both."""
     host, _, port = endpoint.address.rpartition(":")
     return host.removeprefix("[").removesuffix("]"), int(port)
 
@@ -148,12 +151,12 @@ def _alert(error: ssl.SSLError) -> str:
 
 
 def _words(error: ssl.SSLError) -> str:
-    """OpenSSL's reason, as people write."""
+    """OpenSSL's reason in plain words."""
     return (error.reason or str(error)).lower().replace("_", " ")
 
 
 def _shake_hands(server: ssl.SSLContext, client: ssl.SSLContext, *, of_client: bool) -> Mapping[str, Any]:
-    """What the checking end sees of the other's certificate, both in memory."""
+    """The other end's certificate as the checking end sees it, after a handshake in memory."""
     to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
     ends = [client.wrap_bio(to_client, to_server), server.wrap_bio(to_server, to_client, server_side=True)]
     waiting = list(ends)

@@ -1,4 +1,4 @@
-"""Messages of a recording on topics of ROS 2: keys, tokens and attachments as those of its own nodes."""
+"""Publishes the messages of a recording on ROS 2 topics, with the keys, tokens and attachments of a ROS node."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ Middleware = Literal["rmw_zenoh", "ros2dds"]
 NODE: Final = "coec_play"
 
 TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,127}/msg/[A-Za-z][A-Za-z0-9]{0,127}")
-"""Full names of messages (rosidl_parser, definition.py)."""
+"""Full name of a message type (rosidl_parser, definition.py)."""
 
 _TOPIC: Final = TypeAdapter[str](TopicName)
 
 LOOK_AGAIN_S: Final = 0.05
-"""Between two looks at who listens."""
+"""Pause between two looks for subscribers."""
 
 
 def dialect_of(middleware: Middleware, session: zenoh.Session, domain: int, namespace: str) -> Dialect:
-    """How a player speaks in a session: as a node of rmw_zenoh in a domain, or beside a bridge of a namespace."""
+    """The dialect of a player in a session: that of an rmw_zenoh node in a domain, or of a bridge with a namespace."""
     name = str(session.info.zid())
     if middleware == "ros2dds":
         return Ros2dds(name, namespace)
@@ -43,8 +43,8 @@ def dialect_of(middleware: Middleware, session: zenoh.Session, domain: int, name
 
 
 def is_playable(middleware: Middleware, topic: str, type_name: str) -> bool:
-    """Whether a topic has a key: names are ROS's (nobody vouches for those in a file, and `*` in a key is no name); and
-    that of rmw_zenoh holds the type's hash, known of ROS's own types."""
+    """Whether a topic has a key. Topic and type must be valid ROS names, since a file may hold any text and a key with
+    `*` is none. For rmw_zenoh the type must also be one of ROS's own, as its key holds the hash of the type."""
     try:
         _TOPIC.validate_python(topic)
     except ValidationError:
@@ -53,7 +53,7 @@ def is_playable(middleware: Middleware, topic: str, type_name: str) -> bool:
 
 
 class TopicPlayer:
-    """Publishes on topics. Senders wait rather than drop: what is lost is then lost by the receiver."""
+    """Publishes on topics. The sender waits instead of dropping, so that only the receiver loses messages."""
 
     def __init__(self, session: zenoh.Session, dialect: Dialect, topics: Mapping[str, str]) -> None:
         """`topics`: types by name."""
@@ -65,7 +65,8 @@ class TopicPlayer:
         }
 
     def wait_for_listener(self, topics: Iterable[str], timeout_s: float, stop: threading.Event) -> list[str]:
-        """Until somebody subscribes to each of these topics, at most so long; those that nobody listens to."""
+        """Wait until each of these topics has a subscriber, at most `timeout_s`. Returns the topics that still have
+        none."""
         awaited = list(topics)
         deadline_s = time.monotonic() + timeout_s
         while True:
@@ -80,7 +81,7 @@ class TopicPlayer:
         stop: threading.Event,
         heard: Callable[[TopicMessage, Played], None],
     ) -> Played:
-        """Publishes every message on one of the topics when it is due, see `paced`; the others are left out."""
+        """Publishes every message on one of the player's topics when it is due, see `paced`; others are left out."""
         ours = (message for message in items if message.topic in self._publishers)
         return paced(ours, rate, stop, self._send, heard, Played(Counter()))
 

@@ -1,7 +1,7 @@
-"""Recorded windows, fetched over whatever link there is: piece by piece, resumed where it broke, verified at the end.
+"""Fetches recorded windows over slow or broken links: piece by piece, resumed after a break, verified at the end.
 
-What has come lies beside the file, under a name that holds the sha256 it is to have: whoever asks again, with another
-process on another day, goes on behind it, and pieces of two versions of a window never meet in one file.
+The received part lies beside the final file, under a name that holds the expected sha256. A later attempt, even by
+another process on another day, goes on from there, and pieces of two versions of a window never mix in one file.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from coec.schemas.keys import Keys
 from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
 
 PIECE_BYTES: Final = 2**19
-"""Asked for at once: half a second of the rate that a vehicle sends by default, and lost when the link breaks."""
+"""Size of a piece: half a second at the rate at which a vehicle sends by default. A broken link loses one piece."""
 
 MAX_WINDOW_BYTES: Final = 2**32
-"""Of a window that is fetched: as much as a vehicle keeps of all by default (`state.max_bytes`)."""
+"""Largest window that is fetched: as much as a vehicle keeps of all windows by default (`state.max_bytes`)."""
 
 DIGEST_POLL_S: Final = 0.2
-"""Between questions whether the service has read a window: as often as its recorder looks for one."""
+"""Pause between queries whether the service has read a window; its recorder looks for windows as often."""
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
-"""Before a piece is asked for again, doubled each time: the uplink fills at its rate, a link is back when it is."""
+"""Pause before a piece is asked for again, doubled each time up to the longest."""
 
 WAITS: Final = frozenset({"uplink_busy", "busy", "timeout"})
-"""Codes of replies after which the same question may be answered."""
+"""Reply codes after which it makes sense to send the same query again."""
 
 SHA256: Final = re.compile(r"[0-9a-f]{64}")
-"""As the list writes it: a part of it becomes a part of a file's name."""
+"""Form of a hash in the list, checked because a part of the hash becomes part of a file name."""
 
 BLOCK_BYTES: Final = 2**20
-"""Of what is there already, read at once to be hashed."""
+"""Bytes of the part that is already there to read and hash at a time."""
 
 
 Recording = WindowInfo | SnippetInfo
@@ -56,19 +56,20 @@ def fetch_window(
     patience_s: float,
     heard: Callable[[int, int], None],
 ) -> Recording:
-    """A window or snippet in a file that has its name only when its sha256 is right.
+    """Fetches a window or snippet into a file, which gets its final name only if its sha256 is right.
 
-    A window that is rewritten on the way (its result came) is fetched once more. One that is there whole is not.
+    If the service rewrites the window meanwhile (because its result came), it is fetched once more. A file that is
+    already complete is not fetched.
 
     Args:
         timeout_s: for one answer.
-        patience_s: without any piece, before it is given up.
-        heard: is told how many bytes are there, and of how many.
+        patience_s: time without any new piece after which to give up.
+        heard: called with the number of bytes that are there, and the total.
 
     Raises:
         NotFoundError: nobody answered.
-        RemoteError: no such window, or its bytes are not those that were promised.
-        OutputError: the file cannot be written. What has come stays for the next attempt.
+        RemoteError: there is no such window, or its bytes do not have the promised hash.
+        OutputError: the file cannot be written. The received part stays for the next attempt.
     """
     info = _digested(session, keys, pair, window_id, timeout_s)
     for attempt in (1, 2):
@@ -103,7 +104,7 @@ def _whole(
     patience_s: float,
     heard: Callable[[int, int], None],
 ) -> bool:
-    """Goes on with what is there until nothing is missing; False where it is not what was promised."""
+    """Completes the part that is there; False if the result does not have the promised hash."""
     part.parent.mkdir(parents=True, exist_ok=True)
     with part.open("a+b") as file:
         if file.tell() > info.size_bytes:
@@ -147,7 +148,7 @@ def _is_there(path: Path, info: Recording) -> bool:
 
 
 def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> Recording:
-    """What the list says of a window; the service may still be reading it."""
+    """The entry of a window in the service's list, once the service has read the window and knows its hash."""
     deadline_s = time.monotonic() + timeout_s
     while (info := _info(session, keys, pair, window_id, timeout_s)).sha256 is None:
         if time.monotonic() > deadline_s:

@@ -1,4 +1,4 @@
-"""Last words of many vehicles, as they come over a router: heard, asked for, and their tokens."""
+"""Receives the last words of many vehicles through a router: published words, queried words, and liveliness tokens."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from coec.schemas.keys import Keys
 from coec.schemas.last_word import MAX_BYTES
 
 WAITING: Final = 32_768
-"""Words that may wait to be read, 1 kB each and never more than 16: a fleet that answers all at once. What comes beyond
-is counted, and said again within its period."""
+"""Most words that wait to be read, 1 kB each and at most 16 kB: enough for a fleet that answers all at once. Words
+beyond this are counted as lost, and repeated by their pairs within a period."""
 
 
 @dataclass(frozen=True, slots=True)
 class Came:
-    """One thing that came: a word as it was said, a word that was kept or asked for, or a token. `at_s` by the steady
-    clock; the payload of a token is empty where it went."""
+    """One received thing: a word as it was published (`said`), a word from a query (`kept`), or a token. `at_s` is by
+    the steady clock. The payload of a token is empty if the token was withdrawn."""
 
     kind: Literal["said", "kept", "token"]
     key: str
@@ -33,11 +33,12 @@ class Came:
 
 
 class Words:
-    """Of the vehicles that an expression names. Callbacks run on Zenoh's threads, and wait for nothing."""
+    """Last words of the vehicles that an expression names. Callbacks run on Zenoh's threads and do not wait."""
 
     def __init__(self, session: zenoh.Session, of_tokens: zenoh.Session, keys: Keys, timeout_s: float) -> None:
-        """`keys.vehicle` may be `*`. Tokens come in a session of their own: each stays in its tables, which every word
-        that came in the same session would be held against (1 ms of processor for a word, with 10,000 vehicles)."""
+        """`keys.vehicle` may be `*`. Tokens need a separate session: each stays in the session's tables, and every word
+        that came in the same session would be matched against them (1 ms of processor per word with 10,000
+        vehicles)."""
         self._session = session
         self._of_tokens = of_tokens
         self._keys = keys
@@ -46,10 +47,10 @@ class Words:
         self._lock = threading.Lock()
         self._refused: Counter[str] = Counter()
         self.told = threading.Event()
-        """Set when all have answered that were asked at the beginning, or their time is up."""
+        """Set when everybody has answered the query at the beginning, or its time is up."""
 
     def take(self) -> Iterator[Came]:
-        """What has come and waits, at most as much as may."""
+        """The words and tokens that wait, at most `WAITING`."""
         for _ in range(WAITING):
             try:
                 yield self._waiting.get_nowait()
@@ -57,25 +58,25 @@ class Words:
                 return
 
     def refused(self) -> Counter[str]:
-        """What was not taken since the last call, by cause."""
+        """Number of words lost or refused since the last call, by cause."""
         with self._lock:
             refused, self._refused = self._refused, Counter()
         return refused
 
     def ask(self, vehicle: str, pair: str) -> None:
-        """For the word of one pair, of whoever has it; what is answered comes as what was kept."""
+        """Query the word of one pair from whoever has it; the answer comes as `kept`."""
         self._get(Keys(self._keys.prefix, vehicle).last(pair), threading.Event())
 
     @property
     def is_connected(self) -> bool:
-        """Whether a router is there now."""
+        """Whether the session is connected to a router now."""
         return bool(list(self._session.info.routers_zid()))
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Hear what is said, see who is there, and ask once what was said before."""
+        """Inside the block: receive published words and tokens, and query once for earlier words."""
         with ExitStack() as stack:
             said = zenoh.handlers.Callback(self._said, indirect=False)
             stack.callback(self._session.declare_subscriber(self._keys.last("*"), said).undeclare)
