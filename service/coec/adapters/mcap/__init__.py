@@ -1,1 +1,1 @@
-"""MCAP files: windows, bags, what both have in common."""
+"""MCAP files: windows, bags, and what both have in common."""

@@ -1,4 +1,5 @@
-"""All frames of a recording as one ROS 2 bag (MCAP, profile `ros2`): for other tools, and to read back as a source."""
+"""Writes all frames of a recording as one ROS 2 bag (MCAP, profile `ros2`), for other tools and as a source for
+coec."""
 
 from __future__ import annotations
 
@@ -23,13 +24,13 @@ def write_bag(
     heard: Callable[[Frame], None],
     beside: Callable[[Frame], Iterable[tuple[str, str, bytes]]] = _nothing,
 ) -> None:
-    """Writes the frames below `/<pair>/` with the camera info of each image and one `/tf_static`.
+    """Writes the frames on topics below `/<pair>/`, with the camera info of each image and one `/tf_static`.
 
     Args:
-        T_camera_lidar: (4, 4), what `/tf_static` says.
+        T_camera_lidar: (4, 4), the transform in `/tf_static`.
         frames: in the order in which they are written; depth maps are left out.
-        heard: told of each frame.
-        beside: further messages (topic, type, CDR) at the stamp of a frame.
+        heard: called after each frame.
+        beside: further messages (topic, type, CDR) to write at the stamp of a frame.
 
     Raises:
         OSError: the file cannot be written.
@@ -47,7 +48,7 @@ def write_bag(
 
 
 def write_messages(path: Path, items: Iterable[TopicMessage]) -> None:
-    """Writes messages in their order.
+    """Writes messages in the given order.
 
     Raises:
         OSError: the file cannot be written.

@@ -1,7 +1,7 @@
-"""Writing MCAP in which each chunk is compressed or not, by what is in it: clouds shrink, encoded images do not.
+"""An MCAP writer that decides for each chunk whether to compress it: clouds shrink, encoded images do not.
 
-The writer of the `mcap` package compresses every chunk of a file or none, and copies each message three times; records
-other than messages and chunks are its own (MCAP specification, "Records").
+The writer of the `mcap` package compresses either all chunks of a file or none, and copies each message three times. So
+messages and chunks are written here; the other records are those of the package (MCAP specification, "Records").
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PROFILE = "ros2"
 LIBRARY = f"coec/{__version__}"
 
 CHUNK_BYTES = 64 * 1024
-"""A chunk is closed at the first message past this size, if it was not before: what is in memory stays small."""
+"""A chunk is closed at the latest by the first message past this size, so that little is held in memory."""
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -38,7 +38,7 @@ _FOOTER_BYTES = 20
 
 @dataclass(slots=True)
 class _Chunk:
-    """The chunk that is being filled: records as they will lie in it, and where its messages begin."""
+    """The chunk that is being filled: its records in order, and the offsets of its messages."""
 
     packed: bool
     parts: list[bytes] = field(default_factory=list)
@@ -60,8 +60,7 @@ class _Chunk:
 
 
 class ChunkWriter:
-    """Writes one file, front to back, into a stream that is at its beginning. Nothing in it tells when it was
-    written."""
+    """Writes one file, front to back, into a stream at its beginning. The file does not hold the time of writing."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -80,7 +79,7 @@ class ChunkWriter:
         self._write(_bytes_of([records.Header(PROFILE, LIBRARY)]))
 
     def channel(self, topic: str, encoding: str, schema: Schema | None, metadata: Mapping[str, str]) -> int:
-        """The number of a new channel. Without a `schema` its messages describe themselves."""
+        """Adds a channel and returns its number. Without a `schema` its messages describe themselves."""
         key = None if schema is None else (schema.name, schema.encoding, schema.data)
         if key is not None and key not in self._schemas:
             name, schema_encoding, data = key
@@ -99,7 +98,7 @@ class ChunkWriter:
         return channel.id
 
     def message(self, channel_id: int, stamp_ns: int, sequence: int, data: bytes, *, packed: bool) -> None:
-        """Adds a message, to a chunk that is compressed (lz4) if it is to be `packed`."""
+        """Adds a message; if `packed`, to a chunk that is compressed (lz4)."""
         if self._chunk is not None and self._chunk.packed is not packed:
             self.close_chunk()
         if self._chunk is None:
@@ -115,7 +114,7 @@ class ChunkWriter:
             self.close_chunk()
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Adds an attachment, dated 0: it belongs to no instant."""
+        """Adds an attachment with time 0, as it belongs to no instant."""
         self.close_chunk()
         at = self._at
         attachment = records.Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
@@ -139,7 +138,7 @@ class ChunkWriter:
         self._metadata.append(records.MetadataIndex(offset=at, length=self._at - at, name=name))
 
     def close_chunk(self) -> None:
-        """Writes what waits: what was added so far can be read whatever comes later."""
+        """Writes the open chunk, so that everything added so far can be read whatever happens later."""
         chunk, self._chunk = self._chunk, None
         if chunk is None:
             return
@@ -177,7 +176,7 @@ class ChunkWriter:
         )
 
     def finish(self) -> None:
-        """Writes the index, and the end."""
+        """Writes the index and the end of the file."""
         self.close_chunk()
         self._write(_bytes_of([records.DataEnd(self._crc)]))
         at, summary, offsets = self._at, b"", list[records.McapRecord]()
@@ -224,5 +223,5 @@ def _bytes_of(group: Sequence[records.McapRecord]) -> bytes:
     builder = RecordBuilder()
     for record in group:
         record.write(builder)
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]  # mcap leaves the result open
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]  # mcap does not annotate the result
     return data

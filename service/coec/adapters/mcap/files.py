@@ -1,7 +1,7 @@
-"""Reading MCAP that nobody vouches for: every length is checked before it is used, every CRC that is there is verified.
+"""A reader for untrusted MCAP: every length is checked before it is used, and every CRC in the file is verified.
 
-The readers of the `mcap` package hand out short reads as if they were whole and unpack whatever a chunk promises (a
-9.8 kB file can become 600 MB), so records are taken apart here (MCAP specification, "Records"). Writing is theirs.
+The readers of the `mcap` package return short reads as if they were whole, and unpack whatever a chunk promises (a 9.8
+kB file can become 600 MB). So this module parses the records itself (MCAP specification, "Records").
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from coec.errors import CoecError
 MAGIC = b"\x89MCAP0\r\n"
 
 MAX_CHUNK_BYTES = 256 * 2**20
-"""Unpacked size of one chunk. Writers use 0.75 to 4 MiB, or one message more, and messages have up to
-some 32 MiB."""
+"""Largest unpacked size of one chunk. Writers use 0.75 to 4 MiB plus at most one message, and messages have up to some
+32 MiB."""
 
 MAX_RATIO = 1000
-"""Of unpacked to packed bytes of a whole recording, beyond one chunk's; JPEG images and clouds get 1 to 20."""
+"""Largest ratio of unpacked to packed bytes of a whole recording, apart from one chunk; JPEG images and clouds have 1
+to 20."""
 
 MAX_ZSTD_WINDOW = 2**27
-"""128 MiB, the default limit of the zstd tool: bounds the memory of a decompression."""
+"""128 MiB, the default limit of the zstd tool; it bounds the memory of a decompression."""
 
 _PREFIX = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -40,10 +41,10 @@ _TAIL_BYTES = _PREFIX.size + _FOOTER.size + len(MAGIC)
 
 
 class McapDamaged(CoecError):  # noqa: N818 - caught by name where it becomes a SourceError or a WindowError
-    """The file is not MCAP, is cut off, or a CRC does not agree; the message begins with the byte.
+    """The file is not MCAP, is cut off, or a CRC is wrong; the message begins with the offset of the byte.
 
     Attributes:
-        is_mcap: whether it begins as one: then something of it may be whole.
+        is_mcap: whether the file begins like MCAP, so that parts of it may be whole.
     """
 
     def __init__(self, message: str, *, is_mcap: bool = True) -> None:
@@ -51,7 +52,7 @@ class McapDamaged(CoecError):  # noqa: N818 - caught by name where it becomes a 
         self.is_mcap = is_mcap
 
     def of(self, path: Path) -> str:
-        """What it says of a recording, whoever recorded it, and what helps."""
+        """The error message for a recording, with the path and what helps."""
         if not self.is_mcap:
             return f"{path} is no MCAP file: {self}"
         return f"{path} is damaged: {self}. `mcap recover` saves what is whole"
@@ -84,8 +85,8 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message and where it lies: `chunk_at` is the file offset of its chunk record (None outside chunks), `at` the
-    offset of its data within the unpacked chunk (or the file)."""
+    """A message and its place: `chunk_at` is the file offset of its chunk record (None outside of chunks), `at` the
+    offset of its data within the unpacked chunk (or within the file)."""
 
     channel_id: int
     sequence: int
@@ -116,17 +117,17 @@ Record = Schema | Channel | Message | Attachment | Metadata
 
 
 def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> Iterator[Record]:
-    """The records of the data section in the order of the file, those of chunks among them.
+    """The records of the data section in the order of the file, including those in chunks.
 
-    What was yielded before the error is sound by itself, which is what salvaging a cut file relies on. Only a file that
-    is read to the end is known to be whole.
+    Records yielded before an error are sound, which salvaging a cut file relies on. Only a file that is read to the end
+    is known to be whole.
 
     Args:
         stream: positioned at the start of the file, seekable.
         max_unpacked_bytes: bound on all chunks together, for readers that keep what they are given.
 
     Raises:
-        McapDamaged: not MCAP, cut off, a CRC or a length that does not agree, or a chunk that would unpack to more than
+        McapDamaged: not MCAP, cut off, a wrong CRC or length, or a chunk that would unpack to more than
             `MAX_CHUNK_BYTES`.
     """
     size = _size(stream)
@@ -161,7 +162,8 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
 
 
 class MessageReader:
-    """Reads messages again by their place; keeps the chunk it unpacked last, so that reading in order unpacks once."""
+    """Reads messages again by their place. It keeps the last unpacked chunk, so that reading in order unpacks each
+    chunk once."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -173,7 +175,7 @@ class MessageReader:
         """The data of the message that `read_records` found at this place.
 
         Raises:
-            McapDamaged: the file is no longer what it was.
+            McapDamaged: the file has changed.
         """
         if chunk_at is None:
             self._stream.seek(at)
@@ -190,10 +192,10 @@ class MessageReader:
 
 
 def read_attachment(path: Path, name: str) -> bytes | None:
-    """The last attachment of that name, found by the index at the end of the file, or None when there is none.
+    """The last attachment with a name, found by the index at the end of the file; None if there is none.
 
     Raises:
-        McapDamaged: the file is cut off, or index or attachment are damaged.
+        McapDamaged: the file is cut off, or the index or the attachment is damaged.
         OSError: the file cannot be read.
     """
     with path.open("rb") as stream:
@@ -224,7 +226,7 @@ def read_attachment(path: Path, name: str) -> bytes | None:
 
 
 def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
-    """The summary section, its CRC verified, and where it begins. Empty when there is none."""
+    """The summary section, with verified CRC, and where it begins; empty if there is none."""
     if size < len(MAGIC) + _TAIL_BYTES:
         if size == 0:
             raise McapDamaged("it is empty", is_mcap=False)
@@ -251,7 +253,7 @@ def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
 
 
 def _check_summary(stream: BinaryIO, at: int, size: int) -> None:
-    """After the data section: a summary that begins right here (or none), a footer, and nothing behind it."""
+    """Checks what follows the data section: a summary that begins right here (or none), a footer, and nothing else."""
     _, summary_at = _summary(stream, size)
     if summary_at != at:
         raise McapDamaged(f"byte {at}: {summary_at - at} bytes between the data and the summary belong to neither")
@@ -274,7 +276,7 @@ def _chunk_records(chunk: bytes, chunk_at: int) -> Iterator[Record]:
 
 
 def _parse(opcode: int, body: bytes, at: int, chunk_at: int | None) -> Iterator[Record]:
-    """None or one record; those that only repeat others (indexes, statistics) are passed over."""
+    """Yields the record, or nothing for records that only repeat others (indexes, statistics)."""
     cursor = _Cursor(body, at if chunk_at is None else chunk_at)
     match opcode:
         case Opcode.MESSAGE:
@@ -315,7 +317,7 @@ def _unpack_chunk(body: bytes, at: int) -> bytes:
             case "lz4":
                 data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=promised + 1)
             case "zstd":
-                # `decompress` trusts the size in the frame; the stream reader makes no more than it is asked for.
+                # `decompress` trusts the size in the frame; the stream reader unpacks no more than requested.
                 reader = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW).stream_reader(
                     packed, read_across_frames=True
                 )
@@ -337,7 +339,7 @@ def _size(stream: BinaryIO) -> int:
 
 
 def _read(stream: BinaryIO, count: int, at: int, size: int) -> bytes:
-    """Exactly `count` bytes; nothing is allocated for what is not there."""
+    """Exactly `count` bytes; checks that they exist before allocating memory."""
     if at + count > size:
         raise McapDamaged(f"byte {size}: the file is cut off ({at + count - size} bytes are missing here)")
     data = stream.read(count)
@@ -347,7 +349,7 @@ def _read(stream: BinaryIO, count: int, at: int, size: int) -> bytes:
 
 
 class _Cursor:
-    """Walks through a record; every step is checked against its end."""
+    """Walks through a record and checks every step against its end."""
 
     def __init__(self, body: bytes, at: int) -> None:
         self._body = body
@@ -361,7 +363,7 @@ class _Cursor:
 
     @property
     def left(self) -> int:
-        """Bytes that remain."""
+        """Remaining bytes."""
         return len(self._body) - self._offset
 
     def take(self, count: int) -> bytes:
@@ -376,19 +378,19 @@ class _Cursor:
         return layout.unpack(self.take(layout.size))
 
     def blob(self, length: str) -> bytes:
-        """Bytes after their length."""
+        """The next bytes, preceded by their length."""
         (count,) = self.unpack(struct.Struct(length))
         return self.take(count)
 
     def text(self) -> str:
-        """UTF-8 after its length in 32 bits."""
+        """The next text, UTF-8 preceded by its length in 32 bits."""
         try:
             return self.blob("<I").decode("utf-8")
         except UnicodeDecodeError as error:
             raise McapDamaged(f"byte {self._start}: a name is not UTF-8") from error
 
     def pairs(self) -> dict[str, str]:
-        """Keys and values after the length of all of them."""
+        """The next keys and values, preceded by their total length."""
         inside, values = _Cursor(self.blob("<I"), self._start), dict[str, str]()
         while inside.left:
             key = inside.text()

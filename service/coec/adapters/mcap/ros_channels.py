@@ -1,5 +1,5 @@
-"""How a topic of ROS 2 lies in an MCAP file: its definition, the quality of service that players ask for, and whether
-its messages shrink."""
+"""ROS 2 topics as channels of an MCAP file: type definition, quality of service for players, and whether messages
+shrink when compressed."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from coec.errors import RecordingError
 CDR = "cdr"
 
 QOS = "offered_qos_profiles"
-"""In the metadata of a channel: required by the profile `ros2`. Without it `ros2 bag play` offers `/tf_static` to
-nobody who comes later."""
+"""Key in the metadata of a channel, required by the profile `ros2`. Without it `ros2 bag play` does not offer
+`/tf_static` to late subscribers."""
 
 MAX_STAMP_NS = 2**31 * 1_000_000_000
-"""ROS 2 time has signed 32-bit seconds."""
+"""End of ROS 2 time, which has signed 32-bit seconds."""
 
 SHRINK = frozenset({messages.POINT_CLOUD, messages.IMAGE})
-"""Types whose messages lz4 makes smaller: clouds by a tenth, raw images by more. Encoded images it makes no smaller."""
+"""Types whose messages lz4 makes smaller: clouds by a tenth, raw images by more. Encoded images do not shrink."""
 
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
-"""What rosbag2 writes where there is no deadline."""
+"""What rosbag2 writes if there is no deadline."""
 
 
 def check_stamp(stamp_ns: int) -> None:
-    """Whether a message can carry it.
+    """Checks that a ROS message can carry a stamp.
 
     Raises:
         RecordingError: it cannot.
@@ -47,19 +47,19 @@ class RosChannel:
 
     @property
     def schema(self) -> Schema:
-        """The definition of the type, as readers that do not know it need it."""
+        """The definition of the type, for readers that do not know it."""
         return _schema(self.type_name)
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """The quality of service that the topic is played with."""
+        """The quality of service with which the topic is to be played."""
         return {QOS: _qos_text(self.topic)}
 
 
 @lru_cache(maxsize=64)
 def _qos_text(topic: str) -> str:
-    """As rosbag2 writes it up to version 8 of its metadata, in numbers: so it is read where no `metadata.yaml` says
-    another version (`rmw_qos_*_policy_t` of rmw/types.h; rosbag2_storage/qos.cpp)."""
+    """The quality of service in numbers, as rosbag2 writes it up to version 8 of its metadata. Readers assume that
+    version unless a `metadata.yaml` gives another (`rmw_qos_*_policy_t` of rmw/types.h; rosbag2_storage/qos.cpp)."""
     qos = qos_of(topic)
     return "\n".join(
         (

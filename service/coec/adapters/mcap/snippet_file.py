@@ -1,7 +1,7 @@
-"""Snippets on disk: what a pair's sensors sent around an event, a ROS 2 bag of one file as `bag_writer` writes it.
+"""Snippets on disk: the frames of a pair's sensors around an event, as a one-file ROS 2 bag like that of `bag_writer`.
 
-It has no `rig.json`, by which windows are known: it is read as a bag, its rig from camera info and `/tf_static`. What
-happened is in the metadata `coec_snippet`.
+A snippet has no `rig.json`, which marks windows, so that it is read as a bag, with its rig from camera info and
+`/tf_static`. The metadata `coec_snippet` say what happened.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from coec.errors import WindowError
 METADATA = "coec_snippet"
 
 SYNC_BYTES = 4 * 2**20
-"""Put on the disk at once: what a killed recorder loses at most, beside the message under way."""
+"""Bytes after which the file is synced. A killed recorder loses at most this much, and the message being written."""
 
 
 class SnippetFile:
-    """Records one snippet, frame by frame. After a `RecordingError` the file is gone and the writer of no more use.
+    """Records one snippet, frame by frame. After a `RecordingError` the file is gone and the writer unusable.
 
     Attributes:
-        frames: how many it holds.
+        frames: number of frames in the file.
     """
 
     def __init__(
@@ -40,9 +40,9 @@ class SnippetFile:
         Args:
             path: the name after `finish`.
             rig: of the pair.
-            T_camera_lidar: (4, 4), what `/tf_static` says.
+            T_camera_lidar: (4, 4), the transform in `/tf_static`.
             metadata: what happened.
-            packed: compress what shrinks by it.
+            packed: compress messages that shrink.
 
         Raises:
             RecordingError: the file cannot be written.
@@ -84,8 +84,8 @@ class SnippetFile:
 
 
 def salvage_snippet(part_path: Path, progress: Callable[[], None]) -> FinishedFile | None:
-    """Makes a snippet of what a killed recorder left behind, and removes the `.part` file; None when no message of it
-    is whole (or when it was finished after all). `progress` is called after every message.
+    """Makes a snippet of the `.part` file that a killed recorder left behind, and removes that file. None if no message
+    in it is whole, or if the snippet was finished after all. `progress` is called after every message.
 
     Raises:
         RecordingError: it could not be written; the `.part` file is still there.
@@ -106,7 +106,7 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None], *, pac
     messages = 0
     file = WholeFile(beside(final, REWRITE_SUFFIX), final, packed=packed)
     try:
-        # The error that ends the file also ends the loop; whatever came before it was sound.
+        # The error at the damaged end of the file ends the loop; everything before it is sound.
         with suppress(McapDamaged), part_path.open("rb") as stream:
             for record in read_records(stream):
                 match record:
@@ -138,10 +138,10 @@ def _copy(message: Message, file: WholeFile, schemas: Mapping[int, Schema], chan
 
 
 def metadata_of(path: Path) -> dict[str, str]:
-    """What a snippet says of itself; empty where it says nothing.
+    """The metadata `coec_snippet` of a snippet; empty if it has none.
 
     Raises:
-        WindowError: damaged at its beginning.
+        WindowError: the file is damaged at its beginning.
         OSError: it cannot be read.
     """
     try:

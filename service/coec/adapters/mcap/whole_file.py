@@ -1,4 +1,4 @@
-"""An MCAP file that is there as a whole, or not at all."""
+"""MCAP files that appear completely written or not at all."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from coec.errors import RecordingError
 
 @dataclass(frozen=True, slots=True)
 class FinishedFile:
-    """What became of it. `sha256` is hexadecimal and of the whole file; `bytes` and `modified_ns` (what the file system
-    says of the last write) tell this version of the file from a later one."""
+    """A finished file. `sha256` is hexadecimal, over the whole file; `bytes` and `modified_ns` (the file system's time
+    of the last write) distinguish this version of the file from a later one."""
 
     path: Path
     bytes: int
@@ -30,7 +30,7 @@ class FinishedFile:
 
 
 class _HashingFile(io.BufferedWriter):
-    """Hashes what passes: it is only ever appended."""
+    """Hashes all bytes written. It must only be appended to."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path, "wb"))
@@ -43,13 +43,13 @@ class _HashingFile(io.BufferedWriter):
 
 
 class WholeFile:
-    """An MCAP file that appears under its final name when it is complete and on the disk, or not at all."""
+    """An MCAP file that gets its final name only once it is complete and on the disk."""
 
     def __init__(self, temporary: Path, final: Path, *, packed: bool) -> None:
-        """Opens `temporary`, which becomes `final`; what shrinks is compressed if the file is to be `packed`.
+        """Opens `temporary`, which becomes `final`. If `packed`, messages that shrink are compressed.
 
         Raises:
-            RecordingError: the file cannot be written. So does everything below, and the temporary file is gone then.
+            RecordingError: the file cannot be written. All methods raise it; then the temporary file is gone.
         """
         self._temporary, self._final = temporary, final
         self._packed = packed
@@ -61,7 +61,7 @@ class WholeFile:
             self._mcap = ChunkWriter(self._file)
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Adds an attachment, dated 0: it belongs to no instant."""
+        """Adds an attachment with time 0, as it belongs to no instant."""
         with self._guarded():
             self._mcap.attach(name, media_type, data)
 
@@ -71,7 +71,7 @@ class WholeFile:
             self._mcap.metadata(name, values)
 
     def ros(self, channel: RosChannel, stamp_ns: int, sequence: int, data: bytes) -> None:
-        """Adds a message of ROS."""
+        """Adds a ROS message."""
         self.message(channel.topic, CDR, channel.schema, channel.metadata, stamp_ns, sequence, data)
 
     def message(
@@ -84,7 +84,7 @@ class WholeFile:
         sequence: int,
         data: bytes,
     ) -> None:
-        """Adds a message of any kind; its channel is that of the first message on the topic."""
+        """Adds a message of any kind. The first message on a topic determines the topic's channel."""
         packed = self._packed and schema is not None and schema.name in SHRINK
         with self._guarded():
             if topic not in self._channels:
@@ -92,7 +92,7 @@ class WholeFile:
             self._mcap.message(self._channels[topic], stamp_ns, sequence, data, packed=packed)
 
     def sync(self) -> None:
-        """Puts what was added on the disk: a little at a time, so that the end of a window does not wait for it all."""
+        """Puts what was added on the disk. Called often, so that the end of a window need not wait for all of it."""
         with self._guarded():
             self._mcap.close_chunk()
             self._file.flush()
@@ -126,7 +126,7 @@ class WholeFile:
 
 @contextmanager
 def failing_as_recording_error(path: Path) -> Iterator[None]:
-    """What the disk refuses of a file is said in our words."""
+    """Turns an OSError about a file into a `RecordingError` with a clear message."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Windows on disk: one MCAP file each. Others import from here; `names`, what a file holds, is open to all."""
+"""Windows on disk: one MCAP file each. Import from this package; `names` may be imported directly, too."""
 
 from coec.adapters.mcap.windows.names import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX
 from coec.adapters.mcap.windows.reading import is_window, pairs_since, read_result, read_vehicle, read_window

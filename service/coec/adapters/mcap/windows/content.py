@@ -1,4 +1,4 @@
-"""What the records of a window say, taken one after the other."""
+"""The content of a window, collected from its records one after the other."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from coec.config import CalibrationConfig, LimitsConfig, describe
 from coec.errors import DecodeError, WindowError
 
 _LIMITS = LimitsConfig(max_message_bytes=2**30, max_image_pixels=2**30, max_points=2**30)
-"""The frames passed the limits of the recording daemon, which may be wider than the defaults. Their bytes are in memory
-when they are looked at, images are not decoded here, and `reading.MAX_UNPACKED` bounds the whole."""
+"""Wide limits, because the frames passed those of the recording daemon, which may be wider than the defaults. Their
+bytes are in memory already, images are not decoded here, and `reading.MAX_UNPACKED` bounds the whole."""
 
 _FRAME_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY, messages.IMU)
 
 
 class Place(NamedTuple):
-    """Of a pair in the order in which we write: among those of the window, or among those between."""
+    """The index of a pair in writing order: among the pairs of the window, or among the thinned pairs between them."""
 
     between: bool
     order: int
@@ -33,7 +33,7 @@ class Place(NamedTuple):
 
 @dataclass(slots=True)
 class _Parts:
-    """What has been seen of one pair."""
+    """The parts of one pair that have been read so far."""
 
     camera: CameraFrame | None = None
     lidar: LidarFrame | None = None
@@ -48,7 +48,7 @@ class Content:
     Attributes:
         attachments: by name.
         metadata: what the window is.
-        kept: of which other window it holds pairs; empty: of none.
+        kept: which other window it holds pairs of; empty: none.
     """
 
     attachments: dict[str, bytes] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Content:
     parts: dict[Place, _Parts] = field(default_factory=dict)
 
     def take(self, record: Record) -> Place | None:
-        """Adds a record. Returns the place of the pair that it completes, else None."""
+        """Adds a record. Returns the place of the pair that it completes; None if it completes none."""
         match record:
             case Schema():
                 self.schemas[record.schema_id] = record
@@ -91,7 +91,7 @@ class Content:
             raise WindowError(f"{path}: {CONFIGURATION}: {describe(error)}") from error
 
     def pair(self, path: Path, place: Place) -> FramePair:
-        """Takes out the pair of this place."""
+        """Removes and returns the pair at a place."""
         parts = self.parts.pop(place)
         if parts.camera is None or parts.lidar is None:
             named = f"{'thinned ' if place.between else ''}pair {place.order}"

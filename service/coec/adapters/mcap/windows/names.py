@@ -1,4 +1,4 @@
-"""What the files of windows, and what is in them, are called."""
+"""Names of window files and of what they contain."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from pathlib import Path
 
 SUFFIX = ".mcap"
 PART_SUFFIX = ".part"
-"""Of a window that is being recorded; what is found at start can be salvaged."""
+"""Suffix of a window that is being recorded. A file with it that is found at start can be salvaged."""
 
 REWRITE_SUFFIX = ".tmp"
-"""Of a finished window that is being written again; found at start it is of no use, the original is still there."""
+"""Suffix of a finished window that is being rewritten. A file with it that is found at start is useless, because the
+original is still there."""
 
 RIG, CONFIGURATION, MASK, RESULT = "rig.json", "configuration.json", "mask.png", "result.json"
 """Attachments."""
@@ -17,11 +18,10 @@ RIG, CONFIGURATION, MASK, RESULT = "rig.json", "configuration.json", "mask.png",
 JSON = "application/json"
 
 METADATA, KEPT = "coec", "coec_kept"
-"""Metadata: what the window is, and of which other window it holds pairs."""
+"""Metadata records: what the window is, and which other window it holds pairs of."""
 
 PACKING, LZ4 = "packing", "lz4"
-"""Among the metadata: how chunks are compressed that shrink; empty: not at all. Whoever writes the window again does
-the same."""
+"""Entry of the metadata: compression of the chunks that shrink; empty: none. Rewriting a window keeps it."""
 
 IMAGE, COMPRESSED, DEPTH = "camera/image", "camera/image/compressed", "camera/depth/compressed"
 POINTS, CAMERA_INFO, RESULT_TOPIC, OVERLAY = "lidar/points", "camera/camera_info", "result", "overlay"
@@ -29,22 +29,22 @@ ODOMETRY, IMU = "odometry", "imu"
 """Topics below `/coec/<pair>/`."""
 
 BETWEEN = "between/"
-"""Below it the sweep, ego-motion and image of the thinned pairs, as above."""
+"""Below it are the topics for sweep, ego-motion and image of the thinned pairs."""
 
 BETWEEN_IMAGE = BETWEEN + "image/compressed"
-"""Their images are compressed, whatever the camera sends."""
+"""The images of thinned pairs are compressed, whatever the camera sends."""
 
 
 def topic(pair: str, name: str) -> str:
-    """One of these, of a pair."""
+    """The full topic of a pair for one of these names."""
     return f"/coec/{pair}/{name}"
 
 
 def is_between(topic: str) -> bool:
-    """Whether a topic is one of the thinned pairs. A pair may have any name."""
+    """Whether a topic belongs to the thinned pairs. Only the fourth part counts, as a pair may have any name."""
     return topic.split("/")[3:4] == [BETWEEN.rstrip("/")]
 
 
 def beside(path: Path, suffix: str) -> Path:
-    """The name of a file and this suffix."""
+    """The path with a suffix added to the file name."""
     return path.with_name(path.name + suffix)

@@ -1,4 +1,4 @@
-"""Reading windows: whole, pair by pair, or no more than their result."""
+"""Reads windows: completely, pair by pair, or only their result."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from coec.schemas.base import from_json
 from coec.schemas.replies import CalibrationResult
 
 MAX_UNPACKED = 64
-"""A window unpacks to at most this many times its size (plus `CHUNK_BYTES`). Images and clouds do not shrink to a
-sixtieth, however a tool compresses them."""
+"""A window may unpack to at most this many times its size (plus `CHUNK_BYTES`). No tool compresses images and clouds to
+a sixtieth."""
 
 
 def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
-    """The window exactly as it was recorded, and the configuration it was recorded for.
+    """The window exactly as it was recorded, and the configuration that it was recorded for.
 
     Raises:
-        WindowError: unreadable, cut off, damaged, not a window of ours, or without a pair.
+        WindowError: unreadable, cut off, damaged, not a window of coec, or without a pair.
     """
     content = Content()
     size = _size(path)
@@ -39,13 +39,13 @@ def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
     )
     if not pairs:
         raise WindowError(f"{path} holds no camera-LiDAR pair")
-    # The service began it at the extrinsic in use.
+    # The service began the window at the extrinsic in use, which is off by about `MOUNT_RAD`.
     window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD, between)
     return window, content.parsed_configuration(path)
 
 
 def pairs_since(path: Path, since_ns: int) -> Iterator[FramePair]:
-    """The pairs of a window from a stamp on, in the order in which they are in its file, one at a time in memory.
+    """The pairs of a window from a stamp on, in the order of the file; holds one at a time in memory.
 
     Raises:
         WindowError: unreadable, cut off or damaged.
@@ -61,7 +61,7 @@ def pairs_since(path: Path, since_ns: int) -> Iterator[FramePair]:
 
 
 def read_result(path: Path) -> CalibrationResult | None:
-    """The result that was written into a window, None when it has none. Does not read the frames.
+    """The result that was written into a window; None if it has none. Does not read the frames.
 
     Raises:
         WindowError: unreadable, cut off or damaged.
@@ -76,7 +76,7 @@ def read_result(path: Path) -> CalibrationResult | None:
 
 
 def read_vehicle(path: Path) -> str:
-    """The vehicle that recorded a window, empty where the window does not say. Does not read the frames.
+    """The vehicle that recorded a window; empty if the window does not say. Does not read the frames.
 
     Raises:
         WindowError: unreadable or damaged at its beginning.
@@ -85,7 +85,7 @@ def read_vehicle(path: Path) -> str:
 
 
 def metadata_of(path: Path) -> dict[str, str]:
-    """What a window says of itself before its first message; empty where it says nothing.
+    """The metadata `coec` of a window, from before its first message; empty if there are none.
 
     Raises:
         WindowError: unreadable or damaged at its beginning.
@@ -100,10 +100,10 @@ def metadata_of(path: Path) -> dict[str, str]:
 
 
 def is_window(path: Path) -> bool:
-    """Whether a sound MCAP file is a window of ours. Does not read the frames.
+    """Whether a sound MCAP file is a window of coec. Does not read the frames.
 
     Raises:
-        SourceError: unreadable, cut off or damaged, so that nobody can tell.
+        SourceError: unreadable, cut off or damaged, so that it cannot be decided.
     """
     try:
         return read_attachment(path, RIG) is not None
@@ -114,7 +114,7 @@ def is_window(path: Path) -> bool:
 
 
 def records_of(path: Path, max_unpacked_bytes: int | None = None) -> Iterator[Record]:
-    """The records of a window's file; what came before an error is sound.
+    """The records of a window's file; those before an error are sound.
 
     Raises:
         WindowError: unreadable, cut off or damaged.

@@ -1,4 +1,4 @@
-"""A window written again, with its result."""
+"""Rewrites a window with its result."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from coec.schemas.ros_names import DIAGNOSTICS
 
 
 def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | None = None) -> RecordedWindow:
-    """Writes the window again with its result (an earlier one is replaced): as `/diagnostics`, JSON message and
-    attachment, and a picture of the points at the result, if there is one. The file is replaced at once; a reader sees
-    the one or the other. The pairs between those of the window stay where the result says that the camera moved, as it
-    took its time from them.
+    """Rewrites the window with its result (an earlier one is replaced): as `/diagnostics`, as JSON message and as
+    attachment, plus a picture of the points at the result if there is one. The file is replaced atomically, so that a
+    reader sees either version. The thinned pairs between those of the window stay only if the result says that the
+    camera moved, because they determined when.
 
     Raises:
         WindowError: the window is damaged.
-        RecordingError: it could not be written; the file is as it was.
+        RecordingError: it could not be written; then the file is unchanged.
     """
     packed = metadata_of(path).get(PACKING) == LZ4
     file = WholeFile(beside(path, REWRITE_SUFFIX), path, packed=packed)
@@ -62,7 +62,8 @@ def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | No
 
 
 def _copy(path: Path, file: WholeFile, leave_out: Callable[[str], bool]) -> tuple[str, int]:
-    """Copies a window record by record, without some topics and the result; returns its id and number of pairs."""
+    """Copies a window record by record, without its result and the topics to leave out. Returns its id and number of
+    pairs."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     window_id, pairs = path.name.removesuffix(SUFFIX), 0
@@ -97,5 +98,5 @@ def _copy(path: Path, file: WholeFile, leave_out: Callable[[str], bool]) -> tupl
 
 
 def _diagnostics(result: CalibrationResult) -> bytes:
-    """The verdict with its figures, as ROS tools show it."""
+    """The verdict with its figures, for ROS tools."""
     return outgoing.encode_diagnostics(result.data_stamp_ns, [diagnostics.of_result(result)])

@@ -1,4 +1,4 @@
-"""`rig.json` of a window: the rig, and with it what else belongs to the window but is no message."""
+"""`rig.json` of a window: the rig, the extrinsic at the start, and the window's id."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _RigAttachment(BaseModel):
 
 
 def encoded(rig: Rig, T_camera_lidar_start: Matrix4, window_id: str) -> bytes:
-    """The attachment; the mask of the rig is another."""
+    """The attachment, without the rig's mask, which is a separate one."""
     start = matrix_rows(T_camera_lidar_start)
     return to_json(_RigAttachment(window_id=window_id, T_camera_lidar_start=start, rig=rig_to_json(rig)))
 
@@ -34,7 +34,7 @@ def decoded(path: Path, data: bytes, mask_png: bytes | None) -> tuple[Rig, Matri
     """Rig, extrinsic at the start (4, 4) and window id of the window at `path`.
 
     Raises:
-        WindowError: the attachment is not what we write.
+        WindowError: the attachment is not valid.
     """
     try:
         document = _RigAttachment.model_validate_json(data)

@@ -1,4 +1,4 @@
-"""A window made of what a recorder left behind that did not come to its end."""
+"""Salvages the window of a recorder that was killed."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from coec.errors import WindowError
 
 
 def salvage(part_path: Path, progress: Callable[[], None]) -> RecordedWindow | None:
-    """Makes a window of what a killed recorder left behind, and removes the `.part` file.
+    """Makes a window from the `.part` file that a killed recorder left behind, and removes that file.
 
     Args:
         part_path: the `.part` file.
         progress: called after every pair.
 
     Returns:
-        The window with every pair that is whole, or None when there was none or the rig is lost (or when the window was
-        finished after all).
+        The window with every whole pair; None if there is none, if the rig is lost, or if the window was finished after
+        all.
 
     Raises:
         RecordingError: it could not be written; the `.part` file is still there.
@@ -40,7 +40,7 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> Rec
     content = Content()
     writer: WindowWriter | None = None
     try:
-        # The error that ends the file also ends the loop; whatever came before it was sound.
+        # The error at the damaged end of the file ends the loop; everything before it is sound.
         with suppress(WindowError):
             for record in records_of(part_path):
                 place = content.take(record)

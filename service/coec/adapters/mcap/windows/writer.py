@@ -1,21 +1,21 @@
 """Windows on disk: one MCAP file each (profile `ros2`, CDR), written so that a reader never sees half a file.
 
-Layout. First the attachments without which the rest means nothing (`rig.json`, `configuration.json`, `mask.png`), so
-that whatever is cut off behind them can be salvaged. Then pair by pair the sweep, ego-motion, depth map, camera info
-and image, each dated by its sensor and with the index of its pair as sequence number; the image comes last and
-completes the pair. `write_result` adds a picture (`overlay`), `/diagnostics`, the result as a JSON channel and as
-attachment `result.json`. Chunks end with the pairs, so that whatever was added is on the disk.
+Layout: first come the attachments that the rest depends on (`rig.json`, `configuration.json`, `mask.png`), so that a
+file that is cut off behind them can be salvaged. Then come, pair by pair, the sweep, ego-motion, depth map, camera info
+and image. Each has the stamp of its sensor and the index of its pair as sequence number; the image comes last and
+completes the pair. `write_result` adds a picture (`overlay`), `/diagnostics`, and the result as a JSON channel and as
+attachment `result.json`. Each pair ends a chunk, so that everything added is on the disk.
 
-A window may hold pairs of an earlier one that were kept for it. They come last, though they were taken first; the
-metadata `coec_kept` name the window that they are from. A reader sorts pairs by their stamps.
+A window may hold pairs of an earlier window that were kept for it. They come last, though they were taken first; the
+metadata `coec_kept` name that earlier window. A reader sorts pairs by their stamps.
 
-The thinned pairs between those of the window have topics and indices of their own; of these the image comes last,
-too. They are asked where the camera moved within the window: `write_result` leaves them out where it did not, which
-more than halves what is kept of most windows.
+The thinned pairs between those of the window have their own topics and indices; their image comes last, too. They tell
+when the camera moved within the window. `write_result` drops them if it did not move, which more than halves the size
+of most windows.
 
-The sender's own sequence numbers are not kept: the pairs of a window were chosen, so gaps between them mean nothing.
-Chunks of clouds and raw images are compressed if it is asked for, others never: encoded images shrink by nothing.
-Equal pairs give equal bytes: nothing in the file tells when or where it was written.
+The sender's sequence numbers are not kept, because the pairs of a window are a selection and gaps mean nothing. Chunks
+of clouds and raw images are compressed on request, other chunks never, because encoded images do not shrink. Equal
+pairs give equal bytes: nothing in the file tells when or where it was written.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ from coec.schemas.ros_names import TF_STATIC
 
 @dataclass(frozen=True, slots=True)
 class RecordedWindow:
-    """A finished file. `sha256` is hexadecimal and of the whole file, `pairs` their number. `bytes` and `modified_ns`
-    (what the file system says of the last write) tell this version of the file from a later one."""
+    """A finished window. `sha256` is hexadecimal, over the whole file; `pairs` is the number of pairs. `bytes` and
+    `modified_ns` (the file system's time of the last write) distinguish this version of the file from a later one."""
 
     path: Path
     window_id: str
@@ -72,12 +72,12 @@ class RecordedWindow:
 
     @classmethod
     def of(cls, file: FinishedFile, window_id: str, pairs: int) -> RecordedWindow:
-        """The window that is in a file."""
+        """The window in a finished file."""
         return cls(file.path, window_id, pairs, file.bytes, file.modified_ns, file.sha256)
 
 
 class WindowWriter:
-    """Records one window, pair by pair. After a `RecordingError` the file is gone and the writer of no more use."""
+    """Records one window, pair by pair. After a `RecordingError` the file is gone and the writer unusable."""
 
     def __init__(
         self,
@@ -91,16 +91,16 @@ class WindowWriter:
         packed: bool = False,
         temporary: Path | None = None,
     ) -> None:
-        """Opens `<path_final>.part` (or `temporary`) and writes what must not be lost.
+        """Opens `<path_final>.part` (or `temporary`) and writes the attachments.
 
         Args:
             path_final: `<folder>/<window_id>.mcap`, the name after `finish`; a file of that name is replaced.
             rig: of the pair.
-            T_camera_lidar_start: (4, 4) extrinsic that is current now, where the search will start.
+            T_camera_lidar_start: (4, 4) current extrinsic, where the search will start.
             window_id: of the window.
             configuration: with which the window will be calibrated.
-            metadata: what else a reader may want to know, for example `vehicle`. It becomes part of the bytes.
-            packed: compress what shrinks by it.
+            metadata: further facts for readers, for example `vehicle`. They become part of the bytes.
+            packed: compress messages that shrink.
 
         Raises:
             RecordingError: the file cannot be written.
@@ -117,7 +117,7 @@ class WindowWriter:
         self._file.sync()
 
     def note_kept(self, from_window_id: str, since_ns: int) -> None:
-        """The pairs that are added from now on are those of another window from a stamp on.
+        """Notes that the pairs added from now on come from another window, from stamp `since_ns` on.
 
         Raises:
             RecordingError: it could not be written; the `.part` file has been removed.
@@ -125,7 +125,7 @@ class WindowWriter:
         self.note_of_kept({"from_window": from_window_id, "since_ns": str(since_ns)})
 
     def note_of_kept(self, values: Mapping[str, str]) -> None:
-        """The same, in the words that were found in another file."""
+        """The same, with the metadata found in another file."""
         self._file.metadata(KEPT, values)
 
     def add(self, pair: FramePair) -> None:
@@ -152,7 +152,7 @@ class WindowWriter:
         self.pairs += 1
 
     def add_between(self, pair: FramePair) -> None:
-        """Appends a thinned pair, whose image is compressed. It is on the disk with the next one of the window.
+        """Appends a thinned pair, whose image is compressed. It is on the disk once the next pair of the window is.
 
         Raises:
             RecordingError: as for `add`.
@@ -197,6 +197,6 @@ class WindowWriter:
         return topic(self._rig.pair, name)
 
     def _cdr(self, topic_name: str, type_name: str, stamp_ns: int, data: bytes, index: int | None = None) -> None:
-        """A message of the pair of this index, or of the one that is being added."""
+        """Adds a message of the pair with this index; None: of the pair that is being added."""
         sequence = self.pairs if index is None else index
         self._file.ros(RosChannel(topic_name, type_name), stamp_ns, sequence, data)
