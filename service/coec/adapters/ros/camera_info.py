@@ -1,8 +1,8 @@
-"""`sensor_msgs/CameraInfo` to intrinsics: which lens an image topic was taken with.
+"""Converts `sensor_msgs/CameraInfo` to the intrinsics of an image topic.
 
-Which of a message's matrices hold depends on the topic: `K` and `d` belong to the image as the sensor gave it, `P` to
-the rectified one (the message's definition). Where a lens is not one of the models here, or what the message says is
-no calibration, it is refused by name: nobody calibrates against a guess.
+Which of the message's matrices apply depends on the topic: `K` and `d` belong to the image as the sensor gave it, `P`
+to the rectified one (the message's definition). A lens of an unknown model, or a message that is no calibration, is
+refused with a reason instead of guessing.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ from coec.geometry import cameras
 from coec.geometry.se3 import is_rigid, rotation_angle_rad, transform_from
 
 MAX_INFO_BYTES: Final = 16 * 1024
-"""Of a message: a frame id, the name of a model, 14 coefficients and 33 numbers have below 1 kB."""
+"""Largest message. A frame id, the name of a model, 14 coefficients and 33 numbers take less than 1 kB."""
 
 MAX_COEFFICIENTS: Final = 14
-"""Of `d`: OpenCV's fullest model."""
+"""Most coefficients in `d`, as in OpenCV's largest model."""
 
 TURNED_DEG: Final = 0.01
-"""A rectification that turns the camera less than this is none: a tenth of what a calibration is known to."""
+"""A rectification that turns the camera by less than this counts as none; a tenth of a calibration's uncertainty."""
 
 TRANSPORTS: Final = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")
 """What image_transport appends to the topic of an image."""
 
 MAX_SKEW_PX: Final = 0.01
-"""Of `K`: less moves no pixel."""
+"""Largest skew in `K`; less moves no pixel."""
 
 _POLYNOMIAL: Final = ("", "plumb_bob", "rational_polynomial")
-"""OpenCV's polynomials, told apart by their coefficients rather than by what they are called."""
+"""Names of OpenCV's polynomials, which are distinguished by their coefficients instead of these names."""
 
 _ALIASES: Final = {"fisheye": "equidistant", "ds": "double_sphere", "cata": "mei", "none": ""}
-"""Other names that are written: ROS 1's, Kalibr's, and those of catadioptric calibrations."""
+"""Other names in use: those of ROS 1, of Kalibr, and of catadioptric calibrations."""
 
 
 @dataclass(frozen=True, slots=True)
 class Info:
-    """What a `CameraInfo` says: `frame_id` of its header, `size` (width, height) of the full image, px; `d` (N,); `k`
+    """Content of a `CameraInfo`: `frame_id` of its header; `size` (width, height) of the full image, px; `d` (N,); `k`
     (9,), `r` (9,) and `p` (12,) by rows; `binning` (x, y), at least 1; `roi` (x, y, width, height), px."""
 
     frame_id: str
@@ -64,14 +64,14 @@ class Info:
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """Intrinsics, and in a few words which of the message's numbers they are."""
+    """Intrinsics, and a short text that says which of the message's numbers they come from."""
 
     intrinsics: CameraIntrinsics
     told: str
 
 
 def decode_info(payload: bytes) -> Info:
-    """What a message in CDR says.
+    """The content of a message in CDR.
 
     Raises:
         DecodeError: not a `CameraInfo`, or larger than one can be.
@@ -82,10 +82,10 @@ def decode_info(payload: bytes) -> Info:
 
 
 def info_of(message: Any) -> Info:
-    """What a deserialised `CameraInfo` says.
+    """The content of a deserialised `CameraInfo`.
 
     Raises:
-        DecodeError: a name or a list in it is longer than any that a driver writes.
+        DecodeError: a name or a list in it is longer than any driver writes.
     """
     if len(message.header.frame_id) > MAX_FRAME_ID or len(message.distortion_model) > MAX_FRAME_ID:
         raise DecodeError("frame_id_invalid", f"a name in a CameraInfo is longer than {MAX_FRAME_ID} characters")
@@ -107,8 +107,8 @@ def info_of(message: Any) -> Info:
 
 
 def info_topic(image_topic: str) -> str:
-    """Where the `CameraInfo` of an image topic lies by image_transport's rule: beside the image, whatever transport
-    carries it."""
+    """The topic of the `CameraInfo` for an image topic, by image_transport's rule: beside the image, for any
+    transport."""
     namespace, _, last = image_topic.rstrip("/").rpartition("/")
     if last in TRANSPORTS and namespace.strip("/"):
         namespace = namespace.rpartition("/")[0]
@@ -123,16 +123,16 @@ def is_rectified(image_topic: str) -> bool:
 
 
 def lens_of(info: Info, *, rectified: bool) -> Lens:
-    """The lens of an image in its raw or in its rectified form, of its size as it comes: `K` and `P` are those of the
-    full image, of which `roi` is cut out, which then is binned. Pixel centres lie at integers, so that binning by b
-    takes u to (u + 0.5)/b - 0.5.
+    """The lens of a raw or rectified image, at the size of the received image. `K` and `P` hold for the full image, of
+    which `roi` is cut out and then binned. Pixel centres lie at integers, so that binning by b takes u to
+    (u + 0.5)/b - 0.5.
 
-    A message with a rectifying rotation `R` leaves open whether its frame is that of the raw or of the rectified
-    image: it is taken for that of the image in question, and the angle is said.
+    A message with a rectifying rotation `R` does not say whether its frame is that of the raw or of the rectified
+    image. It is taken for the frame of the image in question, and `told` gives the angle.
 
     Raises:
-        SourceError: uncalibrated, of a model that is not known, numbers that no lens has, or a stereo camera's second
-            image, which is told in the frame of the first.
+        SourceError: uncalibrated, an unknown model, numbers that no lens has, or the second image of a stereo camera,
+            which is described in the frame of the first.
     """
     if not all(np.isfinite(values).all() for values in (info.d, info.k, info.r, info.p)):
         raise SourceError("a number in it is not finite")
@@ -159,7 +159,7 @@ def lens_of(info: Info, *, rectified: bool) -> Lens:
 
 
 _Parts = tuple[str, tuple[float, float, float, float], dict[str, float], str]
-"""Model; fx, fy, cx, cy; distortion; what is told of it."""
+"""Model; fx, fy, cx, cy; distortion; text that says where they come from."""
 
 
 def _rectified(info: Info) -> _Parts:
@@ -187,7 +187,7 @@ def _raw(info: Info) -> _Parts:
 
 
 def _polynomial(d: Sequence[float]) -> tuple[str, dict[str, float]]:
-    """The least of OpenCV's models that the coefficients need."""
+    """The smallest of OpenCV's models that has all non-zero coefficients."""
     if 0 < len(d) < 4:
         raise SourceError(f"plumb_bob has four or five coefficients, rational_polynomial eight, this camera {len(d)}")
     names = DISTORTION["rational"][1]
@@ -212,6 +212,6 @@ def _named(name: str, info: Info) -> tuple[str, dict[str, float]]:
 
 
 def _turned_deg(r: Sequence[float]) -> float:
-    """The angle of a rectifying rotation; 0 where none is given, or what is given is no rotation."""
+    """The angle of a rectifying rotation; 0 if none is given, or if the matrix is no rotation."""
     turn = transform_from(np.reshape(r, (3, 3)), np.zeros(3))
     return float(np.degrees(rotation_angle_rad(turn))) if is_rigid(turn) else 0.0

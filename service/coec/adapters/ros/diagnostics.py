@@ -1,4 +1,4 @@
-"""What `/diagnostics` says of a pair: the one mapping from health, or from a result, to ROS's levels and values."""
+"""The status of a pair in `/diagnostics`: the only mapping from health, or from a result, to ROS levels and values."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from coec.schemas.rig_state import SensorReply, SensorState
 from coec.schemas.ros_names import sensor_status_name, status_name
 
 Service = Literal["starting", "running", "stopping", "failing"]
-"""State of the whole service, as `status` tells it."""
+"""State of the whole service, as in `status`."""
 
 UNITS: Final = ("deg", "deg", "deg", "m", "m", "m")
 AXES: Final = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 MAX_MESSAGE: Final = 500
-"""Characters of the sentence that panels show in one line; the values hold every reason in full."""
+"""Most characters of the sentence, which panels show in one line; the values hold every reason in full."""
 
 
 class Level(IntEnum):
@@ -43,13 +43,13 @@ class Status:
 
 
 def hardware_id(vehicle: str, pair: str, serial: str | None) -> str:
-    """The camera's serial number; where nobody said it, the vehicle and the pair."""
+    """The camera's serial number, or vehicle and pair if there is none."""
     return serial or f"{vehicle}/{pair}"
 
 
 def level_of(health: HealthReply, service: Service) -> Level:
-    """That of the state (`replies.ROS_LEVELS`). Nothing is known any more of a pair that nobody renews, and nothing
-    will be of one whose service stops; a service that fails is an error whatever it last thought of the pair."""
+    """The level of the state (`replies.ROS_LEVELS`), with exceptions: STALE if the reply is no longer renewed or the
+    service stops, and at least ERROR if the service fails."""
     level = Level(ROS_LEVELS[health.state])
     if service == "stopping" or any(reason.code == replies.STUCK for reason in health.reasons):
         return Level.STALE
@@ -57,7 +57,7 @@ def level_of(health: HealthReply, service: Service) -> Level:
 
 
 def of_health(health: HealthReply, service: Service, serial: str | None, more: Mapping[str, str]) -> Status:
-    """The status of a pair now. `more` are values that health has none of."""
+    """The status of a pair now. `more` holds values that health does not have."""
     return Status(
         level_of(health, service),
         status_name(health.pair),
@@ -77,7 +77,7 @@ SENSOR_LEVELS: Final[Mapping[SensorState, Level]] = {
 
 
 def of_sensor(sensor: SensorReply, vehicle: str, service: Service) -> Status:
-    """The status of a sensor of a rig now. Nothing is known any more of one whose service stops."""
+    """The status of a sensor of a rig now; STALE if the service stops."""
     level = Level.STALE if service == "stopping" else SENSOR_LEVELS[sensor.state]
     text = ": ".join([sensor.state, *(reason.text for reason in sensor.reasons[:1])])
     values = {"state": sensor.state, "kind": sensor.kind, "pairs": ", ".join(sensor.pairs), "service": service}
@@ -94,7 +94,8 @@ def of_sensor(sensor: SensorReply, vehicle: str, service: Service) -> Status:
 
 
 def of_result(result: CalibrationResult) -> Status:
-    """The status that a window's file carries: accepted is what a healthy pair is, failed what a degraded one is."""
+    """The status in a window's file: an accepted result has the level of a healthy pair, a failed one that of a
+    degraded pair."""
     reasons = result.verdict.reasons
     return Status(
         Level(ROS_LEVELS["degraded" if reasons else "healthy"]),
@@ -106,14 +107,14 @@ def of_result(result: CalibrationResult) -> Status:
 
 
 def _message(health: HealthReply, service: Service) -> str:
-    """The state and why, in one line."""
+    """The state and its reasons in one line."""
     told = health.state if service in ("starting", "running") else f"{health.state}, service {service}"
     text = ": ".join([told, *(["; ".join(reason.text for reason in health.reasons)] if health.reasons else [])])
     return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE - 1]}…"
 
 
 def _values(health: HealthReply) -> dict[str, str]:
-    """Everything that health holds, a line each; what is not known is left out."""
+    """Everything that health holds, one value each; unknown values are left out."""
     values = {"state": health.state, "since_ns": str(health.since_ns)}
     values |= {f"reason {reason.code}": reason.text for reason in health.reasons}
     values |= {f"need {number}": need for number, need in enumerate(health.needs, 1)}

@@ -1,4 +1,4 @@
-"""What a service is on a vehicle that speaks ROS 2."""
+"""Chooses how the service speaks to ROS 2 on a vehicle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coec.schemas.ros_names import NODE, ros_name
 
 
 def dialect_of(config: Config, session: str) -> Dialect | None:
-    """How a session of this Zenoh id, hexadecimal, speaks to the vehicle's ROS; None where there is none."""
+    """The dialect of a session with this Zenoh id, hexadecimal, towards the vehicle's ROS; None without ROS."""
     match config.middleware:
         case "rmw_zenoh":
             return RmwZenoh(Node(config.ros.domain, session, 0, f"/{ros_name(config.vehicle)}", NODE), type_hash)

@@ -1,4 +1,4 @@
-"""What stands ahead of the data in a message of CDR, read with bounds before a decoder builds anything from it."""
+"""Reads what precedes the data in a CDR message, with bounds, before a decoder builds anything from it."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from coec.adapters.frames.incoming import MAX_FRAME_ID, Refusal
 from coec.errors import DecodeError
 
 MAX_CLOUD_FIELDS: Final = 64
-"""Drivers write up to about a dozen. Each would become a Python object."""
+"""Most fields of a cloud; drivers write up to about a dozen. The limit exists because each becomes a Python object."""
 
 MAX_FIELD_NAME: Final = 256
-"""Bytes of the name of a field; drivers use up to some twenty."""
+"""Most bytes of the name of a field; drivers use up to some twenty."""
 
 _ORDERS: Final = {b"\x00": ">", b"\x01": "<"}
 """Byte order by the second byte of the encapsulation (plain CDR)."""
 
 _ENCAPSULATION: Final = 4
-"""Bytes ahead of the message; alignment counts from behind them."""
+"""Bytes before the message; alignment counts from their end."""
 
 _STAMP: Final = 8
 """Bytes of `std_msgs/Header.stamp`."""
 
 _CHARACTER: Final = 4
-"""Bytes of a character in UTF-8, at most."""
+"""Most bytes of a character in UTF-8."""
 
 
 class Head:
-    """Goes through a message from its begin.
+    """A cursor that moves through a message from its beginning.
 
     Raises:
-        DecodeError: `message_malformed` where it is no CDR, or the message ends before what is asked of it.
+        DecodeError: `message_malformed`: not CDR, or the message ends before the requested value.
     """
 
     def __init__(self, payload: bytes) -> None:
@@ -53,14 +53,14 @@ class Head:
         return int(value)
 
     def skip(self, size: int) -> None:
-        """Passes over so many bytes."""
+        """Skips `size` bytes."""
         self._at += size
 
     def text(self, max_bytes: int, reason: Refusal, what: str) -> None:
-        """Passes over a string.
+        """Skips a string.
 
         Raises:
-            DecodeError: `reason` where it claims to be longer than `max_bytes`.
+            DecodeError: with `reason`, if the string claims to be longer than `max_bytes`.
         """
         length = self.number()
         if length > max_bytes + 1:  # the zero behind it counts
@@ -69,7 +69,7 @@ class Head:
 
 
 def check_header(payload: bytes) -> Head:
-    """Looks at the `std_msgs/Header` with which a message begins; what stands behind it comes next.
+    """Checks the `std_msgs/Header` at the beginning of a message. Returns the cursor behind it.
 
     Raises:
         DecodeError: `frame_id_invalid` or `message_malformed`.
@@ -81,7 +81,7 @@ def check_header(payload: bytes) -> Head:
 
 
 def check_cloud_fields(payload: bytes) -> None:
-    """Looks at the fields of a `PointCloud2`.
+    """Checks the fields of a `PointCloud2`.
 
     Raises:
         DecodeError: `cloud_fields`, `frame_id_invalid` or `message_malformed`.

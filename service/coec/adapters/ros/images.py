@@ -1,4 +1,4 @@
-"""`sensor_msgs/Image` and `CompressedImage` to images."""
+"""Converts `sensor_msgs/Image` and `CompressedImage` to images."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ ENCODINGS: Final[dict[str, ImageFormat]] = {
     "uyvy": ImageFormat.YUV422,
     "yuyv": ImageFormat.YUV422_YUY2,
 }
-"""`Image.encoding`: the names of sensor_msgs/image_encodings.hpp, and those of OpenCV's types, which leave open what
-the channels mean: as OpenCV orders them."""
+"""`Image.encoding`: the names of sensor_msgs/image_encodings.hpp, and OpenCV's types. The latter do not say what the
+channels mean, so that OpenCV's order is assumed."""
 
 _DEEP: Final = tuple(name for name, form in ENCODINGS.items() if form.endswith("16"))
-"""Encodings with two bytes a value."""
+"""Encodings with two bytes per value."""
 
 _VIDEO: Final = ("h264", "h265", "hevc", "av1", "vp8", "vp9")
-"""Codecs of ffmpeg_image_transport and others: a packet is no picture without those before it."""
+"""Video codecs of ffmpeg_image_transport and others; a packet alone is no picture, as it needs those before it."""
 
 _START_CODES: Final = (b"\0\0\0\1", b"\0\0\1")
-"""With which a packet of H.264 or H.265 begins (ITU-T H.264, annex B)."""
+"""Beginnings of a packet of H.264 or H.265 (ITU-T H.264, annex B)."""
 
 
 def compressed_image(message: CompressedImage, limits: LimitsConfig) -> EncodedImage:
-    """The image of a message. `format` is free text ("jpeg", "bgr8; jpeg compressed bgr8", "rgb8; png compressed "):
-    the first bytes of the data are what counts, but for two kinds that a person is told by name.
+    """The image of a message. `format` is free text ("jpeg", "bgr8; jpeg compressed bgr8", "rgb8; png compressed "), so
+    that the first bytes of the data decide. `format` only serves to refuse depth images and video with a clear message.
 
     Raises:
         DecodeError: `image_unknown_format`, or the reasons of `probe`.
@@ -61,7 +61,7 @@ def compressed_image(message: CompressedImage, limits: LimitsConfig) -> EncodedI
 
 
 def raw_pixels(message: Image, limits: LimitsConfig) -> EncodedImage:
-    """The image of a message, without the padding of its rows, 16-bit values little-endian.
+    """The image of a message, without row padding and with little-endian 16-bit values.
 
     Raises:
         DecodeError: `image_unknown_format`, `image_size_mismatch`, or the reasons of `raw_image`.

@@ -1,7 +1,6 @@
-"""ROS 2 messages in CDR: frames in.
+"""Decodes ROS 2 messages in CDR to frames.
 
-Every length in a message is the sender's claim: what a decoder would build from it is bounded before it is
-asked to.
+Every length in a message is only a claim of the sender, so that it is checked before a decoder builds anything from it.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ REFUSED: Final = {
     "sensor_msgs/msg/PointCloud": "PointCloud has been replaced by PointCloud2: convert it (point_cloud_converter)",
     messages.TF: "a transform tells where a frame is, not what it sees; motion it tells where `ego.type` is this one",
 }
-"""Types that people take for the right ones, and what to do."""
+"""Types that people configure by mistake, and what to do instead."""
 
 
 def decode(
@@ -52,12 +51,12 @@ def decode(
 ) -> CameraFrame | LidarFrame | EgoMotion:
     """The frame in a message of one of the types in `KNOWN`.
 
-    Stamp and frame id are those of the header; of an odometry the frame id is the child's, in which its twist
-    is expressed. CDR has no sequence number. `point_time` says how points are timed, where their values do not;
-    `source` is the LiDAR that is asked for, of a cloud of several (see `of_source`).
+    Stamp and frame id are those of the header, except for an odometry, whose frame id is that of the child frame, in
+    which its twist is expressed. CDR has no sequence number. `point_time` says how points are timed if their values do
+    not show it; `source` is the requested LiDAR in a cloud of several (see `of_source`).
 
     Raises:
-        DecodeError: anything else, with a reason of `Refusal`.
+        DecodeError: any other message, with a reason of `Refusal`.
     """
     if type_name in _MOTIONS:
         return _MOTIONS[type_name](payload)

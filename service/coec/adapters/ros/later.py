@@ -1,4 +1,4 @@
-"""A recorded message as if it had been recorded later."""
+"""Shifts recorded messages in time, as if they had been recorded later."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from coec.adapters.ros.topics import TopicMessage
 from coec.errors import DecodeError
 
 _STAMP: Final = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
-"""Of a header (sec, nanosec), by the byte order of the message; it stands behind the 4 bytes of encapsulation."""
+"""Layout of a header's stamp (sec, nanosec), by the byte order of the message, behind 4 bytes of encapsulation."""
 
 _END_S: Final = 2**31
-"""Of the time that ROS can say: 2038."""
+"""End of ROS time: 2038."""
 
 _CLOCK_FIELDS: Final = ("timestamp", "time", "time_stamp", "t")
-"""Of points, where some drivers give a clock's time instead of that since the stamp; float64 alone has room for it."""
+"""Fields of points in which some drivers write a clock's time instead of the time since the stamp. Only float64 has
+enough digits for it."""
 
 _UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
-"""In which clocks of points count."""
+"""Units of such clock times."""
 
 _NEAR_S: Final = 60.0
-"""A clock's time of a point is that near to the stamp of its cloud."""
+"""Most time between a point's clock time and the stamp of its cloud."""
 
 
 def shifted(message: TopicMessage, shift_ns: int) -> TopicMessage:
-    """The message so much later: the stamp of its header, those of transforms, and points' times of a clock. A header
-    without a stamp (0) stays without, and a type without a header, or one that is not known here, keeps its bytes.
+    """The message with `shift_ns` added to the stamp of its header, the stamps of its transforms and the clock times of
+    its points. A header without a stamp (0) stays so. A type without a header, or an unknown type, keeps its bytes.
 
     Raises:
-        DecodeError: it is not what its type says, or a stamp would leave what ROS can say.
+        DecodeError: the message does not fit its type, or a stamp would leave ROS time.
     """
     if shift_ns == 0:
         return message

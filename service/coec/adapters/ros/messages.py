@@ -1,5 +1,5 @@
-"""The types of ROS 2 messages that are known here, and CDR to and from them. Definitions are those of Humble; for these
-types they are the same up to Lyrical."""
+"""The known types of ROS 2 messages, and their conversion from and to CDR. The definitions are those of Humble, which
+are the same up to Lyrical for these types."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ T = TypeVar("T")
 
 
 def definition(type_name: str) -> str:
-    """The message definition in ros2msg text, with those it refers to, as an MCAP schema wants it."""
+    """The message definition in ros2msg text, with those that it refers to, as an MCAP schema needs it."""
     text, _ = _STORE.generate_msgdef(type_name, ros_version=2)
     return text
 
 
 def deserialized(message_type: type[T], payload: bytes) -> T:
-    """The message in CDR, of either byte order. Its arrays are read-only views of `payload`.
+    """The message in a CDR payload of either byte order. Its arrays are read-only views of `payload`.
 
     Raises:
-        DecodeError: it is not one, or is cut off.
+        DecodeError: the payload is not this message, or is cut off.
     """
     try:
         message = _STORE.deserialize_cdr(memoryview(payload), message_type.__msgtype__)  # type: ignore[attr-defined]
@@ -55,7 +55,7 @@ def serialized(message: Any, type_name: str) -> bytes:
 
 
 def is_known(type_name: str) -> bool:
-    """Whether it is a type of ROS's own: only of those is the hash known."""
+    """Whether it is one of ROS's own types; only their hashes are known."""
     return type_name in _STORE.fielddefs
 
 
@@ -66,5 +66,5 @@ def has_header(type_name: str) -> bool:
 
 
 def type_hash(type_name: str) -> str:
-    """`RIHS01_` and 64 hexadecimal digits: how ROS 2 tells definitions of one name apart (REP 2016)."""
+    """`RIHS01_` and 64 hexadecimal digits, by which ROS 2 distinguishes definitions with one name (REP 2016)."""
     return str(_STORE.hash_rihs01(type_name))

@@ -1,5 +1,5 @@
-"""Ego-motion from the messages that tell a velocity: `Odometry`, `TwistStamped`, `TwistWithCovarianceStamped`, and
-`Imu`, which tells rotation only."""
+"""Ego-motion from messages with a velocity: `Odometry`, `TwistStamped`, `TwistWithCovarianceStamped`, and `Imu`, which
+has turn rates only."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from coec.calibration.types import EgoMotion
 from coec.errors import DecodeError
 
 MAX_MOTION_BYTES: Final = 4096
-"""Of a message. An odometry has 724 and its two frame ids."""
+"""Largest message. An odometry has 724 bytes and its two frame ids."""
 
 Vector = tuple[float, float, float]
 
 
 def odometry(payload: bytes) -> EgoMotion:
-    """The twist of an odometry, which is expressed in its child frame.
+    """The twist of an `Odometry`, which is expressed in its child frame.
 
     Raises:
-        DecodeError: the reasons of `checked`, or no such message.
+        DecodeError: the reasons of `checked`, or not this message.
     """
     _check(payload)
     message = deserialized(ros.nav_msgs__msg__Odometry, payload)
@@ -36,7 +36,7 @@ def twist(payload: bytes) -> EgoMotion:
     """The twist of a `TwistStamped`, expressed in the frame of its header.
 
     Raises:
-        DecodeError: the reasons of `checked`, or no such message.
+        DecodeError: the reasons of `checked`, or not this message.
     """
     _check(payload)
     message = deserialized(ros.geometry_msgs__msg__TwistStamped, payload)
@@ -44,10 +44,10 @@ def twist(payload: bytes) -> EgoMotion:
 
 
 def twist_with_covariance(payload: bytes) -> EgoMotion:
-    """The same of a `TwistWithCovarianceStamped`; its covariance is not used.
+    """The same for a `TwistWithCovarianceStamped`; its covariance is not used.
 
     Raises:
-        DecodeError: the reasons of `checked`, or no such message.
+        DecodeError: the reasons of `checked`, or not this message.
     """
     _check(payload)
     message = deserialized(ros.geometry_msgs__msg__TwistWithCovarianceStamped, payload)
@@ -58,7 +58,7 @@ def imu(payload: bytes) -> EgoMotion:
     """The turn rates of an `Imu`, about the axes of its own frame; the linear velocity is not known.
 
     Raises:
-        DecodeError: the reasons of `checked`, or no such message; an IMU that says that it has no turn rates.
+        DecodeError: the reasons of `checked`, not this message, or the IMU says that it does not measure turn rates.
     """
     _check(payload)
     message = deserialized(ros.sensor_msgs__msg__Imu, payload)
@@ -70,7 +70,7 @@ def imu(payload: bytes) -> EgoMotion:
 
 
 def checked(stamp: int, frame: str, linear_mps: Vector | None, angular_radps: Vector) -> EgoMotion:
-    """The motion, if a vehicle can have it.
+    """The motion, checked to be possible for a vehicle.
 
     Raises:
         DecodeError: `motion_invalid`.

@@ -1,8 +1,8 @@
-"""Ego-motion from `/tf`: how a frame moves in another, from two of its poses.
+"""Ego-motion from `/tf`: the velocity of a frame in another, from two of its poses.
 
-A transform tells where a frame is, not how fast. Between two poses T₁ and T₂ of the vehicle in `odom`, dt apart, the
-twist that leads from one to the other is log(T₁⁻¹·T₂)/dt, expressed in the vehicle's frame: exact while the twist does
-not change, and of second order in dt about the middle between the two, where it is dated.
+A transform tells where a frame is, not how fast it moves. For two poses T₁ and T₂ of the vehicle in `odom`, dt apart,
+the twist between them is log(T₁⁻¹·T₂)/dt, in the vehicle's frame. It is exact if the twist is constant. Otherwise its
+error is of second order in dt at the middle between the two poses, and that middle is its stamp.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from coec.calibration.types import EgoMotion, Matrix4
 from coec.geometry import se3
 
 MIN_BETWEEN_S: Final = 0.01
-"""Least time between the two poses: a millimetre, as fine as a filter's poses lie, is then 0.1 m/s."""
+"""Least time between the two poses; then a millimetre, the resolution of a filter's poses, is 0.1 m/s."""
 
 MAX_BETWEEN_S: Final = 0.5
-"""Most time: a vehicle changes its velocity within it, and what happened in a longer gap nobody knows."""
+"""Most time between the two poses; in a longer gap the velocity may have changed unnoticed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,18 +30,18 @@ class _Pose:
 
 
 class MovingFrame:
-    """One frame in another, from message to message. Not safe for use from several threads."""
+    """Motion of one frame in another, from message to message. Not safe for use from several threads."""
 
     def __init__(self, parent: str, child: str) -> None:
         self._parent, self._child = bare(parent), bare(child)
         self._before: _Pose | None = None
 
     def motion(self, payload: bytes) -> EgoMotion | None:
-        """The motion since the pose before, of a `TFMessage` in CDR; None where the message holds no new pose of the
-        frame, or there was none before.
+        """The motion since the previous pose, from a `TFMessage` in CDR; None if the message holds no new pose of the
+        frame, or if there was no previous pose.
 
         Raises:
-            DecodeError: no such message; its pose is none, or cannot be reached from the one before.
+            DecodeError: not this message, its pose is invalid, or the motion to it is impossible.
         """
         found = None
         for stamped in transforms_in(payload):
@@ -72,7 +72,7 @@ def frames_in(payload: bytes) -> set[tuple[str, str]]:
     """Parent and child of every transform in a `TFMessage` in CDR.
 
     Raises:
-        DecodeError: no such message.
+        DecodeError: not this message.
     """
     return {(frame_id(bare(t.header.frame_id)), frame_id(bare(t.child_frame_id))) for t in transforms_in(payload)}
 

@@ -1,4 +1,4 @@
-"""ROS 2 messages in CDR: what a recorder, a player and the service itself give."""
+"""Encodes ROS 2 messages in CDR, for the recorder, the player and the service itself."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ DISTORTION: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "eucm": ("eucm", ("alpha", "beta")),
     "double_sphere": ("double_sphere", ("xi", "alpha")),
 }
-"""`CameraInfo.distortion_model` and the order of `d` by camera model. `plumb_bob`, `rational_polynomial` and
-`equidistant` are those of sensor_msgs/distortion_models.hpp; ROS names no others that fit, so the rest go by the names
+"""`CameraInfo.distortion_model` and the order of `d`, by camera model. `plumb_bob`, `rational_polynomial` and
+`equidistant` are from sensor_msgs/distortion_models.hpp. ROS has no names for the others, so that they have the names
 of `dataset.yaml`."""
 
 _UNKNOWN_POSE_M2 = 1e9
-"""Variance written for the pose of a recorded odometry, of which only the twist is known: (30 km)²."""
+"""Variance of the pose in a recorded odometry, whose pose is not known: (30 km)²."""
 
 
 def encode_image(frame: CameraFrame) -> tuple[str, bytes]:
@@ -67,12 +67,12 @@ def encode_image(frame: CameraFrame) -> tuple[str, bytes]:
 
 
 def encode_depth(stamp_ns: int, frame_id: str, depth: EncodedImage) -> bytes:
-    """`CompressedImage` of a precomputed depth map (PNG); `decode` gives it back as the image of a frame."""
+    """`CompressedImage` of a precomputed depth map (PNG); `decode` returns it as the image of a frame."""
     return _encode_compressed(stamp_ns, frame_id, DEPTH_FORMAT, depth.data)
 
 
 def encode_jpeg(stamp_ns: int, frame_id: str, jpeg: bytes) -> bytes:
-    """`CompressedImage` of a picture that was drawn."""
+    """`CompressedImage` of a drawn picture."""
     return _encode_compressed(stamp_ns, frame_id, ImageFormat.JPEG.value, jpeg)
 
 
@@ -89,7 +89,7 @@ def encode_cloud(frame: LidarFrame) -> bytes:
 
 
 def encode_motion(motion: EgoMotion) -> tuple[str, bytes]:
-    """Type name and message: `Odometry`, or `Imu` where the linear velocity is not known. Either decodes to an equal
+    """Type name and message: `Odometry`, or `Imu` if the linear velocity is not known. Either decodes to an equal
     motion."""
     if motion.linear_mps is None:
         return IMU, _encode_imu(motion)
@@ -97,7 +97,7 @@ def encode_motion(motion: EgoMotion) -> tuple[str, bytes]:
 
 
 def _encode_imu(motion: EgoMotion) -> bytes:
-    """What is not known says so by its covariance, which begins with -1 (sensor_msgs/Imu)."""
+    """The covariance of an unknown value begins with -1 (sensor_msgs/Imu)."""
     unknown = np.array([-1.0, *[0.0] * 8])
     message = ros.sensor_msgs__msg__Imu(
         header=_header(motion.stamp_ns, motion.frame_id),
@@ -112,7 +112,7 @@ def _encode_imu(motion: EgoMotion) -> bytes:
 
 
 def _encode_odometry(motion: EgoMotion, linear_mps: tuple[float, float, float]) -> bytes:
-    """The twist is expressed in the child frame; the pose is unknown and says so by its covariance."""
+    """The twist is expressed in the child frame; the pose is unknown, which its covariance shows."""
     unknown = np.diag(np.full(6, _UNKNOWN_POSE_M2)).reshape(-1)
     message = ros.nav_msgs__msg__Odometry(
         header=_header(motion.stamp_ns, "odom"),
@@ -136,24 +136,24 @@ def _encode_odometry(motion: EgoMotion, linear_mps: tuple[float, float, float]) 
 
 
 MAX_RESIDUAL_PX: Final = 0.5
-"""What `equidistant` may miss of a lens that ROS has no word for, at most, px: where a point lands on the next pixel,
-an image is wrong."""
+"""Largest error, px, of an `equidistant` model in place of one that ROS does not have; a larger one would put points on
+the next pixel."""
 
 ROS_MODELS: Final = frozenset({"plumb_bob", "rational_polynomial", "equidistant"})
 """Models that ROS's own programs know (sensor_msgs/distortion_models.hpp)."""
 
 
 class UnsayableCameraError(CoecError):
-    """ROS has no model that comes near the camera's."""
+    """ROS has no camera model that comes near the camera's."""
 
     reply_code = "camera_not_sayable"
 
 
 def sayable(camera: Camera) -> tuple[Camera, float]:
-    """The camera in a model that ROS's own programs know, and how many pixels that misses, at most.
+    """The camera in a model that ROS's own programs know, and its largest error in pixels.
 
     Raises:
-        UnsayableCameraError: none is nearer than `MAX_RESIDUAL_PX`.
+        UnsayableCameraError: no model is within `MAX_RESIDUAL_PX`.
     """
     if DISTORTION[name_of(camera)][0] in ROS_MODELS:
         return camera, 0.0
@@ -202,7 +202,7 @@ class Placed:
 
 
 def encode_transforms(frames: Sequence[Placed], stamp_ns: int) -> bytes:
-    """`TFMessage`: tf's transforms, too, map coordinates of the child to those of the parent."""
+    """`TFMessage`. Like `Placed`, transforms of tf map coordinates of the child to those of the parent."""
     transforms = []
     for frame in frames:
         x, y, z, w = (float(v) for v in quaternion_xyzw_from_rotation(frame.T_parent_child[:3, :3]))
@@ -220,7 +220,7 @@ def encode_transforms(frames: Sequence[Placed], stamp_ns: int) -> bytes:
 
 
 def encode_tf_static(rig: Rig, T_camera_lidar: Matrix4, stamp_ns: int) -> bytes:
-    """`TFMessage` of a window: the LiDAR as a child of the camera, `T_camera_lidar` (4, 4) as it stands."""
+    """`TFMessage` of a window: the LiDAR as a child of the camera, with `T_camera_lidar` (4, 4) unchanged."""
     return encode_transforms([Placed(rig.camera_frame, rig.lidar_frame, T_camera_lidar)], stamp_ns)
 
 

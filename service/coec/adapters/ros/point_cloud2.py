@@ -1,5 +1,5 @@
-"""`sensor_msgs/PointCloud2` to sweeps and back: any order of fields, padding and organisation, one copy per
-column."""
+"""Converts `sensor_msgs/PointCloud2` to sweeps and back, with any order of fields, padding and organisation, and one
+copy per column."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def frame_of(
 ) -> LidarFrame:
     """The sweep of a message whose header is already checked.
 
-    `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned
-    integer; time one of `TIME_FIELDS`, any number, as recognised there or as `point_time` says. Optional
-    fields of other types are left out, as are fields with several values a point. A `stamp_ns` of 0 is none: then the
-    first point tells it, if it tells a time of day. `source`: see `of_source`.
+    `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned integer. The
+    time is one of `TIME_FIELDS`, any number, read as recognised in `point_time` or as the argument `point_time` says.
+    Optional fields of other types are left out, and so are fields with several values per point. A `stamp_ns` of 0
+    means no stamp; then the first point gives it, if it has a time of day. `source`: see `of_source`.
 
     Raises:
         DecodeError: `cloud_shape`, `cloud_fields`, `cloud_too_large`, `cloud_empty`, `cloud_time`,
@@ -58,8 +58,8 @@ def frame_of(
     """
     _check_layout(message, limits)
     message = of_source(message, source)
-    by_name = {field.name: field for field in reversed(message.fields)}  # the first of a name counts
-    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes infinite, and is dropped
+    by_name = {field.name: field for field in reversed(message.fields)}  # the first field of a name counts
+    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinite and are dropped
         xyz_m = _places(message, by_name)
         intensity = _column(message, by_name.get("intensity"), "fiu")
         ring = _column(message, next((by_name[n] for n in ("ring", "channel", "line") if n in by_name), None), "u")
@@ -78,11 +78,12 @@ def frame_of(
 
 
 WRITTEN_TIME: Final = PointTimeConfig(field="time", unit="s", base="stamp")
-"""How `message_of` writes the times of points: as Velodyne does."""
+"""How `message_of` writes the times of points, as Velodyne does."""
 
 
 def message_of(frame: LidarFrame) -> PointCloud2:
-    """The message that `frame_of` reads back to an equal sweep, its points timed as `WRITTEN_TIME`; without padding."""
+    """The message that `frame_of` reads back to an equal sweep; without padding, with points timed as
+    `WRITTEN_TIME`."""
     given = [
         ("x", frame.xyz_m[:, 0], PointField.FLOAT32),
         ("y", frame.xyz_m[:, 1], PointField.FLOAT32),
@@ -114,7 +115,7 @@ def message_of(frame: LidarFrame) -> PointCloud2:
 
 
 def _check_layout(message: PointCloud2, limits: LimitsConfig) -> None:
-    """All in Python integers, which do not overflow."""
+    """Checks the sizes, in Python integers, which do not overflow."""
     count = message.width * message.height
     if count > limits.max_points:
         raise DecodeError(Refusal.CLOUD_TOO_LARGE, f"{count} points; limits.max_points is {limits.max_points}")
@@ -147,8 +148,8 @@ def _places(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[
 
 
 def _together(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[np.float32] | None:
-    """x y z as most drivers lay them, float32 one behind the other: copied three at a time, in a third of the time that
-    columns take. None where they lie otherwise."""
+    """x y z in the layout of most drivers, float32 one after the other. Copying the three together takes a third of the
+    time of single columns. None for any other layout."""
     x = by_name.get("x")
     if x is None or x.offset + _PLACE.itemsize > message.point_step:
         return None
@@ -162,11 +163,11 @@ def _together(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Times:
-    """The stamp of a sweep, when its points were measured, and how that was read.
+    """The stamp of a sweep, the times of its points, and how they were read.
 
     Attributes:
-        stamp_ns: that of the header, or where it has none, of the first point that tells a time of day.
-        offset_s: (N,) seconds after the stamp; None where no field tells.
+        stamp_ns: that of the header; if it has none, that of the first point, if points have a time of day.
+        offset_s: (N,) seconds after the stamp; None if no field holds a time.
         told: see `LidarFrame.timed_by`.
     """
 
@@ -196,10 +197,10 @@ def _times(
 
 
 def _column(message: PointCloud2, field: PointField | None, kinds: str) -> NDArray[Any] | None:
-    """(N,) values of a field, or None when it is absent or not of these NumPy kinds."""
+    """(N,) values of a field; None if it is absent or not of these NumPy kinds."""
     if field is None or field.datatype not in _DTYPES or _DTYPES[field.datatype].kind not in kinds:
         return None
-    if field.count > 1:  # some drivers write 0 where they mean 1
+    if field.count > 1:  # some drivers write 0 for 1
         return None
     dtype = _DTYPES[field.datatype].newbyteorder(">" if message.is_bigendian else "<")
     if field.offset + dtype.itemsize > message.point_step:
@@ -208,7 +209,7 @@ def _column(message: PointCloud2, field: PointField | None, kinds: str) -> NDArr
 
 
 def _view(message: PointCloud2, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
-    """(height, width) values at an offset in each point, which has room for them."""
+    """(height, width) values at an offset in each point; the caller has checked that they fit."""
     return np.ndarray(
         shape=(message.height, message.width),
         dtype=dtype,

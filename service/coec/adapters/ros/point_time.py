@@ -1,14 +1,14 @@
-"""When each point of a cloud was measured: which field says it, in which unit, counted from where.
+"""When each point of a cloud was measured: which field holds the time, in which unit, and counted from when.
 
-`PointCloud2` has no rule for it. Ouster counts nanoseconds from the stamp, Velodyne seconds, from it or up to it; Hesai
-and RoboSense write seconds since 1970, Livox nanoseconds since 1970. So it is recognised from the values: a sweep
-takes `SHORTEST_S` to `LONGEST_S`, and lies within `NEAR_S` of its stamp. Of units a factor of 1000 apart one at most
-makes a usual sweep of a column. Where more than one reading is left, none is taken: `lidar.time` of the configuration
-says which it is.
+`PointCloud2` has no rule for this. Ouster counts nanoseconds from the stamp; Velodyne counts seconds from the stamp or
+up to it; Hesai and RoboSense write seconds since 1970, Livox nanoseconds since 1970. So the reading is recognised from
+the values: a sweep takes `SHORTEST_S` to `LONGEST_S` and lies within `NEAR_S` of its stamp. Units are a factor of 1000
+apart, so that at most one of them makes a usual sweep of a column. If more than one reading is left, the cloud is
+refused, and `lidar.time` in the configuration has to say which is right.
 
-Some drivers leave the stamp out where they write times of day: then the first point tells it.
+Some drivers that write times of day leave the stamp out; then the first point gives it.
 
-Every cloud is judged for itself, so that it reads the same alone and in a stream, live and in a bag.
+Every cloud is judged by itself, so that it reads the same alone and in a stream, live and in a bag.
 """
 
 from __future__ import annotations
@@ -34,34 +34,36 @@ FIELDS: Final = (
     "time_offset_ns",
     "time_offset_sec",
 )
-"""As drivers name it; the first that a cloud has counts. Ouster `t`, Velodyne `time`, Livox `offset_time` and
-`timestamp`, Hesai and RoboSense `timestamp`, Autoware `time_stamp`, Aeva `time_offset_ns`, SICK `time_offset_sec`."""
+"""Names that drivers use for the time field; the first that a cloud has counts. Ouster `t`, Velodyne `time`, Livox
+`offset_time` and `timestamp`, Hesai and RoboSense `timestamp`, Autoware `time_stamp`, Aeva `time_offset_ns`, SICK
+`time_offset_sec`."""
 
 ON_A_CLOCK: Final = ("timestamp", "time_stamp")
-"""Names that do not tell whether the time of day is meant, or the time since the stamp: drivers use them for both."""
+"""Names that drivers use both for the time of day and for the time since the stamp."""
 
 SHORTEST_S: Final = 1e-3
-"""Of a sweep. What is shorter needs no motion compensation: a millisecond at 30 m/s is 3 cm."""
+"""Shortest sweep. A shorter one needs no motion compensation: a millisecond at 30 m/s is 3 cm."""
 
 LONGEST_S: Final = 10.0
-"""Of a sweep, the longest period of `config.SweepConfig`."""
+"""Longest sweep, as the longest period of `config.SweepConfig`."""
 
 NEAR_S: Final = 1.0
-"""Between a sweep and its stamp: drivers stamp its begin, middle or end, or the instant of sending it."""
+"""Most time between a sweep and its stamp: drivers stamp its begin, middle or end, or the instant of sending it."""
 
 SINCE_S: Final = 946_684_800
-"""Begin of 2000, seconds since 1970: no time of day is earlier."""
+"""Begin of 2000, seconds since 1970; no time of day is earlier."""
 
 UNTIL_S: Final = 2**31
-"""2038, the end of what ROS can say. Units are a factor of 1000 apart: in one of them at most a value lies between."""
+"""2038, the end of ROS time. As units are a factor of 1000 apart, a value lies between `SINCE_S` and this in at most
+one of them."""
 
 FINEST_S: Final = 1e-3
-"""Between two neighbouring values of a time of day that tells when a sweep was taken: not so of float32."""
+"""Largest step between neighbouring values of a time of day that can date a sweep; float32 is coarser."""
 
 NS_PER_S: Final = 1_000_000_000
 
 _TICKS: Final[dict[TimeUnit, int]] = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": NS_PER_S}
-"""Of each unit in a second."""
+"""Ticks of each unit in a second."""
 
 _WORDS: Final[dict[TimeUnit, str]] = {"s": "s", "ms": "ms", "us": "µs", "ns": "ns"}
 _BASES: Final[dict[TimeBase, str]] = {"stamp": "since the stamp", "clock": "on the stamp's clock"}
@@ -69,7 +71,7 @@ _BASES: Final[dict[TimeBase, str]] = {"stamp": "since the stamp", "clock": "on t
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One way to read a column; its first and last point are then `begin_s` and `end_s` after the stamp."""
+    """One way to read a column; with it the first and last point are `begin_s` and `end_s` after the stamp."""
 
     unit: TimeUnit
     base: TimeBase
@@ -83,14 +85,14 @@ class Reading:
 
     @property
     def sentence(self) -> str:
-        """For people; without the name of the field."""
+        """The reading in words, without the name of the field."""
         begin, end = (f"{1e3 * value:.1f}".replace("-0.0", "0.0") for value in (self.begin_s, self.end_s))
         since = " from the stamp" if self.base == "clock" else ""
         return f"{_WORDS[self.unit]} {_BASES[self.base]}; {begin} to {end} ms{since}"
 
     @property
     def stamped(self) -> str:
-        """Where in the sweep the stamp lies, within a tenth of it."""
+        """Where in the sweep the stamp lies, to a tenth of the sweep; empty if at none of the usual places."""
         tenth = 0.1 * self.lasts_s
         if self.lasts_s < SHORTEST_S:
             return ""
@@ -108,17 +110,16 @@ def offsets_s(
     stamp_ns: int,
     said: PointTimeConfig | None,
 ) -> tuple[NDArray[np.float32], str]:
-    """(N,) float32 seconds after the stamp at which each point was measured, and in a line how that was read.
+    """(N,) float32 seconds after the stamp at which each point was measured, and a line that says how they were read.
 
     Args:
         name: of the field.
         column: (N,) its values.
-        keep: (N,) the points whose values count, None if all; the others carry anything.
-        said: how it is to be read, if the configuration says so.
+        keep: (N,) the points whose values count, None: all; other values may be anything.
+        said: how to read it, if the configuration says so.
 
     Raises:
-        DecodeError: `cloud_time` where no reading brings the points to the stamp, `cloud_time_ambiguous` where several
-            do.
+        DecodeError: `cloud_time` if no reading brings the points near the stamp, `cloud_time_ambiguous` if several do.
     """
     values = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
     begin, end = _range(values if keep is None else values[keep])
@@ -131,8 +132,8 @@ def offsets_s(
 
 
 def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, said: PointTimeConfig | None) -> int | None:
-    """Nanoseconds of the first point, for a cloud without a stamp; None where its points tell no time of day, or none
-    that the configuration says. Arguments as of `offsets_s`."""
+    """The time of the first point, ns, for a cloud without a stamp; None if its points have no time of day, or not the
+    one in the configuration. Arguments as for `offsets_s`."""
     values = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
     begin, end = _range(values if keep is None else values[keep])
     clocked = [unit for unit in _TICKS if said is None or (said.unit, said.base) == (unit, "clock")]
@@ -147,7 +148,7 @@ def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, said: PointTi
 
 
 def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_ns: int) -> Reading:
-    """How a column is read whose values reach from `begin` to `end`.
+    """How to read a column whose values reach from `begin` to `end`.
 
     Raises:
         DecodeError: `cloud_time`, `cloud_time_ambiguous`.
@@ -159,7 +160,7 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
     near = [reading for reading in every if reading.begin_s <= NEAR_S and reading.end_s >= -NEAR_S]
     sweeps = _as_named(name, [reading for reading in near if SHORTEST_S <= reading.lasts_s <= LONGEST_S])
     instants = _as_named(name, [reading for reading in near if reading.lasts_s < SHORTEST_S])
-    # Whole milliseconds that few drivers would write may as well be the nanoseconds of a flash.
+    # Few drivers write whole milliseconds, so that such values may also be nanoseconds of a flash LiDAR.
     flashes = [reading for reading in instants if counts and reading.unit == "ns" and reading.base == "stamp"]
     coarse = any(reading.unit in ("ms", "s") for reading in sweeps)
     candidates = [*sweeps, *(flashes if coarse else ())] if sweeps else instants
@@ -182,7 +183,7 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
 
 
 def _as_named(name: str, readings: Sequence[Reading]) -> list[Reading]:
-    """Without those on a clock where the name speaks of the time since the stamp, and that is possible."""
+    """The readings without those on a clock, if the name means the time since the stamp and such a reading is left."""
     since_stamp = [reading for reading in readings if reading.base == "stamp"]
     return since_stamp if since_stamp and name not in ON_A_CLOCK else list(readings)
 
@@ -198,8 +199,8 @@ def _read(begin: float, end: float, unit: TimeUnit, base: TimeBase, stamp_ns: in
 
 
 def _stamp(unit: TimeUnit, base: TimeBase, stamp_ns: int) -> tuple[int, float]:
-    """What a column counts from: whole seconds, in its unit, and seconds. Apart, so that no digit of a time of day is
-    lost."""
+    """What a column counts from: whole seconds, in its unit, and the fraction in seconds. They are separate so that no
+    digit of a time of day is lost."""
     if base == "stamp":
         return 0, 0.0
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
@@ -207,7 +208,7 @@ def _stamp(unit: TimeUnit, base: TimeBase, stamp_ns: int) -> tuple[int, float]:
 
 
 def _range(values: NDArray[Any]) -> tuple[float, float]:
-    """Least and most; (0, 0) of none."""
+    """Least and largest finite value; (0, 0) if there is none."""
     if values.size == 0:
         return 0.0, 0.0
     least, most = values.min().item(), values.max().item()

@@ -1,4 +1,4 @@
-"""The frames of several sensors of a vehicle as messages: each on topics of its own, all in one tree of transforms."""
+"""The frames of several sensors of a vehicle as messages: each sensor has its topics, all share one transform tree."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ ODOMETRY = "/odometry"
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """What is said of a vehicle beside its frames.
+    """What the messages tell about a vehicle beside its frames.
 
     Attributes:
-        cameras: a rig with the intrinsics of each camera, by its frame of coordinates.
-        placed: where each sensor is in the vehicle.
+        cameras: a rig with the intrinsics of each camera, by the camera's frame id.
+        placed: pose of each sensor in the vehicle.
     """
 
     cameras: Mapping[str, Rig]
@@ -28,24 +28,24 @@ class Vehicle:
 
 
 def image_topic(camera: str) -> str:
-    """Of the compressed images of a camera; its camera info lies beside."""
+    """Topic of the compressed images of a camera."""
     return f"/{camera}/image/compressed"
 
 
 def points_topic(lidar: str) -> str:
-    """Of the sweeps of a LiDAR."""
+    """Topic of the sweeps of a LiDAR."""
     return f"/{lidar}/points"
 
 
 class SensorTopics:
-    """Frames as messages on topics by the names of their sensors, and `/tf_static` before the first."""
+    """Frames as messages, on topics named after their sensors, with `/tf_static` before the first."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._is_joined = False
 
     def of(self, frame: Frame) -> Iterator[TopicMessage]:
-        """Those of the next frame; depth maps are left out."""
+        """The messages of the next frame; depth maps are left out."""
         stamp_ns = frame.stamp_ns
         if not self._is_joined:
             self._is_joined = True

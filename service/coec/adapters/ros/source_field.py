@@ -1,8 +1,8 @@
-"""Clouds of several LiDARs in one `PointCloud2`: split by the field that tells the source of each point.
+"""Splits clouds of several LiDARs in one `PointCloud2`, by the field that tells the source of each point.
 
-Most who join clouds give none. Autoware's `concatenate_data` writes which point is whose into another message
-(`ConcatenatedPointCloudInfo`), and none of the fields of its points (x, y, z, intensity, return_type, channel, azimuth,
-elevation, distance, time_stamp) says it; a `laser_id` or `channel` is a beam's number, not a LiDAR's.
+Most programs that join clouds write no such field. Autoware's `concatenate_data` puts the sources into another message
+(`ConcatenatedPointCloudInfo`), and no field of its points (x, y, z, intensity, return_type, channel, azimuth,
+elevation, distance, time_stamp) holds them. A `laser_id` or `channel` is the number of a beam, not of a LiDAR.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from coec.adapters.frames.incoming import Refusal
 from coec.errors import DecodeError
 
 SOURCE_FIELDS: Final = ("lidar_id", "sensor_id", "source_id", "device_id", "source")
-"""Integers under which mergers of clouds tell LiDARs apart: `lidar_id`, `sensor_id` and `source` in those that others
-publish, `device_id` in Kitware's SLAM (beside its `laser_id`, the beam)."""
+"""Names of integer fields in which joined clouds identify the LiDAR: `lidar_id`, `sensor_id` and `source` in published
+projects, `device_id` in Kitware's SLAM (beside its `laser_id`, the beam)."""
 
 _WIDTHS: Final = {
     PointField.INT8: "i1",
@@ -32,19 +32,19 @@ _WIDTHS: Final = {
 }
 
 MAX_LISTED: Final = 16
-"""Sources that a refusal lists: a vehicle has fewer LiDARs, and numbers of something else may be any."""
+"""Most sources that a refusal lists. A vehicle has fewer LiDARs, but the field may hold other numbers, however many."""
 
 
 def of_source(message: PointCloud2, source: int | None) -> PointCloud2:
-    """The points of one LiDAR, in their order, as a cloud of one row; the message as it is where it holds no other.
+    """The points of one LiDAR, in their order, as a cloud of one row; the message unchanged if it holds no others.
 
     Args:
-        message: whose data are as long as its layout says.
-        source: the number of the LiDAR that is asked for; None: there must be one only.
+        message: its data must be as long as its layout says.
+        source: number of the requested LiDAR; None: the cloud must hold only one.
 
     Raises:
-        DecodeError: `cloud_concatenated`: several sources and none asked for, or no point of the one asked for; says
-            which there are.
+        DecodeError: `cloud_concatenated`: several sources but none requested, or no point of the requested one; lists
+            the sources.
     """
     field = next((field for name in SOURCE_FIELDS for field in message.fields if field.name == name), None)
     values = None if field is None else _values(message, field)
@@ -77,7 +77,7 @@ def of_source(message: PointCloud2, source: int | None) -> PointCloud2:
 
 
 def _values(message: PointCloud2, field: PointField) -> NDArray[np.integer] | None:
-    """(height, width) numbers of a field; None where it holds none, or lies outside its point."""
+    """(height, width) numbers of a field; None if it holds no integers or lies outside of its point."""
     width = _WIDTHS.get(field.datatype)
     if width is None or field.offset + int(width[1]) > message.point_step:
         return None

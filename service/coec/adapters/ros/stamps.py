@@ -1,4 +1,4 @@
-"""Headers of messages: their stamp and frame id, checked."""
+"""Checks stamp and frame id of message headers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def stamp_ns(header: ros.std_msgs__msg__Header) -> int:
 
 
 def frame_id(text: str) -> str:
-    """The frame id as it is.
+    """The frame id, unchanged, if it is not too long.
 
     Raises:
         DecodeError: `frame_id_invalid`.

@@ -1,8 +1,8 @@
-"""The tree of static transforms (`/tf_static`): how the frames of a vehicle lie to one another.
+"""The tree of static transforms (`/tf_static`): the poses between the frames of a vehicle.
 
-tf knows one parent per frame, and the last that was said of a joint holds. What senders say is bounded before it is
-kept: names, places, joints. Trees that contradict tf's rule, and joints that change, are told, for whoever reads a
-calibration off them to judge.
+In tf each frame has one parent, and the latest transform of a joint holds. Names, positions and the number of joints
+are bounded before anything is kept. Trees that violate tf's rule, and joints that change, are reported, so that the
+code that reads a calibration from them can judge.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from coec.errors import DecodeError
 from coec.geometry.se3 import inverse
 
 MAX_JOINTS: Final = 2048
-"""Kept in all; vehicles have some hundred."""
+"""Most joints that are kept; vehicles have some hundred."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +34,10 @@ class Joint:
 
 
 class StaticTransforms:
-    """All that was said of static transforms. Not safe for use from several threads.
+    """All static transforms received so far. Not safe for use from several threads.
 
     Attributes:
-        replaced: how often a joint that was known came with another value.
+        replaced: how often a known joint came with another value.
     """
 
     def __init__(self) -> None:
@@ -46,14 +46,14 @@ class StaticTransforms:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """All frames that are named, in the order of their names."""
+        """All named frames, sorted by name."""
         return tuple(sorted({*self._joints, *(parent for parents in self._joints.values() for parent in parents)}))
 
     def take(self, joints: tuple[Joint, ...]) -> None:
-        """Add these joints; what was said of the same frames before no longer holds.
+        """Add these joints; they replace earlier joints between the same frames.
 
         Raises:
-            DecodeError: with them there are more than `MAX_JOINTS`; none is taken.
+            DecodeError: there would be more than `MAX_JOINTS`; then none is added.
         """
         known = {(joint.child, joint.parent) for parents in self._joints.values() for joint in parents.values()}
         fresh = {(joint.child, joint.parent) for joint in joints} - known
@@ -67,13 +67,13 @@ class StaticTransforms:
             parents[joint.parent] = joint
 
     def transform(self, target: str, source: str) -> Matrix4 | None:
-        """T_target_source (4, 4) along the fewest joints, or None where they do not connect the two."""
+        """T_target_source (4, 4) along the fewest joints; None if no joints connect the two frames."""
         way = self._way(bare(target), bare(source))
         return None if way is None else way[-1][1]
 
     def doubts(self, target: str, source: str) -> tuple[str, ...]:
-        """What on the way between two frames no tree can be, one sentence each: a frame with several parents, of which
-        tf takes whichever it heard last, or a loop."""
+        """What violates the tree on the way between two frames, one sentence each: a frame with several parents, of
+        which tf takes the one it heard last, or a loop."""
         on_the_way = {frame for frame, _ in self._way(bare(target), bare(source)) or ()}
         several = [
             f"frame {child!r} has the parents {' and '.join(repr(parent) for parent in sorted(parents))}"
@@ -117,8 +117,8 @@ class StaticTransforms:
         return neighbours
 
     def _loops(self) -> Iterator[list[str]]:
-        """Ways up from child to parent that come back to where they were, each once. Of several parents the first is
-        gone up to: that there are several is told anyway."""
+        """Paths from child to parent that lead back to a frame on them, each once. Of several parents only the first is
+        followed, because several parents are reported anyway."""
         done: set[str] = set()
         for start in sorted(self._joints):
             way: dict[str, None] = {}
@@ -136,7 +136,7 @@ def decode_joints(payload: bytes) -> tuple[Joint, ...]:
     """The joints of a `TFMessage` in CDR.
 
     Raises:
-        DecodeError: not such a message, or one of its transforms is none.
+        DecodeError: not this message, or one of its transforms is invalid.
     """
     return tuple(_joint(stamped) for stamped in transforms_in(payload))
 

@@ -1,7 +1,6 @@
-"""Messages on topics of ROS 2: what a recording holds, or is given as, with the topics on which they lie.
+"""Messages of a recording on ROS 2 topics, read or written, and the names of these topics.
 
-The topics of a pair that no driver named are below `/<pair>/`: those of the bags that are written here, and of what is
-played.
+In bags that coec writes, and by default in what it plays, the topics of a pair are below `/<pair>/`.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ Frame = CameraFrame | LidarFrame | EgoMotion
 
 
 LATCHED: Final = 100
-"""Messages of `/tf_static` that are kept for whoever comes later: as many as tf2's listeners ask for
-(tf2_ros/qos.hpp, StaticListenerQoS). A recording has one of each node that published some."""
+"""Messages of `/tf_static` that are kept for late subscribers: as many as tf2's listeners ask for (tf2_ros/qos.hpp,
+StaticListenerQoS). A recording has one from each node that published static transforms."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicMessage:
-    """A message on its way.
+    """A message on a topic.
 
     Attributes:
-        stamp_ns: when it was published; what its header says may be earlier.
+        stamp_ns: when it was published; the stamp of its header may be earlier.
         data: CDR.
     """
 
@@ -45,7 +44,7 @@ class TopicMessage:
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A topic of a recording: messages of a type, so many, and so many a second; 0 of fewer than two."""
+    """A topic of a recording: type, number of messages, and messages per second (0 for fewer than two)."""
 
     type_name: str
     count: int
@@ -53,14 +52,15 @@ class TopicInfo:
 
 
 def qos_of(topic: str) -> Qos:
-    """What a recording is played with: reliable, which all subscribers take; `/tf_static` waits for latecomers."""
+    """The quality of service of a played topic: reliable, which all subscribers accept; `/tf_static` also keeps its
+    messages for late subscribers."""
     return Qos(transient_local=True, depth=LATCHED) if topic == TF_STATIC else Qos()
 
 
 @dataclass(frozen=True, slots=True)
 class PairTopics:
-    """Where the frames of a pair lie; None: nowhere. `image_raw` is for images that are not compressed, `turns` for
-    motion of which only the rotation is known."""
+    """Topics of a pair's frames; None: not published. `image_raw` is for uncompressed images, `turns` for ego-motion of
+    which only the rotation is known."""
 
     image: str
     image_raw: str
@@ -71,14 +71,14 @@ class PairTopics:
 
     @classmethod
     def default(cls, pair: str) -> PairTopics:
-        """Those below `/<pair>/`."""
+        """The topics below `/<pair>/`."""
         image = f"/{pair}/camera/image"
         points, motion, turns = f"/{pair}/lidar/points", f"/{pair}/odometry", f"/{pair}/imu"
         return cls(f"{image}/compressed", image, f"/{pair}/camera/camera_info", points, motion, turns)
 
     @classmethod
     def of_pair(cls, pair: OpenPairConfig) -> PairTopics:
-        """Those of a configuration; the camera info lies where a service looks for it."""
+        """The topics in a configuration; the camera info is where a service looks for it."""
         image = pair.camera.place
         info = pair.camera.info_topic or info_topic(image)
         motion = pair.ego.place if pair.ego else None
@@ -89,14 +89,14 @@ class FrameTopics:
     """The frames of a recording as messages, with the camera info of each image, and `/tf_static` before the first."""
 
     def __init__(self, rig: Rig, T_camera_lidar: Matrix4, topics: PairTopics) -> None:
-        """`T_camera_lidar` (4, 4) is what `/tf_static` says."""
+        """`T_camera_lidar` (4, 4) is the transform in `/tf_static`."""
         self._rig = rig
         self._T_camera_lidar = T_camera_lidar
         self._topics = topics
         self._joined: set[str] = set()
 
     def of(self, frame: Frame) -> Iterator[TopicMessage]:
-        """Those of the next frame; depth maps are left out."""
+        """The messages of the next frame; depth maps are left out."""
         for child, joint in self._joints(frame):
             if child not in self._joined:
                 self._joined.add(child)
@@ -109,7 +109,7 @@ class FrameTopics:
         rig = self._rig
         joints = [(rig.lidar_frame, outgoing.encode_tf_static(rig, self._T_camera_lidar, frame.stamp_ns))]
         if isinstance(frame, EgoMotion) and frame.frame_id != rig.lidar_frame:
-            # The ego frame as a child of the LiDAR's, written by the same rule: child to parent.
+            # The ego frame as a child of the LiDAR's frame; this transform, too, maps child to parent.
             below = replace(rig, camera_frame=rig.lidar_frame, lidar_frame=frame.frame_id)
             joints.append((frame.frame_id, outgoing.encode_tf_static(below, rig.T_lidar_ego, frame.stamp_ns)))
         return joints
@@ -131,7 +131,7 @@ class FrameTopics:
 
 
 def _timed(rig: Rig, sweep: LidarFrame) -> LidarFrame:
-    """The sweep with the time of each point: topics have no other place for the timing of the rig."""
+    """The sweep with the time of each point, because messages have no other place for the rig's sweep timing."""
     if sweep.time_offset_s is not None or rig.sweep is None:
         return sweep
     return replace(sweep, time_offset_s=azimuth_offsets_s(sweep.xyz_m, rig.sweep).astype(np.float32))

@@ -1,4 +1,4 @@
-"""Messages of transforms (`tf2_msgs/TFMessage`), moving ones and static ones, read with bounds."""
+"""Reads messages of moving or static transforms (`tf2_msgs/TFMessage`), with bounds."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from coec.errors import DecodeError
 from coec.geometry.se3 import rotation_from_quaternion_xyzw, transform_from
 
 MAX_TRANSFORMS: Final = 2048
-"""Of a message; robots with many joints send some hundred at once."""
+"""Most transforms of a message; robots with many joints send some hundred at once."""
 
 MAX_MESSAGE_BYTES: Final = 2**20
-"""Of a message: as many transforms with names of usual length have 300 kB."""
+"""Largest message; `MAX_TRANSFORMS` transforms with names of usual length have 300 kB."""
 
 MAX_PLACE_M: Final = 1e9
-"""Of a transform, per axis, metres: frames of maps may lie at the centre of the earth, 6.4e6 m away."""
+"""Largest translation per axis, metres; map frames may lie at the centre of the earth, 6.4e6 m away."""
 
 
 def transforms_in(payload: bytes) -> list[Any]:
-    """The `TransformStamped` of a `TFMessage` in CDR, as they came.
+    """The `TransformStamped` in a `TFMessage` in CDR, unchanged.
 
     Raises:
         DecodeError: `message_too_large`, `transforms_too_many` or `message_malformed`.
@@ -57,5 +57,5 @@ def pose_of(stamped: Any) -> Matrix4:
 
 
 def bare(frame_id: str) -> str:
-    """A frame id without the slash that ROS 1 put before it."""
+    """A frame id without the leading slash of ROS 1."""
     return frame_id.lstrip("/")

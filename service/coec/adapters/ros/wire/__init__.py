@@ -1,1 +1,1 @@
-"""How ROS 2 speaks on Zenoh: keys, tokens and attachments as text and bytes; no session."""
+"""Wire format of ROS 2 on Zenoh: keys, tokens and attachments as text and bytes, without a session."""

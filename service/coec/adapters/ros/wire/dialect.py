@@ -1,5 +1,4 @@
-"""What rmw_zenoh and the bridge have in common: a topic has a key, a publisher a token and something beside each
-message."""
+"""What rmw_zenoh and the bridge have in common: keys of topics, tokens of publishers, attachments of messages."""
 
 from __future__ import annotations
 
@@ -9,11 +8,12 @@ from coec.adapters.ros.wire.qos import Qos
 
 
 class Dialect(Protocol):
-    """How one session speaks to ROS 2. `topic` begins with `/`, `type_name` is ROS's own (`sensor_msgs/msg/Image`)."""
+    """How one session speaks to ROS 2. `topic` begins with `/`; `type_name` is in ROS form
+    (`sensor_msgs/msg/Image`)."""
 
     @property
     def node_token(self) -> str | None:
-        """Liveliness token of the session's node; None where sessions are none."""
+        """Liveliness token of the session's node; None if sessions are no nodes."""
 
     def key(self, topic: str, type_name: str) -> str:
         """The Zenoh key of a topic."""
@@ -22,8 +22,8 @@ class Dialect(Protocol):
         """Liveliness token of a publisher; `number` counts the session's entities."""
 
     def subscriber_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str | None:
-        """Liveliness token of a subscriber; None where subscribing is enough."""
+        """Liveliness token of a subscriber; None if subscribing is enough."""
 
     def attachment(self, token: str, sequence: int, source_ns: int) -> bytes | None:
-        """What a message carries, the `sequence`-th (from 1) of the publisher of `token`; `source_ns` is the sender's
-        wall clock. None: nothing."""
+        """Attachment of the `sequence`-th message (from 1) of the publisher with `token`; `source_ns` is the sender's
+        wall clock. None: no attachment."""

@@ -1,4 +1,4 @@
-"""A publisher of a topic, as its liveliness token tells of it."""
+"""A publisher of a topic, as its liveliness token describes it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Publisher:
-    """`topic` and `type_name` as ROS says them.
+    """`topic` and `type_name` in ROS form.
 
     Attributes:
-        node: its full name; None where a bridge stands before it.
-        gid: by which its messages tell where they come from; None where they do not.
+        node: full name of its node; None if it is behind a bridge.
+        gid: id of the publisher in its messages; None if its messages have none.
     """
 
     topic: str

@@ -1,7 +1,7 @@
 """rmw_zenoh: keys of topics, liveliness tokens, attachments.
 
-Seen on the wire against rmw_zenoh_cpp 0.6.7 (Kilted), both directions; what Lyrical does otherwise was read in its
-source (0.10.5).
+Checked on the wire against rmw_zenoh_cpp 0.6.7 (Kilted), in both directions; the differences of Lyrical are taken from
+its source (0.10.5).
 """
 
 from __future__ import annotations
@@ -22,21 +22,23 @@ TOKENS: Final = "@ros2_lv"
 """First chunk of all liveliness tokens; a chunk that starts with `@` is not matched by `**`."""
 
 HASHLESS: Final = "TypeHashNotSupported"
-"""Humble writes this where later ones write the hash of the type."""
+"""Humble writes this in place of the hash of the type."""
 
 CPU_BACKEND: Final = "/backends:cpu:"
-"""Behind a subscriber's token: without it Lyrical sends messages with large arrays to a key of the token's own."""
+"""Suffix of a subscriber's token. Without it Lyrical sends messages with large arrays to a key specific to the
+token."""
 
 CPU_KEY: Final = "/_buf_cpu"
-"""Behind the key of a topic: there Lyrical's publishers put messages with large arrays for such subscribers."""
+"""Suffix of a topic's key to which Lyrical's publishers send messages with large arrays for subscribers with
+`CPU_BACKEND`."""
 
 MAX_TOKEN: Final = 1024
-"""Characters of a token that is read; those of real nodes have some 200."""
+"""Most characters of a token that is read; tokens of real nodes have some 200."""
 
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 
 MAX_ATTACHMENT: Final = _ATTACHMENT.size
-"""Bytes; a longer one is none."""
+"""Size of an attachment in bytes; anything longer is not one."""
 
 _TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _NODE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+|/")
@@ -46,7 +48,7 @@ _TYPE: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]{0,127})::(msg|srv|action)::dds
 
 @dataclass(frozen=True, slots=True)
 class TopicKey:
-    """Where a topic lies: `<domain>/<topic>/<type>/<hash>`. `topic` begins with `/`; `type_name` is ROS's own
+    """The key of a topic: `<domain>/<topic>/<type>/<hash>`. `topic` begins with `/`; `type_name` is in ROS form
     (`sensor_msgs/msg/Image`)."""
 
     domain: int
@@ -61,7 +63,7 @@ class TopicKey:
 
     @classmethod
     def parse(cls, key: str) -> TopicKey:
-        """The inverse; what Lyrical appends (`/_buf_cpu`) is left out.
+        """The inverse of `key`; Lyrical's suffix (`/_buf_cpu`) is dropped.
 
         Raises:
             UsageError: not the key of a topic.
@@ -73,8 +75,8 @@ class TopicKey:
 
 
 def topic_expressions(domain: int, topic: str) -> tuple[str, str]:
-    """Key expressions that match the topic in whatever type, and no other topic; the second one where Lyrical's
-    publishers put messages with large arrays."""
+    """Key expressions that match the topic with any type, and no other topic. The second is for messages with large
+    arrays from Lyrical's publishers."""
     key = f"{domain}/{topic.strip('/')}/*/*"
     return key, key + CPU_KEY
 
@@ -117,7 +119,7 @@ class Node:
         return self._endpoint("MP", number, topic, qos)
 
     def subscriber(self, number: int, topic: TopicKey, qos: Qos) -> str:
-        """The token of a subscriber of this node, which takes large arrays as everybody else's."""
+        """The token of a subscriber of this node. It receives large arrays on a key shared by all subscribers."""
         return self._endpoint("MS", number, topic, qos) + CPU_BACKEND
 
     def _endpoint(self, kind: str, number: int, topic: TopicKey, qos: Qos) -> str:
@@ -135,7 +137,7 @@ def publisher_tokens(domain: int) -> str:
 
 
 def publisher_of(token: str) -> Publisher | None:
-    """The publisher that a token tells of; None where it tells of none, or of one that no ROS could have."""
+    """The publisher that a token describes; None if it describes none, or one that is impossible in ROS."""
     chunks = token.split("/") if len(token) <= MAX_TOKEN else []
     if len(chunks) < 13 or chunks[0] != TOKENS or chunks[5] != "MP":
         return None
@@ -148,7 +150,7 @@ def publisher_of(token: str) -> Publisher | None:
 
 @dataclass(frozen=True, slots=True)
 class RmwZenoh:
-    """The dialect of a session that is one node; `type_hash` gives the RIHS01 of a type by its name."""
+    """The dialect of a session that is one node; `type_hash` returns the RIHS01 hash of a type by its name."""
 
     node: Node
     type_hash: Callable[[str], str]
@@ -179,7 +181,7 @@ class RmwZenoh:
 
 
 def mangled(name: str) -> str:
-    """A name of ROS as one chunk of a key."""
+    """A ROS name as one chunk of a key."""
     return name.replace("/", "%")
 
 
@@ -190,7 +192,7 @@ def unmangled(chunk: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """What comes with each message: its number (from 1), the sender's wall clock, and who the publisher is."""
+    """What comes with each message: its number (from 1), the sender's wall clock, and the publisher's id."""
 
     sequence: int
     source_ns: int
@@ -198,12 +200,12 @@ class Attachment:
 
     @property
     def packed(self) -> bytes:
-        """33 bytes. Without them rmw_zenoh drops a message."""
+        """33 bytes. rmw_zenoh drops a message without them."""
         return _ATTACHMENT.pack(self.sequence, self.source_ns, len(self.gid), self.gid)
 
     @classmethod
     def parse(cls, attachment: bytes | None) -> Attachment | None:
-        """The inverse; None where it is none."""
+        """The inverse of `packed`; None if the bytes are no attachment."""
         if attachment is None or len(attachment) != _ATTACHMENT.size:
             return None
         sequence, source_ns, length, gid = _ATTACHMENT.unpack(attachment)
@@ -211,5 +213,5 @@ class Attachment:
 
 
 def gid_of(token: str) -> bytes:
-    """The 16 bytes by which a publisher is known, from its own token."""
+    """The 16-byte id of a publisher, computed from its token."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")

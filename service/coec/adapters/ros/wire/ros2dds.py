@@ -1,6 +1,6 @@
 """zenoh-bridge-ros2dds: keys of topics, and the tokens by which a bridge finds publishers and subscribers.
 
-Read in the source of zenoh-plugin-ros2dds 1.10.0.
+Taken from the source of zenoh-plugin-ros2dds 1.10.0.
 """
 
 from __future__ import annotations
@@ -13,47 +13,47 @@ from coec.adapters.ros.wire.publisher import Publisher
 from coec.adapters.ros.wire.qos import Qos
 
 SLASH: Final = "§"
-"""Stands for `/` where a key or a type is one chunk of a token."""
+"""Stands for `/` in a key or a type that is one chunk of a token."""
 
 _TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
 
 
 def topic_key(namespace: str, topic: str) -> str:
-    """`[namespace/]topic`, without the slashes at the ends."""
+    """`[namespace/]topic`, without slashes at the ends."""
     return "/".join(part for part in (namespace.strip("/"), topic.strip("/")) if part)
 
 
 @dataclass(frozen=True, slots=True)
 class Ros2dds:
-    """The dialect of a session beside a bridge. `session` is its Zenoh id, hexadecimal; `namespace` that of the bridge,
-    empty for none. Messages carry nothing but themselves."""
+    """The dialect of a session beside a bridge. `session` is its Zenoh id, hexadecimal; `namespace` is that of the
+    bridge, empty for none. Messages have no attachment."""
 
     session: str
     namespace: str
 
     @property
     def node_token(self) -> None:
-        """Bridges tell of routes, not of nodes."""
+        """None: bridges announce routes, not nodes."""
         return None
 
     def key(self, topic: str, type_name: str) -> str:
-        """See `Dialect`; the type is no part of it."""
+        """See `Dialect`; the type is not part of the key."""
         del type_name
         return topic_key(self.namespace, topic)
 
     def publisher_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str:
-        """See `Dialect`; there is one publisher of a topic in a session, which therefore has no number."""
+        """See `Dialect`. A session has one publisher per topic, so that the token has no number."""
         del number
         key, type_chunk = (name.replace("/", SLASH) for name in (self.key(topic, type_name), type_name))
         return f"@/{self.session}/@ros2_lv/MP/{key}/{type_chunk}/{qos_text(qos)}"
 
     def subscriber_token(self, number: int, topic: str, type_name: str, qos: Qos) -> None:
-        """See `Dialect`: a bridge reads what somebody subscribes to."""
+        """None: a bridge notices the subscription itself."""
         del number, topic, type_name, qos
 
     def attachment(self, token: str, sequence: int, source_ns: int) -> bytes | None:
-        """Nothing: the bridge reads none."""
+        """None: the bridge reads no attachments."""
         del token, sequence, source_ns
         return None
 
@@ -62,12 +62,12 @@ PUBLISHER_TOKENS: Final = "@/*/@ros2_lv/MP/*/*/*"
 """A key expression that matches the tokens of all publishers, of every bridge."""
 
 MAX_TOKEN: Final = 1024
-"""Characters of a token that is read; those of real bridges have some 150."""
+"""Most characters of a token that is read; tokens of real bridges have some 150."""
 
 
 def publisher_of(token: str, namespace: str) -> Publisher | None:
-    """The publisher behind a bridge that a token tells of; None where it tells of none, of one of another namespace, or
-    of one that no ROS could have."""
+    """The publisher behind a bridge that a token describes; None if it describes none, one of another namespace, or one
+    that is impossible in ROS."""
     chunks = token.split("/") if len(token) <= MAX_TOKEN else []
     if len(chunks) != 7 or chunks[0] != "@" or chunks[2:4] != ["@ros2_lv", "MP"]:
         return None
@@ -80,5 +80,5 @@ def publisher_of(token: str, namespace: str) -> Publisher | None:
 
 
 def qos_text(qos: Qos) -> str:
-    """`keyed:reliability:durability:history,depth`, the numbers those of Cyclone DDS; ROS's topics are keyless."""
+    """`keyed:reliability:durability:history,depth`, with the numbers of Cyclone DDS; ROS topics are keyless."""
     return f":{int(qos.reliable)}:{int(qos.transient_local)}:0,{qos.depth}"
