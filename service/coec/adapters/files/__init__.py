@@ -1,1 +1,1 @@
-"""What is kept in files, and values as JSON documents."""
+"""Files that are kept, and values as JSON documents."""

@@ -1,6 +1,6 @@
-"""`rig.json`: the baselines of the commissioned pairs of a vehicle, checksummed, the previous good copy beside it.
+"""`rig.json`: the baselines of a vehicle's commissioned pairs, with a checksum and the previous good copy beside it.
 
-Each baseline carries the sha256 of its own content, under which it is spoken of in history and reports.
+History and reports refer to a baseline by the sha256 of its content.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _length(count: int) -> FieldInfo:
 
 
 BASELINES = "rig.json"
-"""In the state directory: what was learned when the pairs were commissioned."""
+"""File in the state directory with what was learned when the pairs were commissioned."""
 
 
 class _Document(BaseModel):
@@ -44,7 +44,7 @@ class _Document(BaseModel):
 
 
 class AccuracyDocument(_Document):
-    """`Accuracy`; null on axes that are not searched (rad, m)."""
+    """`Accuracy` (rad, m); null on axes that are not searched."""
 
     bias: Maybe6
     bias_sigma: Maybe6
@@ -52,7 +52,7 @@ class AccuracyDocument(_Document):
 
 
 class LimitsDocument(_Document):
-    """`MonitorLimits`; null where there is no limit."""
+    """`MonitorLimits`; null: no limit."""
 
     max_distance2_rotation: float
     max_farthest2_pose: float
@@ -66,7 +66,7 @@ class LimitsDocument(_Document):
 
 
 class SceneDocument(_Document):
-    """`SceneBaseline`, of just as many parts as the monitor looks at."""
+    """`SceneBaseline`, with exactly as many parts as the monitor uses."""
 
     gradient: Annotated[tuple[Annotated[tuple[float, ...], _length(BLOCK_COLUMNS)], ...], _length(BLOCK_ROWS)]
     bands: Annotated[tuple[float, ...], _length(BANDS)]
@@ -75,7 +75,7 @@ class SceneDocument(_Document):
 
 
 class BaselineDocument(_Document):
-    """`Baseline`, floats written so that they read back to the same bits."""
+    """`Baseline`; floats are written so that they read back to the same bits."""
 
     pair: str
     T_camera_lidar: Matrix4x4
@@ -95,7 +95,7 @@ class BaselineDocument(_Document):
 
 
 def save_baseline(path: Path, baseline: Baseline) -> str:
-    """Adds a baseline to `rig.json`, or replaces that of its pair; on the disk when this returns. Its hash.
+    """Adds a baseline to `rig.json`, or replaces that of its pair. Returns its hash, once it is on the disk.
 
     Raises:
         StateError: the disk is full or the folder not writable.
@@ -112,7 +112,7 @@ def save_baseline(path: Path, baseline: Baseline) -> str:
 
 
 def load_baseline(path: Path, pair: str) -> Baseline | None:
-    """The baseline of a pair; None where there is none.
+    """The baseline of a pair; None if there is none.
 
     Raises:
         StateError: the file and its previous copy are damaged.
@@ -122,7 +122,7 @@ def load_baseline(path: Path, pair: str) -> Baseline | None:
 
 
 def load_baselines(path: Path) -> dict[str, Baseline]:
-    """All of a file, by pair; none where there is no file.
+    """All baselines in a file, by pair; empty if there is no file.
 
     Raises:
         StateError: as `load_baseline`.
@@ -131,11 +131,11 @@ def load_baselines(path: Path) -> dict[str, Baseline]:
 
 
 def baseline_of(rig: Rig, state: StateConfig) -> Baseline | None:
-    """What is known of a rig: what was learned when it was commissioned, else what commissioned vehicles of its model
-    tell, if the configuration names that; None where there is neither.
+    """The baseline of a rig: the one learned when it was commissioned, else the one of its vehicle model if the
+    configuration names a file for that; None if there is neither.
 
     Raises:
-        StateError: a file is damaged, or that of the model has nothing of this pair.
+        StateError: a file is damaged, or that of the model has no baseline of this pair.
     """
     own = load_baseline(state.directory / BASELINES, rig.pair)
     if own is not None or state.model is None:
@@ -152,13 +152,13 @@ def baseline_hash(baseline: Baseline) -> str:
 
 
 def hash_of(document: dict[str, Any]) -> str:
-    """The same of a document."""
+    """The same for a document."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def baseline_to_json(baseline: Baseline) -> dict[str, Any]:
-    """As JSON values."""
+    """The baseline as JSON values."""
     limits, scene = baseline.monitor, baseline.scene
     document = BaselineDocument(
         pair=baseline.pair,
@@ -197,10 +197,10 @@ def baseline_to_json(baseline: Baseline) -> dict[str, Any]:
 
 
 def baseline_from_json(values: object) -> Baseline:
-    """The exact inverse.
+    """The exact inverse of `baseline_to_json`.
 
     Raises:
-        StateError: not such a document; says where.
+        StateError: not a valid document; says where.
     """
     try:
         document = BaselineDocument.model_validate(values)

@@ -1,5 +1,5 @@
-"""Estimates to wire models and back. The way there and back gives the same bytes, so that what one process
-solved and another serves, stores or replays is one result."""
+"""Converts estimates to wire models and back. A round trip gives the same bytes, so that the result that one process
+solves is exactly the one that another serves, stores or replays."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def matrix_of(transform: replies.Transform) -> Matrix4:
 
 
 def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.CalibrationResult:
-    """Everything of an estimate, for programs and people. NaN becomes null, infinity the largest double."""
+    """The wire form of an estimate, complete. NaN becomes null, infinity the largest double."""
     optimum, uncertainty = estimate.optimum, estimate.uncertainty
     return replies.CalibrationResult(
         vehicle=vehicle,
@@ -93,8 +93,8 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
 
 
 def comparable(reached: replies.CalibrationResult, recorded: replies.CalibrationResult) -> replies.CalibrationResult:
-    """A result, to be compared with a recorded one byte by byte: what an earlier version of the program recorded says
-    so of itself, and that is no difference in the decision."""
+    """`reached` with the schema version of `recorded`, for a comparison byte by byte: a recording by an earlier version
+    of the program holds that version, which is no difference in the decision."""
     return reached.model_copy(update={"schema_version": recorded.schema_version})
 
 
@@ -109,7 +109,7 @@ def _moved_of(moved: MovedWithin) -> replies.MovedWithin:
 
 
 def estimate_of(result: replies.CalibrationResult) -> Estimate:
-    """The estimate that `result_of` wrote: every number the same double, metrics in order of their names."""
+    """The estimate that `result_of` wrote, with the same doubles; metrics are sorted by name."""
     return Estimate(
         window_id=result.window_id,
         data_stamp_ns=result.data_stamp_ns,
@@ -194,7 +194,7 @@ def check_of(observation: Observation, after: PairState) -> replies.CheckReply:
 
 
 def _limit_of(metric: replies.MetricReply) -> float:
-    """No limit is one that every figure keeps."""
+    """The limit; if there is none, an infinite one that every figure keeps."""
     if metric.limit is not None:
         return metric.limit
     return -math.inf if metric.at_least else math.inf
@@ -210,8 +210,8 @@ def _in_degrees(rad_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def number_or_null(value: float) -> float | None:
-    """JSON has neither NaN nor infinity. The largest double stands on the same side of every limit as
-    infinity."""
+    """The value for JSON, which has neither NaN nor infinity: null for NaN, the largest double for infinity, which is
+    on the same side of every limit."""
     if math.isnan(value):
         return None
     return float(min(max(value, -sys.float_info.max), sys.float_info.max))

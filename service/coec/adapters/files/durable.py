@@ -1,9 +1,9 @@
-"""Files that survive a full disk and a power cut, the one place that knows how: replacement, lines at an end, removal.
+"""File operations that survive a full disk and a power cut: replacing, appending lines, removing.
 
-What a function here has done is on the disk when it returns: the data of a file by fsync of the file, its name by fsync
-of the folder. Whatever the system refuses is raised as the `OSError` that it gave, and leaves the files as they were
-or, where only the last fsync failed, as they were meant to be; never in between. Nothing here is safe from several
-threads at once.
+When a function here returns, its effect is on the disk: the data of a file by fsync of the file, its name by fsync of
+the folder. If the system refuses something, its `OSError` is raised. Then the files are as they were, or, if only the
+last fsync failed, as they were meant to be, never in between. Nothing here is safe for use from several threads at
+once.
 """
 
 from __future__ import annotations
@@ -15,25 +15,27 @@ from pathlib import Path
 from typing import BinaryIO
 
 FRESH_SUFFIX = ".new"
-"""Of a file that is about to replace another; found at a start it is of no use, and the next replacement's own."""
+"""Suffix of a file that is about to replace another. One that is found at a start is useless; the next replacement
+overwrites it."""
 
 _MODE = 0o666
-"""Permissions of a new file, less what the umask of the process takes off: those that `open` gives."""
+"""Permissions of a new file before the umask of the process, as `open` uses them."""
 
 MAX_ASIDE = 8
-"""Files of one name that are kept aside: those that came first tell most, and a disk that damages every file must not
-be filled by them."""
+"""Most files of one name that are kept aside. The first ones tell most, and a disk that damages every file must not be
+filled by them."""
 
 _LINK_SUFFIX = ".link"
-"""Of the second name of a file that is about to become the previous copy."""
+"""Suffix of the second name of a file that is about to become the previous copy."""
 
 
 def replace(path: Path, data: bytes, previous: Path | None = None) -> None:
-    """Make `data` the whole content of a file, which is there as it was or as it shall be, at any moment.
+    """Make `data` the whole content of a file, atomically: at any moment the file has either the old or the new
+    content.
 
     Args:
         path: the file; need not exist.
-        previous: where what is replaced is kept, if there is something; None: nowhere.
+        previous: path that receives the replaced file, if there was one; None: it is not kept.
     """
     fresh, link = _beside(path, FRESH_SUFFIX), _beside(path, _LINK_SUFFIX)
     try:
@@ -45,14 +47,14 @@ def replace(path: Path, data: bytes, previous: Path | None = None) -> None:
                 link.replace(previous)
         fresh.replace(path)
         sync_folder(path.parent)
-    finally:  # nothing to remove after a success, but a rename onto another name of the same file leaves its own
+    finally:  # after a success only `link` may be left: renaming it onto another name of the same file does nothing
         for leftover in (fresh, link):
             with suppress(OSError):
                 leftover.unlink(missing_ok=True)
 
 
 def publish(stream: BinaryIO, temporary: Path, final: Path) -> None:
-    """Close a file that was written under a temporary name, and give it its own when it is on the disk."""
+    """Close a file that was written under a temporary name, and rename it once its data are on the disk."""
     stream.flush()
     os.fsync(stream.fileno())
     stream.close()
@@ -67,8 +69,8 @@ def keep_under(path: Path, other: Path) -> None:
 
 
 def set_aside(path: Path, suffix: str) -> None:
-    """Give a file that is about to be replaced a second name beside it: its own and `suffix`, and -1, -2 and so on. One
-    that is not there needs none. The first `MAX_ASIDE` are kept, and the newest of the later ones."""
+    """Give a file that is about to be replaced a second name beside it: its name and `suffix`, then `suffix`-1, -2 and
+    so on. Does nothing if the file does not exist. The first `MAX_ASIDE` are kept, and the newest of the later ones."""
     names = [_beside(path, suffix), *(_beside(path, f"{suffix}-{number}") for number in range(1, MAX_ASIDE + 1))]
     other = next((name for name in names if not name.exists()), names[-1])
     other.unlink(missing_ok=True)
@@ -77,13 +79,13 @@ def set_aside(path: Path, suffix: str) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file; one that is not there is removed already."""
+    """Remove a file, if it exists."""
     path.unlink(missing_ok=True)
     sync_folder(path.parent)
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder of files; one that is not there is removed already."""
+    """Remove a folder of files, if it exists."""
     with suppress(FileNotFoundError):
         for path in sorted(folder.iterdir()):
             path.unlink(missing_ok=True)
@@ -92,13 +94,13 @@ def remove_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, as far as they are missing."""
+    """Make a folder and its missing parents."""
     if folder.is_dir():
         return
     make_folder(folder.parent)
     with suppress(FileExistsError):
         folder.mkdir()
-    sync_folder(folder)  # refuses what is there under this name and is no folder
+    sync_folder(folder)  # raises if the name belongs to something that is no folder
     sync_folder(folder.parent)
 
 
@@ -112,11 +114,11 @@ def sync_folder(folder: Path) -> None:
 
 
 class Log:
-    """A file of lines that grows at its end, and is written anew when it has become too long.
+    """A file of lines that grows at its end and is rewritten when it has become too long.
 
-    How many bytes of it are sound is known at any time: what stands behind them, left by a write that failed in this
-    process or by the end of an earlier one, is cut off before anything is written behind it. Lines that could not be
-    written wait, and go to the disk in order with the next.
+    The log knows how many bytes of the file are sound. Anything behind them, left by a failed write of this process or
+    by the end of an earlier one, is cut off before more is written. Lines that could not be written wait and go to the
+    disk in order with the next.
     """
 
     def __init__(self, path: Path, limit: int, content: Callable[[], Iterable[bytes]]) -> None:
@@ -124,9 +126,9 @@ class Log:
 
         Args:
             path: the file; its folder must exist.
-            limit: lines; a file of twice as many is written anew.
-            content: all lines that the file shall hold, from the memory of its owner, those that wait among them;
-                asked for when the file is written anew.
+            limit: number of lines; a file with twice as many is rewritten.
+            content: returns all lines that the file should hold, from the owner's memory, including the waiting ones;
+                called when the file is rewritten.
         """
         self._path = path
         self._limit = limit
@@ -140,14 +142,14 @@ class Log:
 
     @property
     def waiting(self) -> bool:
-        """Whether a line is not on the disk, or the file not what it shall be."""
+        """Whether a line is not on the disk yet, or the file has to be rewritten."""
         return bool(self._waiting) or self._anew
 
     def load(self) -> list[bytes]:
-        """The whole lines of the file, without their ends; none when there is no file. A torn last one is left out.
+        """The complete lines of the file, without line ends; empty if there is no file. A torn last line is left out.
 
         Raises:
-            OSError: it is there, but cannot be read; it will be written anew.
+            OSError: the file exists but cannot be read; it will be rewritten.
         """
         self._anew = True
         try:
@@ -161,7 +163,7 @@ class Log:
         return lines
 
     def renew(self) -> None:
-        """The file is not what it shall be: the next `flush` writes it anew from `content`."""
+        """Mark the file as wrong, so that the next `flush` rewrites it from `content`."""
         self._anew = True
 
     def add(self, line: bytes) -> None:
@@ -172,10 +174,10 @@ class Log:
             self._anew = True
 
     def flush(self) -> None:
-        """Write what waits.
+        """Write the waiting lines.
 
         Raises:
-            OSError: it could not be written; it waits for the next call.
+            OSError: they could not be written; they wait for the next call.
         """
         if not self.waiting:
             return
@@ -190,7 +192,7 @@ class Log:
         self._waiting.clear()
 
     def _rewrite(self) -> None:
-        self._anew = True  # whether the old or the new file is there is not known should the last fsync fail
+        self._anew = True  # if the last fsync fails, it is not known whether the old or the new file is there
         lines = list(self._content())
         data = _joined(lines)
         replace(self._path, data)
@@ -200,14 +202,14 @@ class Log:
         self._longest = 2 * max(self._limit, len(lines))
 
     def _was_cut(self) -> bool:
-        """Whether somebody else has cut or removed the file."""
+        """Whether somebody else has truncated or removed the file."""
         try:
             return self._path.stat().st_size < self._sound_bytes
         except FileNotFoundError:
             return self._sound_bytes > 0
 
     def _write(self, data: bytes) -> None:
-        """Write behind what is sound, and cut what cannot be finished; if not even that is possible, the next does."""
+        """Write behind the sound bytes. If that fails, truncate to them; if that fails, too, the next write does it."""
         descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, _MODE)
         try:
             try:
@@ -221,7 +223,7 @@ class Log:
                 raise
         finally:
             os.close(descriptor)
-        if not self._named:  # by this process: whether an earlier one came so far is not known
+        if not self._named:  # once per process, as an earlier one may not have got this far
             sync_folder(self._path.parent)
             self._named = True
 
@@ -236,7 +238,7 @@ def _write_new(path: Path, data: bytes) -> None:
 
 
 def _write_at(descriptor: int, data: bytes, at: int) -> None:
-    """The system may take less than it is given; a full disk then refuses the rest."""
+    """Write all of `data`; a single call may write less, and on a full disk the next one then fails."""
     view = memoryview(data)
     while view:
         count = os.pwrite(descriptor, view, at)

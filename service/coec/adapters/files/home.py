@@ -1,4 +1,4 @@
-"""Paths below a home directory, as people and configurations write them."""
+"""Paths below a home directory, written with `~`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from pathlib import Path
 
 
 def from_home(path: str) -> Path:
-    """A path with `~` or `~name` at its beginning read as that user's home; as it stands where there is none: the user
-    that a service manager makes up for a service has no home."""
+    """A path with a leading `~` or `~name` replaced by that user's home. It stays as it is if the user has no home, as
+    the dynamic user that a service manager creates for a service."""
     return Path(os.path.expanduser(path))  # noqa: PTH111  pathlib's own raises where there is no home

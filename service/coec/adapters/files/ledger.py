@@ -1,4 +1,5 @@
-"""The newest lines of a file: put down in memory by whoever has one, written by whoever may wait for a disk."""
+"""The newest items of a log file: any thread adds them in memory, and a thread that may wait for the disk writes
+them."""
 
 from __future__ import annotations
 
@@ -14,14 +15,14 @@ T = TypeVar("T")
 
 
 class Ledger(Generic[T]):
-    """Items in order, each a line of the file. Safe to use from several threads: only `load` and `flush` wait for the
-    disk, and nobody waits for them."""
+    """Items in order, each a line of the file. Safe for use from several threads: only `load` and `flush` wait for the
+    disk, and no other method waits for them."""
 
     def __init__(self, path: Path, limit: int, line_of: Callable[[T], bytes]) -> None:
         """
         Args:
             path: the file; its folder must exist.
-            limit: items kept, the newest.
+            limit: number of items kept, the newest.
             line_of: the line of an item, without its end.
         """
         self._line_of = line_of
@@ -30,28 +31,27 @@ class Ledger(Generic[T]):
         self._kept: deque[T] = deque(maxlen=limit)
         self._waiting: list[T] = []
         self._anew = False
-        # Only whoever writes uses these.
+        # Only the writing thread uses these.
         self._writing = threading.Lock()
         self._content: tuple[T, ...] = ()
         self._log = Log(path, limit, lambda: map(line_of, self._content))
         self._on_disk: tuple[T, ...] = ()
 
     def load(self) -> list[bytes]:
-        """The whole lines of the file; see `Log.load`. To be called before the ledger is used by several threads, as
-        `found`.
+        """The complete lines of the file; see `Log.load`. Call this and `found` before several threads use the ledger.
 
         Raises:
-            OSError: it is there, but cannot be read; it will be written anew.
+            OSError: the file exists but cannot be read; it will be rewritten.
         """
         return self._log.load()
 
     def found(self, item: T) -> None:
-        """An item was in the file."""
+        """Add an item that was found in the file."""
         self._kept.append(item)
         self._on_disk = tuple(self._kept)
 
     def renew(self) -> None:
-        """The file is not what it shall be: the next `flush` writes it anew."""
+        """Mark the file as wrong, so that the next `flush` rewrites it."""
         with self._lock:
             self._anew = True
 
@@ -61,16 +61,16 @@ class Ledger(Generic[T]):
         return self._on_disk[-1] if self._on_disk else None
 
     def on_disk(self) -> tuple[T, ...]:
-        """All that are on the disk, oldest first."""
+        """All items on the disk, oldest first."""
         return self._on_disk
 
     def items(self) -> tuple[T, ...]:
-        """All that are kept, oldest first."""
+        """All kept items, oldest first."""
         with self._lock:
             return tuple(self._kept)
 
     def add(self, make: Callable[[T | None], T]) -> T:
-        """Keep one more, which `make` makes with the one before it; on the disk with the next `flush`."""
+        """Keep one more item, which `make` makes from the one before it. The next `flush` puts it on the disk."""
         with self._lock:
             item = make(self._kept[-1] if self._kept else None)
             self._kept.append(item)
@@ -81,10 +81,10 @@ class Ledger(Generic[T]):
             return item
 
     def flush(self) -> None:
-        """Write what waits.
+        """Write the waiting items.
 
         Raises:
-            OSError: it could not be written; it waits for the next call.
+            OSError: they could not be written; they wait for the next call.
         """
         with self._writing:
             with self._lock:

@@ -1,4 +1,4 @@
-"""Files that a command was asked to write."""
+"""Output files of commands."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from coec.schemas.base import M, from_json
 
 
 def try_folder(folder: Path) -> None:
-    """Make the folder and write into it, before the work of which the result is to be there.
+    """Make the folder and try to write into it, before the work whose result is to go there.
 
     Raises:
-        OutputError: it cannot be made, or not be written to.
+        OutputError: the folder cannot be made or written to.
     """
     if folder.is_file():
         raise OutputError(f"cannot write to {folder}: it is a file; name a folder with --output")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Permissions do not tell: of a full or read-only disk, or to root.
+        # A real write, because permissions say nothing about a full or read-only disk, and nothing at all to root.
         with tempfile.TemporaryFile(dir=folder) as trial:
             trial.write(b"\0")
     except OSError as error:
@@ -29,7 +29,7 @@ def try_folder(folder: Path) -> None:
 
 
 def try_file(path: Path) -> None:
-    """Likewise of a file, which stays as it is, or absent.
+    """Check that a file can be written; it is neither changed nor created.
 
     Raises:
         OutputError: it cannot be written.
@@ -42,7 +42,7 @@ def try_file(path: Path) -> None:
 
 
 def write(path: Path, data: bytes) -> Path:
-    """A whole file, its folder made if need be.
+    """Write a whole file, and make its folder if needed.
 
     Raises:
         OutputError: it cannot be written.
@@ -56,11 +56,11 @@ def write(path: Path, data: bytes) -> Path:
 
 
 def replace(path: Path, data: bytes) -> Path:
-    """Likewise, and at no moment is half of it there: for files that other programs read. One that is there keeps its
-    permissions, and a link stays one.
+    """The same, but atomically, for files that other programs read. An existing file keeps its permissions, and a link
+    stays a link.
 
     Raises:
-        OutputError: it cannot be written; what was there is there still.
+        OutputError: it cannot be written; then the old file is still there.
     """
     try:
         real = path.resolve()
@@ -75,7 +75,7 @@ def replace(path: Path, data: bytes) -> Path:
 
 
 def kept(path: Path, model: type[M]) -> M | None:
-    """A document that `to_json` made and that was written before; None where there is none, or a damaged one."""
+    """A document that `to_json` made, read from a file; None if there is none or it is damaged."""
     try:
         return from_json(model, path.read_bytes())
     except (OSError, DecodeError):

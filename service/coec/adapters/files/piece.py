@@ -9,7 +9,7 @@ from coec.errors import NotFoundError, UsageError
 
 
 def read_piece(path: Path, what: str, offset: int, length: int) -> bytes:
-    """`length` bytes of a file from `offset`; fewer at its end. `what` it is called where it cannot be read.
+    """`length` bytes of a file from `offset`, fewer at its end. `what` names the file in error messages.
 
     Raises:
         NotFoundError: it cannot be read.

@@ -28,7 +28,7 @@ from coec.geometry import cameras, se3
 
 
 class SweepDocument(BaseModel):
-    """`SweepTiming` in radians as it is, so that it reads back to the same bits."""
+    """`SweepTiming`, kept in radians so that it reads back to the same bits."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
@@ -47,7 +47,7 @@ class CloudDocument(BaseModel):
 
 
 class RigDocument(BaseModel):
-    """`rig.json`: everything of a `Rig` but its mask. Floats are written so that they read back to the same bits."""
+    """`rig.json`: a `Rig` without its mask. Floats are written so that they read back to the same bits."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
@@ -65,8 +65,8 @@ def rig_of(pair: PairConfig) -> Rig:
     """The rig that a configuration describes; reads its mask.
 
     Raises:
-        ConfigError: intrinsics that their model refuses, a matrix that is not rigid, a mask that is absent, not an
-            image, or not of the camera's size. Names the pair and the key.
+        ConfigError: the model refuses the intrinsics, a matrix is not rigid, or the mask is absent, not an image, or
+            not of the camera's size. Names the pair and the key.
     """
     camera = _camera(pair.camera.intrinsics, f"pair {pair.name}, camera.intrinsics")
     ego = pair.ego
@@ -84,10 +84,10 @@ def rig_of(pair: PairConfig) -> Rig:
 
 
 def check_given(pair: OpenPairConfig) -> None:
-    """What an awaited pair is given of its rig, as far as that can be looked at without the rest.
+    """Checks the parts of an awaited pair's rig that the configuration gives, as far as possible without the rest.
 
     Raises:
-        ConfigError: intrinsics that their model refuses, a matrix that is not rigid, a mask that is not there.
+        ConfigError: the model refuses the intrinsics, a matrix is not rigid, or the mask does not exist.
     """
     where = f"pair {pair.name}"
     if pair.camera.intrinsics is not None:
@@ -114,10 +114,10 @@ def camera_of(intrinsics: CameraIntrinsics) -> cameras.Camera:
 
 
 def rigid_matrix(rows: Matrix4x4, where: str) -> Matrix4:
-    """(4, 4) float64, certain to be a rotation and a translation.
+    """(4, 4) float64, checked to be a rotation and a translation.
 
     Raises:
-        ConfigError: it is not; names `where`.
+        ConfigError: it is not; the message names `where`.
     """
     T = np.array(rows, dtype=np.float64)
     if not se3.is_rigid(T):
@@ -126,7 +126,7 @@ def rigid_matrix(rows: Matrix4x4, where: str) -> Matrix4:
 
 
 def load_mask(path: Path, camera: cameras.Camera) -> NDArray[np.bool_]:
-    """(height, width) bool from a PNG or JPEG: False where it is black in every channel.
+    """(height, width) bool from a PNG or JPEG: False at pixels that are black in every channel.
 
     Raises:
         ConfigError: unreadable, not an image, or not of the camera's size.
@@ -140,7 +140,7 @@ def load_mask(path: Path, camera: cameras.Camera) -> NDArray[np.bool_]:
 
 
 def mask_from_image(data: bytes, camera: cameras.Camera) -> NDArray[np.bool_]:
-    """(height, width) bool of an encoded image.
+    """(height, width) bool from an encoded image, likewise.
 
     Raises:
         DecodeError: not an image, or not of the camera's size.
@@ -156,7 +156,7 @@ def mask_from_image(data: bytes, camera: cameras.Camera) -> NDArray[np.bool_]:
 
 
 def mask_to_png(mask: NDArray[np.bool_]) -> bytes:
-    """A grey PNG, 255 where the mask is True."""
+    """A grey PNG, 255 at pixels where the mask is True, else 0."""
     return encode_png(np.where(mask, np.uint8(255), np.uint8(0)))
 
 
@@ -192,7 +192,7 @@ def rig_from_json(document: object, mask_png: bytes | None) -> Rig:
     """The exact inverse of `rig_to_json` and `mask_to_png`.
 
     Raises:
-        WindowError: not such a document; says where.
+        WindowError: not a valid document; says where.
     """
     try:
         parsed = RigDocument.model_validate(document)

@@ -1,8 +1,8 @@
-"""The thread that waits for the disk, so that nobody else does: it writes what others have put down in memory.
+"""The scribe: a thread that writes to the disk what other threads have noted in memory, so that only it has to wait.
 
-Whoever has put something down says so and goes on. A disk that is full, read-only or slow keeps it waiting, and costs
-nothing else: it is tried again every second, and what was put down meanwhile goes with it. Whoever has to know asks
-whether all is on the disk, and waits for no longer than a disk that is well needs.
+A thread that has noted something tells the scribe and goes on. If the disk is full, read-only or slow, only the scribe
+waits. It tries again every second, together with whatever was noted meanwhile. A thread that has to know can ask
+whether everything is on the disk; it waits no longer than a healthy disk needs.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from coec.errors import StateError
 _log = logging.getLogger(__name__)
 
 PATIENCE_S = 0.03
-"""A disk that is well takes the lines and the state of a command, five fsyncs, within 20 ms; commands are answered
-within 100 ms whatever the disk does."""
+"""Longest wait for the disk. A healthy disk takes the lines and the state of a command, five fsyncs, within 20 ms;
+commands are answered within 100 ms whatever the disk does."""
 
 RETRY_S = 1.0
-"""Between two attempts, and between two looks at how full the disk is."""
+"""Time between two attempts, and between two looks at how full the disk is."""
 
 SLOW_S = 1.0
-"""A disk that takes longer for some kB is said to be slow."""
+"""A disk that takes longer than this for some kB is reported as slow."""
 
 FULL_BYTES = 2**20
-"""Free space below which no entry is sure to find room."""
+"""Free space below which an entry may not find room."""
 
 
 class Book(Protocol):
-    """What can be written."""
+    """Something that can be written to the disk."""
 
     def flush(self) -> None:
-        """Write what was put down since the last time; may take as long as the disk does.
+        """Write what was noted since the last time; may take as long as the disk does.
 
         Raises:
             StateError: it could not be written; the next call tries again.
@@ -47,7 +47,7 @@ class Book(Protocol):
 
 
 class Scribe:
-    """Of all books in one folder. `thread` writes, everything else is for any thread."""
+    """Writes all books in one folder. `thread` writes; the methods are for any thread unless they say otherwise."""
 
     def __init__(self, folder: Path) -> None:
         self.thread = ServiceThread("scribe", self._run)
@@ -60,15 +60,15 @@ class Scribe:
         self._space: Reason | None = None
 
     def write(self, *books: Book) -> None:
-        """Something was put down in these books; it is written soon, in this order."""
+        """Have these books written soon, in this order, because something was noted in them."""
         with self._condition:
             self._due.update(dict.fromkeys(books))
             self._asked += 1
             self._condition.notify_all()
 
     def has_written(self) -> bool:
-        """Whether all that was put down before this call is on the disk. Waits for `PATIENCE_S` at most, and not at all
-        for a disk that refuses, or has kept others waiting for so long."""
+        """Whether everything noted before this call is on the disk. Waits at most `PATIENCE_S`, and not at all if the
+        disk refuses, or if the write under way has already taken that long."""
         with self._condition:
             wanted, end_s = self._asked, time.monotonic() + PATIENCE_S
             while self._written < wanted:
@@ -81,7 +81,7 @@ class Scribe:
 
     @property
     def trouble(self) -> Reason | None:
-        """What ails the disk; None while it is well."""
+        """What is wrong with the disk; None if nothing is."""
         begun_s, failure = self._begun_s, self._failure
         silent_s = 0.0 if begun_s is None else time.monotonic() - begun_s
         if silent_s > SLOW_S:
@@ -90,7 +90,7 @@ class Scribe:
         return failure or self._space
 
     def write_due(self) -> None:
-        """Write what is due. For the scribe's own thread, or where there is none."""
+        """Write the books that are due. For the scribe's own thread, or for use without a thread."""
         with self._condition:
             books, number = tuple(self._due), self._asked
             self._due.clear()
@@ -112,7 +112,7 @@ class Scribe:
             self._condition.notify_all()
 
     def look(self) -> None:
-        """See whether the disk has room. For the scribe's own thread: a disk that hangs does not even say that."""
+        """See whether the disk has room. For the scribe's own thread, because on a disk that hangs even this waits."""
         try:
             found = os.statvfs(self._folder)
         except OSError as error:
@@ -141,7 +141,7 @@ class Scribe:
         self.write_due()
 
     def request_stop(self) -> None:
-        """Write what is due once more, and end the thread."""
+        """Have the due books written once more, and end the thread."""
         self.thread.request_stop()
         with self._condition:
             self._condition.notify_all()

@@ -1,9 +1,9 @@
-"""What a vehicle remembers over a restart: `state.json` with a checksum, and the previous good copy beside it.
+"""The state that survives a restart: `state.json` with a checksum, and the previous good copy beside it.
 
 The file is the canonical JSON (sorted keys, no spaces) of `{"body": …, "checksum": sha256 of the canonical body,
-"schema_version": 1}`. A file that is not byte for byte what this module would write for its own body is damaged: no
-flipped bit can be read as a calibration. What cannot be used is kept beside the file that takes its place, as
-`.broken`, or as `.newer` where a later version of the service wrote it.
+"schema_version": 1}`. A file counts as damaged unless it is byte for byte what this module would write for its body, so
+that no flipped bit can be read as a calibration. An unusable file is kept beside the file that replaces it, as
+`.broken`, or as `.newer` if a later version of the service wrote it.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from coec.errors import StateError
 SCHEMA_VERSION = 1
 
 MAX_BYTES = 64 * 2**20
-"""Of a file that is read at all. 32 pairs with everything that may be in their state have below 1 MB."""
+"""Largest file that is read. 32 pairs with everything that their state can hold take less than 1 MB."""
 
 BROKEN, NEWER = ".broken", ".newer"
-"""Suffixes of what is kept aside."""
+"""Suffixes of files kept aside."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedState:
-    """What was found. `body` is None when there was no good copy; `damage` holds one sentence per bad copy."""
+    """What was found. `body` is None if there was no good copy; `damage` holds one sentence per bad copy."""
 
     body: dict[str, Any] | None
     damage: tuple[str, ...]
@@ -66,16 +66,17 @@ class StateFile:
         return LoadedState(None, tuple(damage))
 
     def distrust(self) -> None:
-        """What was loaded turned out to be of no use: it is kept aside, and does not become the previous copy."""
+        """Call this if the loaded body turns out to be unusable: it is kept aside and does not become the previous
+        copy."""
         self._aside[self._path if self._current_is_good else self._previous] = BROKEN
         self._current_is_good = False
 
     def save(self, body: dict[str, Any]) -> None:
-        """Replace the file; the copy it replaces, if good, becomes the previous one. What was found and could not be
-        used is kept aside first. On the disk when this returns.
+        """Replace the file; the replaced copy, if good, becomes the previous one. Unusable copies that were found are
+        kept aside first. On the disk when this returns.
 
         Raises:
-            StateError: the disk is full or the folder not writable; there is a good copy on the disk all the same.
+            StateError: the disk is full or the folder not writable; a good copy stays on the disk.
         """
         try:
             for path in tuple(self._aside):
@@ -119,7 +120,7 @@ def _decode(data: bytes) -> dict[str, Any]:
         raise StateError(f"is not of schema version {SCHEMA_VERSION}")
     try:
         expected = _encode(body)
-    except (ValueError, RecursionError) as error:  # lists that can be read may be too deep to be written
+    except (ValueError, RecursionError) as error:  # nesting that can be read may be too deep to write
         raise StateError("holds values that were never written") from error
     if expected != data:
         raise StateError("does not match its checksum")

@@ -1,1 +1,1 @@
-"""Images: decoded, measured, refused."""
+"""Images: decoding, quality, and refusal of bad ones."""

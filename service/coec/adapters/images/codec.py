@@ -1,9 +1,7 @@
-"""Images: bytes to pixels and back, by OpenCV, but never before their header was read and their size
-accepted.
+"""Decodes and encodes images with OpenCV, but only after reading the header and accepting the size.
 
-`cv2.imdecode` allocates whatever a header asks for (a 48 kB PNG can take 2.3 GB), and libjpeg fills what is
-missing of a truncated file with grey and says so only on stderr. Both are therefore decided here, on the
-bytes.
+`cv2.imdecode` allocates whatever a header asks for (a 48 kB PNG can take 2.3 GB), and libjpeg fills the missing part of
+a truncated file with grey and says so only on stderr. Therefore size and completeness are checked here, on the bytes.
 """
 
 from __future__ import annotations
@@ -22,18 +20,17 @@ from coec.config import LimitsConfig
 from coec.errors import DecodeError
 
 _MOSAIC_PX = 4
-"""A side of a mosaic has two pixels of each colour at least, for the others to lie between."""
+"""Least side of a mosaic: two pixels of each colour, so that colours can be interpolated between them."""
 
 _REDUCE_FROM_PX = 64
-"""Smaller images are judged at full size: half of them would leave too few gradients for a mean."""
+"""Smaller images are judged at full size, because at half size too few gradients would be left for a mean."""
 
 
 # --- before pixels -----------------------------------------------------------------------------------------
 
 
 def probe(data: bytes, limits: LimitsConfig) -> EncodedImage:
-    """Reads format and size from the header of a JPEG or PNG and checks that the file has its end. Decodes
-    nothing.
+    """Reads format and size from the header of a JPEG or PNG and checks that the file is complete. Decodes nothing.
 
     Raises:
         DecodeError: `image_unknown_format`, `image_truncated`, `image_too_large` or `image_corrupt`.
@@ -76,8 +73,8 @@ def _check_size(width: int, height: int, limits: LimitsConfig) -> None:
 
 
 def decode_bgr(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
-    """(height, width, 3) uint8 in OpenCV's order. An EXIF orientation is ignored: the camera model describes
-    the pixels as they were read out.
+    """(height, width, 3) uint8 in OpenCV's order. An EXIF orientation is ignored, because the camera model describes
+    the pixels as the sensor read them out.
 
     Raises:
         DecodeError: the reasons of `probe` and `raw_image`.
@@ -115,7 +112,7 @@ def decode_grey_reduced(image: EncodedImage, limits: LimitsConfig) -> NDArray[np
 
 
 def decode_depth(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.float32]:
-    """(height, width) float32: the codes of an 8- or 16-bit grey PNG as they are, NaN where 0 (no value).
+    """(height, width) float32: the codes of an 8- or 16-bit grey PNG unchanged, NaN for 0 (no value).
 
     Raises:
         DecodeError: `depth_not_grey`, or the reasons of `probe`.
@@ -154,7 +151,7 @@ def encode_png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _imdecode(image: EncodedImage, mode: int, limits: LimitsConfig) -> NDArray[np.uint8]:
-    # The header is read again here, so that no caller can hand over bytes whose size nobody has looked at.
+    # The header is read again here, so that no caller can pass bytes whose size was not checked.
     header = probe(image.data, limits)
     if (header.format, header.width, header.height) != (image.format, image.width, image.height):
         raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, "the image is not what its description says")
@@ -196,14 +193,14 @@ class GreyImages:
 
 
 class Compressed:
-    """Implements `ports.ImageReducer`. What came compressed stays as it came; raw pixels become grey JPEG: a tenth to a
-    thirtieth of their bytes, for 10 ms of a core each megapixel."""
+    """Implements `ports.ImageReducer`. Compressed images stay as they are. Raw pixels become a grey JPEG with a tenth
+    to a thirtieth of their bytes, which takes 10 ms of a core per megapixel."""
 
     def __init__(self, limits: LimitsConfig) -> None:
         self._limits = limits
 
     def reduced(self, frame: CameraFrame) -> CameraFrame:
-        """The frame without its depth map, its image compressed.
+        """The frame without its depth map and with its image compressed.
 
         Raises:
             DecodeError: the reasons of `raw_image`.
@@ -216,7 +213,7 @@ class Compressed:
 
 
 class CachedGreys:
-    """Keeps the grey images of the last frames: for solving one window many times. Implements `ports.ImageReader`."""
+    """Keeps the grey images of the last frames, for solving one window many times. Implements `ports.ImageReader`."""
 
     def __init__(self, reader: GreyImages, entries: int) -> None:
         self._reader = reader
@@ -240,20 +237,19 @@ class CachedGreys:
 class Inspector:
     """Implements `ports.ImageInspector`.
 
-    Sharpness is the mean of the squared differences between neighbours, over both directions, divided by
-    twice the variance of the grey values, on the picture at half its size: 0 for a uniform picture, 1 for
-    white noise. It does not change with brightness or contrast, falls with blur, and depends on the scene by
-    a factor of about five: on real exposures (KITTI-360, KITTI, a garage, a raw 180° fisheye with its black
-    rim) it is 0.011 to 0.057 as recorded, and 0.002 to 0.0055 after a Gaussian blur of 4 px, by which the
-    finest edges no longer mark anything. At an eighth of the size the two overlap (0.07 to 0.21 against 0.02
-    to 0.07): that is why it is not reduced further.
+    Sharpness is the mean squared difference between neighbours, over both directions, divided by twice the variance of
+    the grey values, on the image at half size: 0 for a uniform image, 1 for white noise. It does not change with
+    brightness or contrast, falls with blur, and varies with the scene by a factor of about five. On real exposures
+    (KITTI-360, KITTI, a garage, a raw 180° fisheye with its black rim) it is 0.011 to 0.057 as recorded, and 0.002 to
+    0.0055 after a Gaussian blur of 4 px, which removes the finest edges. At an eighth of the size the two ranges
+    overlap (0.07 to 0.21 against 0.02 to 0.07), which is why the image is not reduced further.
     """
 
     def __init__(self, limits: LimitsConfig) -> None:
         self._limits = limits
 
     def inspect(self, frame: CameraFrame) -> ImageQuality:
-        """Sharpness and exposure of the frame; reads every pixel once, keeps none.
+        """Sharpness and exposure of the frame; reads every pixel once and keeps none.
 
         Raises:
             DecodeError: the reasons of `probe` and `raw_image`.

@@ -1,4 +1,4 @@
-"""What a JPEG or PNG says of itself, read from its bytes with bounds, before a decoder believes it."""
+"""Reads the header of a JPEG or PNG with bounds, before a decoder trusts it."""
 
 from __future__ import annotations
 
@@ -19,20 +19,19 @@ _JPEG_SCAN = b"\xff\xda"
 # Markers of ITU-T T.81, table B.1.
 _SOF = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; Huffman
 _PROGRESSIVE = 0xC2
-_TABLES = (0xC4, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE)  # DHT, DQT, DRI, APPn, COM: what may lie before a scan
+_TABLES = (0xC4, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE)  # DHT, DQT, DRI, APPn, COM: may come before a scan
 _OTHER_SOF = (0xC3, *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0))  # lossless, differential, arithmetic
 _STANDALONE = (0x01, *range(0xD0, 0xD9))  # TEM, RST0-7, SOI: markers without a length
 
 _MAX_SEGMENTS = 512
-"""Segments before the frame header of a JPEG. Cameras write about ten; EXIF and a colour profile may take
-64."""
+"""Most segments before the frame header of a JPEG. Cameras write about ten; EXIF and a colour profile may take 64."""
 
 _MAX_SCANS = 100
-"""Scans of a progressive JPEG. Encoders write about ten. Each costs a pass over the whole image, however few
-bytes it has, so that a small file with many can occupy a decoder for hours."""
+"""Most scans of a progressive JPEG. Encoders write about ten. Each scan costs a pass over the whole image, however few
+bytes it has, so that a small file with many scans can occupy a decoder for hours."""
 
 _MAX_CHUNKS = 16_384
-"""Chunks of a PNG. Encoders write one for each 8 KiB of data: 4,096 in the largest message (32 MiB)."""
+"""Most chunks of a PNG. Encoders write one for each 8 KiB of data: 4,096 in the largest message (32 MiB)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +39,7 @@ class Header:
     """Format and size in pixels; `body` is the offset of the first byte behind the header.
 
     Attributes:
-        components: of a JPEG that is not progressive; 0 of all others.
+        components: number of components of a JPEG that is not progressive; 0 for all other images.
     """
 
     format: ImageFormat
@@ -66,9 +65,9 @@ def read_header(data: bytes) -> Header:
 
 
 def check_body(header: Header, data: bytes) -> None:
-    """Whether the file is whole, and nothing in it asks the decoder for more than it brings.
+    """Checks that the file is complete and does not make the decoder work for more than the file holds.
 
-    What a driver appends behind the end, such as padding to the size of its buffer, does no harm.
+    Bytes that a driver appends behind the end, such as padding to the size of its buffer, do no harm.
 
     Raises:
         DecodeError: `image_truncated`, `image_corrupt` or `image_unknown_format`.
@@ -78,14 +77,14 @@ def check_body(header: Header, data: bytes) -> None:
         return
     if not _is_one_scan(header, data) and _count_scans(data) > _MAX_SCANS:
         raise DecodeError(Refusal.IMAGE_CORRUPT, f"the JPEG has more than {_MAX_SCANS} scans")
-    # Entropy-coded data cannot hold the end marker, and a thumbnail's stands before the frame header.
+    # Entropy-coded data cannot contain the end marker, and that of a thumbnail comes before the frame header.
     if data.rfind(_JPEG_END, header.body) < 0:
         raise DecodeError(Refusal.IMAGE_TRUNCATED, "the JPEG has no end marker: it was cut off")
 
 
 def _is_one_scan(header: Header, data: bytes) -> bool:
-    """Whether the first scan of a JPEG holds all there is: a decoder then reads no other (libjpeg, jdinput.c). So it is
-    of nearly every camera, and these need not be gone through."""
+    """Whether the first scan of a JPEG holds all components; then a decoder reads no other (libjpeg, jdinput.c). This
+    is so for nearly every camera, and saves counting the scans."""
     at = header.body
     for _ in range(_MAX_SEGMENTS if header.components else 0):
         if at + 5 > len(data) or data[at] != 0xFF:
@@ -100,8 +99,8 @@ def _is_one_scan(header: Header, data: bytes) -> bool:
 
 
 def _count_scans(data: bytes) -> int:
-    """Occurrences of the marker of a scan, as `data.count` at a tenth of its time: words that begin at even places, and
-    those that begin at odd ones."""
+    """Number of scan markers, as `data.count` gives it, in a tenth of its time: it compares 16-bit words, once from
+    even and once from odd offsets."""
     marker = np.frombuffer(_JPEG_SCAN, np.uint16)
     words = (np.frombuffer(data, np.uint16, (len(data) - odd) // 2, odd) for odd in (0, 1))
     return sum(int(np.count_nonzero(half == marker)) for half in words)
@@ -118,7 +117,7 @@ def _png_header(data: bytes) -> Header:
 
 
 def _check_png_chunks(data: bytes, at: int) -> None:
-    """OpenCV's reader reserves the length that a chunk claims (up to 2 GiB) before it looks for the bytes."""
+    """Checks the chunk lengths, because OpenCV's reader allocates what a chunk claims (up to 2 GiB) before it reads."""
     for _ in range(_MAX_CHUNKS):
         if at + 12 > len(data):
             raise DecodeError(Refusal.IMAGE_TRUNCATED, "the PNG has no end: it was cut off")

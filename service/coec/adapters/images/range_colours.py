@@ -1,8 +1,9 @@
-"""Colours of ranges, for people: near is yellow, far is violet.
+"""Colours of ranges for pictures: near is yellow, far is violet.
 
-Of the perceptual colour maps plasma keeps ranges a quarter of the scale apart at least 18 apart in CIELAB for every
-kind of colour vision (Machado, Oliveira, Fernandes 2009: protanopia, deuteranopia, tritanopia); turbo 10, where its red
-and its green are one to a deuteranope; viridis as many as plasma, but its greens are lost on trees.
+With the perceptual colour map plasma, ranges a quarter of the scale apart differ by at least 18 in CIELAB for every
+kind of colour vision (Machado, Oliveira, Fernandes 2009: protanopia, deuteranopia, tritanopia). With turbo they differ
+by 10, because a deuteranope cannot distinguish its red from its green. Viridis is as good as plasma, but its greens are
+lost on trees.
 """
 
 from __future__ import annotations
@@ -15,25 +16,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 NEAREST_M, FURTHEST_M = 2.0, 80.0
-"""Ranges that the objective looks at, metres."""
+"""Ranges that the objective uses, metres."""
 
 DARKEST = 0.1
-"""Where the colours of far ranges end: what lies below is nearly black."""
+"""Place in the colour map where far ranges end; below it colours are nearly black."""
 
 ROBUST = (0.02, 0.98)
-"""Quantiles of the ranges in view between which the colours change: a bird or a church tower costs no colours."""
+"""Quantiles of the ranges in view between which the colours change, so that a bird or a church tower uses up no
+colours."""
 
 LEAST_RATIO = 4.0
-"""Of the far end to the near one: a wall is one colour, and not a rainbow of its noise."""
+"""Least ratio of the far end to the near end, so that a wall has one colour instead of a rainbow of its noise."""
 
 SAMPLES = 4096
-"""Ranges that the quantiles are taken of, about."""
+"""Approximate number of ranges from which the quantiles are taken."""
 
 STEPS = (1.0, 2.0, 5.0)
-"""Ends and figures of scales are these, times powers of ten."""
+"""Ends and labels of scales are these numbers, times powers of ten."""
 
 TURNED_STEPS = 2
-"""A scale is left when an end of the one that would fit is so many steps away: by one step it flickers."""
+"""A scale changes only if an end of the fitting scale is at least this many steps away; with one step it would
+flicker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,7 @@ class RangeScale:
         return np.asarray(self.nearest_m * (self.furthest_m / self.nearest_m) ** share, dtype=np.float64)
 
     def colours_bgr(self, range_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """(N, 3) of ranges (N,), metres."""
+        """Colours (N, 3) of ranges (N,), metres."""
         level = np.rint(255 * (1.0 - (1.0 - DARKEST) * self.share_of(range_m))).astype(np.uint8)
         return np.asarray(_PLASMA[level], dtype=np.uint8)
 
@@ -64,13 +67,13 @@ class RangeScale:
 
 
 WHOLE = RangeScale(NEAREST_M, FURTHEST_M)
-"""Of all that the objective looks at."""
+"""The scale over all ranges that the objective uses."""
 
 
 def scale_of(range_m: NDArray[np.floating]) -> RangeScale:
-    """The scale of a scene: from the nearest to the furthest of its ranges (N,), but for a few, at round steps; `WHOLE`
-    where there are none. What is nearer than `NEAREST_M` is the vehicle itself, and not drawn."""
-    # Of some thousand points the quantiles are known well enough, at a tenth of the time.
+    """The scale of a scene: from the nearest to the furthest of its ranges (N,), without a few outliers, at round
+    steps; `WHOLE` if there are no ranges. Points nearer than `NEAREST_M` are on the vehicle itself and not drawn."""
+    # Some thousand points give good enough quantiles in a tenth of the time.
     thinned = np.asarray(range_m[:: max(1, len(range_m) // SAMPLES)], dtype=np.float64)
     thinned = thinned[thinned >= NEAREST_M]
     if len(thinned) == 0:
@@ -83,8 +86,8 @@ def scale_of(range_m: NDArray[np.floating]) -> RangeScale:
 
 
 def kept_or(latest: RangeScale | None, fitting: RangeScale) -> RangeScale:
-    """The scale of the latest picture where it still does, else the one that fits this one: pictures of a drive keep
-    their colours."""
+    """The scale of the latest picture if it is still good enough, else the one that fits this picture, so that the
+    pictures of a drive keep their colours."""
     if latest is None:
         return fitting
     ends = ((latest.nearest_m, fitting.nearest_m), (latest.furthest_m, fitting.furthest_m))
@@ -92,7 +95,7 @@ def kept_or(latest: RangeScale | None, fitting: RangeScale) -> RangeScale:
 
 
 def _step(range_m: float) -> int:
-    """The number of the largest step that is no longer than a range: 0 is 1 m, 3 is 10 m."""
+    """The number of the largest step that is not above a range: 0 is 1 m, 3 is 10 m."""
     decade = floor(log10(range_m) + 1e-9)
     return 3 * decade + sum(10.0**decade * step <= range_m * (1 + 1e-9) for step in STEPS) - 1
 

@@ -1,11 +1,12 @@
-"""Raw pixels as cameras send them, to 8 bits of grey or colour.
+"""Converts raw pixels, as cameras send them, to 8 bits of grey or colour.
 
-Frames keep the pixels as they came: most are never looked at, and a window records what the camera gave.
+Frames keep the pixels as they came, because most are never used and a window records what the camera sent.
 
-Of 16-bit pixels the eight that count are taken: a camera of 10, 12 or 14 bits puts them into 16 either at the bottom or
-at the top, and says nowhere which. So the highest of 8, 10, 12, 14 and 16 bits that a picture makes use of becomes the
-highest of eight; a saturated pixel is white either way. A dark picture of 12 bits is read as one of 10, four times as
-bright: edges and depth do not depend on that.
+Of 16-bit pixels the eight significant bits are taken. A camera of 10, 12 or 14 bits puts its bits into 16 either at the
+bottom or at the top, and does not say where. So the image is taken to have the smallest depth of 8, 10, 12, 14 and 16
+bits that holds its largest value, and its highest bit becomes the highest of eight; a saturated pixel is white either
+way. A dark image of 12 bits is read as one of 10 bits, four times as bright, which matters neither for edges nor for
+depth.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ _DEPTHS: Final = (8, 10, 12, 14, 16)
 """Bits per pixel of image sensors."""
 
 _BLACK, _WHITE = 16, 235
-"""Luma of black and white in YUV (ITU-R BT.601), as OpenCV takes it where it makes colours of it."""
+"""Luma of black and white in YUV (ITU-R BT.601), as in OpenCV's conversions to colour."""
 
 _LUMA: Final = np.clip(np.rint((np.arange(256) - _BLACK) * (255 / (_WHITE - _BLACK))), 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """Of one format: `channels` of `dtype` a pixel; OpenCV's conversions, None where there is nothing to convert."""
+    """Layout of one format: `channels` of `dtype` per pixel; OpenCV's conversions, None if nothing is to convert."""
 
     dtype: np.dtype[Any]
     channels: int
@@ -61,13 +62,13 @@ _LAYOUTS: Final[dict[ImageFormat, _Layout]] = {
 }
 
 SUBSAMPLED: Final = (ImageFormat.YUV422, ImageFormat.YUV422_YUY2)
-"""Two pixels of a row share their colour."""
+"""Formats in which two pixels of a row share their colour."""
 
 MOSAICS: Final = tuple(form for form in ImageFormat if form.startswith("bayer_"))
-"""Each pixel has one colour."""
+"""Formats in which each pixel has one colour."""
 
 BYTES_PER_PIXEL: Final = {form: layout.channels * layout.dtype.itemsize for form, layout in _LAYOUTS.items()}
-"""Of every raw format; 16-bit values are little-endian."""
+"""Bytes per pixel of every raw format; 16-bit values are little-endian."""
 
 
 def bgr_of(image: EncodedImage) -> NDArray[np.uint8]:
@@ -80,14 +81,14 @@ def grey_of(image: EncodedImage) -> NDArray[np.uint8]:
     """(height, width) uint8 of a raw image whose size is checked; may be written to."""
     layout, pixels = _LAYOUTS[image.format], _pixels(image)
     if layout.to_grey is None:
-        # A copy where it is a view of the message: kernels are compiled once more for what may not be written to.
+        # Copy a read-only view of the message, because kernels would be compiled once more for read-only arrays.
         return pixels if pixels.flags.writeable else pixels.copy()
     grey = np.asarray(cv2.cvtColor(pixels, layout.to_grey), dtype=np.uint8)
     return np.asarray(cv2.LUT(grey, _LUMA), dtype=np.uint8) if image.format in SUBSAMPLED else grey
 
 
 def eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """The eight bits that count, see above; uint8 as it is."""
+    """The eight significant bits, see the module; uint8 is returned unchanged."""
     if pixels.dtype == np.uint8:
         return pixels
     used = int(pixels.max()).bit_length()
