@@ -1,1 +1,1 @@
-"""Depth maps: networks with their cards, and maps that came with the frames."""
+"""Depth maps: from networks with model cards, or received with the frames."""

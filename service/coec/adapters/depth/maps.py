@@ -1,4 +1,4 @@
-"""Where depth maps come from: a network, or maps that came with the frames."""
+"""Sources of depth maps: a network, or maps that came with the frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coec.config import DepthConfig, LimitsConfig
 from coec.errors import DecodeError, ModelError
 
 STEREO = "stereo"
-"""Value of `DepthConfig.model` that means: the maps which the source carries."""
+"""Value of `DepthConfig.model` that stands for the maps that come with the frames."""
 
 PRECOMPUTED = "precomputed"
 """Identity of depth that came with the frames."""
@@ -35,7 +35,7 @@ class PrecomputedDepth:
         return PRECOMPUTED
 
     def infer(self, frame: CameraFrame) -> DepthMap:
-        """The map of the frame, (h, w) float32, NaN where its code is 0.
+        """The map of the frame, (h, w) float32, NaN for code 0.
 
         Raises:
             DecodeError: `depth_missing`, or the map cannot be decoded.
@@ -50,13 +50,13 @@ class PrecomputedDepth:
 
 
 class CachedDepth:
-    """Remembers the latest maps of another `DepthModel`, by the content of the frame. One caller at a time.
+    """Keeps the latest maps of another `DepthModel`, by the content of the frame. One caller at a time.
 
-    Depth that was inferred while a slice was open is then not inferred again at the end of it.
+    So depth that was inferred while a slice was open need not be inferred again at its end.
     """
 
     def __init__(self, model: DepthModel, entries: int) -> None:
-        """`entries` maps are kept; the one that was not asked for the longest goes first."""
+        """`entries` maps are kept; the least recently used one is dropped first."""
         if entries < 1:
             raise ValueError(f"entries must be at least 1, got {entries}")
         self._model = model
@@ -65,11 +65,11 @@ class CachedDepth:
 
     @property
     def identity(self) -> str:
-        """That of the wrapped model."""
+        """Identity of the wrapped model."""
         return self._model.identity
 
     def infer(self, frame: CameraFrame) -> DepthMap:
-        """The wrapped model's map of the frame; failures are not remembered.
+        """The wrapped model's map of the frame; failures are not kept.
 
         Raises:
             DecodeError: as the wrapped model does.
@@ -88,13 +88,13 @@ class CachedDepth:
 def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
     """The depth model that a configuration names: `stereo`, an ONNX file, or the name of a built-in card.
 
-    The file of a built-in card is looked for in `models_folder()`, then among those that come with the package.
+    The file of a built-in card is searched in `models_folder()`, then among those that come with the package.
 
     Raises:
         ModelError: no such file or name, no card for it, a damaged network, or one that does not match its
             card.
     """
-    # Imported here: the runtime takes 20 MB, and the service knows this module, too, but opens no network.
+    # Imported here because the runtime takes 20 MB, and the service imports this module but opens no network.
     from coec.adapters.depth.onnx_network import OnnxDepth, file_identity
 
     if config.model == STEREO:
@@ -112,14 +112,14 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
 
 
 def models_folder() -> Path:
-    """Where networks are looked for by name: `coec/models` in $XDG_DATA_HOME, by default ~/.local/share."""
+    """Folder in which networks are searched by name: `coec/models` in $XDG_DATA_HOME, by default ~/.local/share."""
     base = os.environ.get("XDG_DATA_HOME", "")
     return (Path(base) if base else from_home("~/.local/share")) / "coec" / "models"
 
 
 def _file_of(card: ModelCard) -> Path:
-    """`<name>.onnx` in the folder of networks, else the card's customary file name there, else the file that comes
-    with the package; the first where there is none."""
+    """`<name>.onnx` in the folder of networks, else the card's usual file name there, else the file that comes with the
+    package. If none exists, the first of these paths."""
     name = f"{card.name}.onnx"
     places = [models_folder() / name, models_folder() / (card.file or name), CARDS / name]
     return next((path for path in places if path.is_file()), places[0])
@@ -129,7 +129,7 @@ def _content_key(frame: CameraFrame) -> bytes:
     digest = hashlib.sha256()
     for image in (frame.image, frame.depth):
         if image is not None:
-            # Lengths first: two images back to back are otherwise no different from one.
+            # Lengths first, so that two images one after the other differ from one long one.
             digest.update(f"{image.format} {image.width} {image.height} {len(image.data)} ".encode())
             digest.update(image.data)
     return digest.digest()

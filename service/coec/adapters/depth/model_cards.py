@@ -1,8 +1,8 @@
-"""Model cards: what has to be known of a monocular depth network to feed it and to read its output.
+"""Model cards: what one has to know about a monocular depth network to feed it and to read its output.
 
 A card is a YAML file beside the network (`midas.onnx` -> `midas.yaml`): either a whole card, or one line that
 points to a built-in one, `card: dpt_beit_large_512`. Networks whose file is known are recognised by sha256
-and need no YAML. The built-in cards lie in the folder `cards`, and with one of them, `street`, its network.
+and need no YAML. The built-in cards are in the folder `cards`, together with the network of one of them, `street`.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ class CardInput(_Part):
 
 
 class CardOutput(_Part):
-    """What the output tensor means. Its values are used as they come, so this is a statement, not a
-    conversion."""
+    """What the output tensor means. Its values are used unchanged, so that this describes them and converts
+    nothing."""
 
     name: str | None = Field(default=None, description="name of the output tensor; the only one when not given")
     kind: Literal["inverse_depth", "depth", "metric_depth"]
@@ -101,8 +101,8 @@ class CardOutput(_Part):
 
 
 class ModelCard(_Part):
-    """A depth network. `file` is the customary file name; `sha256` that of the one file this card was
-    measured on."""
+    """A depth network. `file` is the usual file name; `sha256` is that of the one file on which this card was
+    measured."""
 
     name: str = Field(pattern=r"^[a-z0-9_]{1,64}$")
     file: str | None = Field(default=None, pattern=r"^[A-Za-z0-9_.-]+\.onnx$")
@@ -129,13 +129,13 @@ def built_in_cards() -> dict[str, ModelCard]:
 
 
 def list_models() -> list[ModelCard]:
-    """The built-in cards, in the order of their names."""
+    """The built-in cards, sorted by name."""
     return [card for _, card in sorted(built_in_cards().items())]
 
 
 def find_card(network: Path, sha256: str, named: ModelCard | None = None) -> ModelCard:
-    """The card of a network file: the YAML beside it, else the one it was asked for by name, else the
-    built-in card of that sha256.
+    """The card of a network file: the YAML beside it, else the built-in card of the requested name, else the
+    built-in card with that sha256.
 
     Args:
         network: the ONNX file.

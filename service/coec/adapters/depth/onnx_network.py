@@ -31,15 +31,15 @@ PROVIDERS: dict[Provider, str] = {
 }
 
 MAX_INPUT_PIXELS = 2**22
-"""Network input above which an image is refused: four times dpt_beit_large_512 on KITTI-360's 1408×376. It
-bounds the memory that an image of absurd aspect ratio can ask for."""
+"""Largest network input, px: four times that of dpt_beit_large_512 on KITTI-360's 1408×376. Larger ones are refused,
+which bounds the memory that an image of absurd aspect ratio can take."""
 
 TEST_IMAGE_SIZE = (512, 512)
 """Height and width, px, of the image that stands in for a camera's when a network is opened."""
 
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
 _HASH_CHUNK_BYTES = 2**20
-_QUIET = 4  # onnxruntime's log level "fatal": its errors arrive as exceptions, which say the same
+_QUIET = 4  # onnxruntime's log level "fatal", since its errors arrive as exceptions, too
 
 
 class OnnxDepth:
@@ -58,7 +58,7 @@ class OnnxDepth:
         limits: LimitsConfig,
         identity: str,
     ) -> None:
-        """Open a network, hold it against its card, and run it once on a test image.
+        """Open a network, compare it with its card, and run it once on a test image.
 
         Args:
             path: ONNX file; external weights lie beside it.
@@ -70,8 +70,8 @@ class OnnxDepth:
             identity: see `file_identity`.
 
         Raises:
-            ModelError: no network, a damaged one, external weights missing, an input or output that does not
-                match the card, or no finite value for the test image.
+            ModelError: there is no network, it is damaged, external weights are missing, input or output do not
+                match the card, or the test image gives no finite value.
         """
         self._path = path
         self._card = card
@@ -90,11 +90,11 @@ class OnnxDepth:
 
     @property
     def card(self) -> ModelCard:
-        """The card that the network is run by."""
+        """The card by which the network is run."""
         return self._card
 
     def infer(self, frame: CameraFrame) -> DepthMap:
-        """The network's output for the frame's image, as it comes; values that are not finite become NaN.
+        """The network's output for the frame's image, unchanged except that non-finite values become NaN.
 
         Raises:
             DecodeError: the image cannot be decoded, or its shape asks for a network input over
@@ -131,7 +131,7 @@ class OnnxDepth:
         return np.where(np.isfinite(values), values, np.float32(np.nan))
 
     def _check_input(self) -> tuple[str, tuple[int, int] | None]:
-        """Name of the input, and (height, width) in px where the network itself fixes them."""
+        """Name of the input, and its (height, width) in px if the network fixes them, else None."""
         card = self._card
         tensor = _pick(self._session.get_inputs(), card.input.name, "input", self._path, card.name)
         shape = list(tensor.shape)
@@ -159,7 +159,7 @@ class OnnxDepth:
         return str(tensor.name)
 
     def _try_out(self) -> None:
-        """One run, so that a network that cannot work is an error at the start, not in the first window."""
+        """One run, so that a network that cannot work fails at the start instead of in the first window."""
         height, width = self._own_size or self._card.input.size.size_for(*TEST_IMAGE_SIZE)
         ramp = np.linspace(0.0, 255.0, height * width * 3, dtype=np.float32).astype(np.uint8)
         depth = self._run(to_tensor(ramp.reshape(height, width, 3), self._card.input, height, width))
@@ -173,8 +173,8 @@ class OnnxDepth:
 def to_tensor(bgr: NDArray[np.uint8], card: CardInput, height: int, width: int) -> NDArray[np.float32]:
     """The input tensor, (1, 3, height, width), of an image (H, W, 3) in blue-green-red order.
 
-    The image is resized as 8-bit values: where the authors resize floats, cubic interpolation may overshoot 0
-    to 255 there, and is clipped here.
+    The image is resized as 8-bit values. If a network's authors resize floats, their cubic interpolation may leave 0 to
+    255; here it is clipped.
     """
     source_height, source_width = bgr.shape[:2]
     if (source_height, source_width) != (height, width):
@@ -223,10 +223,10 @@ def _open_session(path: Path, providers: Sequence[Provider], threads: int) -> An
     options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.use_deterministic_compute = True
-    # Inputs of several sizes would each leave their blocks in the arena for ever (FIELD_NOTES, onnxruntime).
+    # With an arena, inputs of each size would leave their blocks in it for ever (FIELD_NOTES, onnxruntime).
     options.enable_cpu_mem_arena = False
     options.enable_mem_pattern = False
-    # Waiting threads would burn a core between frames: 39 % against 1.9 % at 10 Hz (FIELD_NOTES).
+    # Spinning threads would use the processor between frames: 39 % of a core against 1.9 % at 10 Hz (FIELD_NOTES).
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.log_severity_level = _QUIET
@@ -239,8 +239,7 @@ def _open_session(path: Path, providers: Sequence[Provider], threads: int) -> An
             "beside it): "
             f"{error}"
         ) from error
-    # Without this a failing accelerator would be replaced by the CPU in silence, with other bytes from then
-    # on.
+    # Without this, onnxruntime would silently replace a failing accelerator by the CPU, whose results have other bytes.
     session.disable_fallback()
     return session
 
@@ -268,5 +267,5 @@ def _pick(tensors: Sequence[Any], name: str | None, kind: str, path: Path, card:
 
 
 def _admits(dimension: int | str | None, size: int) -> bool:
-    """Whether a dimension of the network's input can be `size`; free ones have a name or None."""
+    """Whether a dimension of the network's input can be `size`; a free dimension is a name or None."""
     return dimension == size or not isinstance(dimension, int)

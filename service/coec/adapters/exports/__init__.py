@@ -1,6 +1,6 @@
-"""An extrinsic in the files of other programs: one module a format, and the names of all.
+"""Writes an extrinsic into files of other programs: one module per format, and the names of all formats.
 
-Formats that can hold more than one transform change theirs alone.
+In a file that can hold several transforms, only this one is changed.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ class Format(NamedTuple):
     """How a file is written.
 
     Attributes:
-        text: what the file shall hold, given what it holds already; None where there is no file yet. Raises
-            `OutputError` where that cannot be.
-        encoding: of its text, as Zenoh names encodings.
+        text: returns the new content of the file, given its present content (None: there is no file yet). Raises
+            `OutputError` if that is not possible.
+        encoding: of the text, as Zenoh names encodings.
     """
 
     text: Callable[[Extrinsic, str | None], str]
@@ -43,4 +43,4 @@ FORMATS: Final[Mapping[str, Format]] = MappingProxyType(
         "json": Format(json_files.plain_text, JSON),
     }
 )
-"""By the names that a user writes."""
+"""Formats by the names that a user writes."""

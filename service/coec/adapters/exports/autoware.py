@@ -15,7 +15,7 @@ def text(extrinsic: Extrinsic, existing: str | None) -> str:
     """The file with this camera below its parent.
 
     Raises:
-        OutputError: what exists cannot be changed.
+        OutputError: the existing file cannot be changed.
     """
     T = extrinsic.T_parent_body
     names = ("x", "y", "z", "roll", "pitch", "yaw")

@@ -1,7 +1,7 @@
-"""One entry of a YAML file changed, every other byte left as it was.
+"""Changes one entry of a YAML file and leaves every other byte as it is.
 
-A YAML library writes the whole document anew, and with it the comments, quotes and number formats of people. Here the
-library says where an entry stands, and only its lines are replaced.
+A YAML library would rewrite the whole document, including the comments, quotes and number formats that people chose.
+Here the library only finds the place of an entry, and the lines of that entry are replaced.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ INDENT = "  "
 
 
 def set_entry(text: str, path: Sequence[str], lines: Sequence[str]) -> str:
-    """The text with one entry set: replaced where it stands, else added at the end of the map that should hold it.
+    """The text with one entry set: replaced if it exists, else added at the end of the map that should hold it.
 
     Args:
         text: a YAML document whose root is a map in block style.
         path: keys from the root to the entry.
-        lines: of its value, as they stand below the key, without indentation.
+        lines: lines of the value below the key, without indentation.
 
     Raises:
-        OutputError: no such document, or the entry cannot be changed without touching others.
+        OutputError: not such a document, or the entry cannot be changed without touching others.
     """
     before = _parsed(text)
     found, depth = _deepest(before, path)
@@ -63,7 +63,7 @@ def _parsed(text: str) -> CommentedMap:
 
 
 def _deepest(document: CommentedMap, path: Sequence[str]) -> tuple[CommentedMap, int]:
-    """The map that holds as much of the path as there is, and how many of its keys that is."""
+    """The map that holds the longest existing part of the path, and how many keys that part has."""
     found = document
     for depth, key in enumerate(path):
         if key not in found:
@@ -78,7 +78,7 @@ def _deepest(document: CommentedMap, path: Sequence[str]) -> tuple[CommentedMap,
 
 
 def _end_of(rows: Sequence[str], line: int, column: int) -> int:
-    """The line behind the last one of the entry that begins at a line and column."""
+    """The line behind the entry that begins at a line and column."""
     end = line + 1
     for number in range(line + 1, len(rows)):
         row = rows[number]
@@ -102,7 +102,7 @@ def _room_in(parent: CommentedMap, rows: Sequence[str], path: Sequence[str]) -> 
 
 
 def _without(document: Any, path: Sequence[str]) -> Any:
-    """Plain values of a document without the entry, and without maps that hold nothing else."""
+    """Plain values of a document without the entry, and without maps that hold only the entry."""
     if not isinstance(document, CommentedMap) or not path:
         return document
     rest = {key: value for key, value in document.items() if key != path[0]}

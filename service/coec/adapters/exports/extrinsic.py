@@ -1,6 +1,6 @@
-"""What is exported: a transform between two named frames, how sure it is, and where it comes from.
+"""What is exported: a transform between two named frames, its uncertainty, and where it comes from.
 
-A format takes from it the direction and the order that its readers expect, and says both in the file.
+Each format writes the direction and the order that its readers expect, and states both in the file.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Origin:
     Attributes:
         version: of coec.
         provenance: `nominal`, `commissioned`, `estimated` or `restored`.
-        window_id, data_stamp_ns, config_hash: of the window it rests on; None where there is none.
-        objections: why it is not accepted, one sentence each; empty when it is.
+        window_id, data_stamp_ns, config_hash: of the window that it rests on; None if there is none.
+        objections: why it is not accepted, one sentence each; empty if it is accepted.
     """
 
     vehicle: str
@@ -46,17 +46,17 @@ class Origin:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrinsic:
-    """A camera's pose, ready to be written down.
+    """A camera's pose, ready to be written.
 
     Attributes:
         T_camera_lidar: (4, 4) maps LiDAR (x forward, y left, z up) to optical camera coordinates (x right, y down, z
             forward), metres.
         covariance: (6, 6) of its error about and along the camera axes, radians and metres: the true transform is
-            exp(error)·T_camera_lidar. NaN where it is not known.
+            exp(error)·T_camera_lidar. NaN for entries that are not known.
         parent, child: names of the frames; the child is the camera.
-        T_parent_lidar: (4, 4) pose of the LiDAR in the parent; identity where the parent is the LiDAR.
-        camera: intrinsics; None where they are not known.
-        origin: see there.
+        T_parent_lidar: (4, 4) pose of the LiDAR in the parent; identity if the parent is the LiDAR.
+        camera: intrinsics; None if they are not known.
+        origin: see `Origin`.
     """
 
     T_camera_lidar: Matrix
@@ -83,7 +83,7 @@ class Extrinsic:
         return self.T_parent_child @ T_OPTICAL_BODY
 
     def remarks(self, direction: str) -> list[str]:
-        """Comment lines for a file: the direction of its numbers in words, how sure they are, where they come from."""
+        """Comment lines for a file: the direction of its numbers in words, their uncertainty and their origin."""
         origin = self.origin
         lines = [
             f"{origin.pair} of {origin.vehicle}: {origin.provenance}, by coec {origin.version}",
@@ -100,7 +100,7 @@ class Extrinsic:
         return [_one_line(line) for line in lines]
 
     def document(self, direction: str) -> dict[str, object]:
-        """The same as JSON values, for formats without comments."""
+        """The same facts as JSON values, for formats without comments."""
         origin = self.origin
         return {
             "direction": direction,
@@ -133,21 +133,21 @@ T_OPTICAL_BODY: Matrix = np.array(
 
 
 def quaternion_wxyz(T: Matrix) -> list[float]:
-    """Of a transform (4, 4): unit, w first, w ≥ 0."""
+    """Unit quaternion of a transform (4, 4), w first, w ≥ 0."""
     x, y, z, w = se3.quaternion_xyzw_from_rotation(T[:3, :3]).tolist()
     return [w, x, y, z]
 
 
 def quaternion_xyzw(T: Matrix) -> list[float]:
-    """Of a transform (4, 4): unit, w last, w ≥ 0."""
+    """Unit quaternion of a transform (4, 4), w last, w ≥ 0."""
     return [float(value) for value in se3.quaternion_xyzw_from_rotation(T[:3, :3])]
 
 
 def roll_pitch_yaw(T: Matrix) -> list[float]:
-    """Radians, R = Rz(yaw)·Ry(pitch)·Rx(roll), as URDF and ROS have it.
+    """[roll, pitch, yaw] in radians, R = Rz(yaw)·Ry(pitch)·Rx(roll), as in URDF and ROS.
 
-    Yaw first, then what is left of the rotation when it is taken away: exact also where the pitch is a right angle,
-    where yaw and roll turn about the same axis and only their sum is given.
+    Yaw is taken first, then pitch and roll from the rest of the rotation. This is exact even for a pitch of a right
+    angle, where yaw and roll turn about the same axis and only their sum is determined.
     """
     R = T[:3, :3]
     yaw = math.atan2(R[1, 0], R[0, 0])
@@ -170,7 +170,7 @@ def utc(stamp_ns: int | None) -> str:
 
 
 def _one_line(text: str) -> str:
-    """A comment that cannot end before its line does, in the characters that every reader takes."""
+    """The text in one line and in ASCII, so that a comment with it cannot end early and every reader accepts it."""
     return " ".join(text.split()).encode("ascii", "replace").decode()
 
 

@@ -1,5 +1,5 @@
 """Formats in JSON: nuScenes' `calibrated_sensor.json`, OpenLABEL's coordinate systems, COLMAP's `rig_config.json`, and
-a plain one. JSON has no comments: what they would say stands under `coec`, which readers of these formats pass over."""
+a plain one. As JSON has no comments, the remarks are under `coec`, which readers of these formats ignore."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ PLAIN_DIRECTION = "T_child_parent maps coordinates in the parent to the optical 
 
 
 def nuscenes_text(extrinsic: Extrinsic, existing: str | None) -> str:
-    """The table with the record of this sensor, which is found by `sensor_token`, the child.
+    """The table with the record of this sensor, whose `sensor_token` is the child frame.
 
     Raises:
-        OutputError: what exists is no such table.
+        OutputError: the existing file is not such a table.
     """
     table = [] if existing is None else _parsed(existing)
     if not isinstance(table, list) or not all(isinstance(record, dict) for record in table):
@@ -40,10 +40,10 @@ def nuscenes_text(extrinsic: Extrinsic, existing: str | None) -> str:
 
 
 def openlabel_text(extrinsic: Extrinsic, existing: str | None) -> str:
-    """The document with this coordinate system, and its parent where that is not in it yet.
+    """The document with this coordinate system, and with its parent if that is missing.
 
     Raises:
-        OutputError: what exists is no OpenLABEL document.
+        OutputError: the existing file is not an OpenLABEL document.
     """
     fresh: dict[str, Any] = {"openlabel": {"metadata": {"schema_version": "1.0.0"}, "coordinate_systems": {}}}
     document = fresh if existing is None else _parsed(existing)
@@ -68,14 +68,14 @@ def openlabel_text(extrinsic: Extrinsic, existing: str | None) -> str:
 
 
 def colmap_text(extrinsic: Extrinsic, existing: str | None) -> str:
-    """The rigs with this camera, found by `image_prefix` (the child and a slash) in the rig whose reference sensor is
-    the parent; a rig of its own where there is none.
+    """The rigs with this camera, whose `image_prefix` is the child and a slash. It is put into the rig whose reference
+    sensor is the parent, or into a new rig if there is none.
 
-    COLMAP takes a rig only with a reference sensor, and means all poses of its cameras from that. Here it is the
-    parent, under a prefix that no image has.
+    COLMAP accepts a rig only with a reference sensor, to which all poses of its cameras relate. Here it is the parent,
+    under a prefix that no image has.
 
     Raises:
-        OutputError: what exists is no such list, or has this camera in a rig with another reference.
+        OutputError: the existing file is not such a list, or has this camera in a rig with another reference.
     """
     rigs = [] if existing is None else _parsed(existing)
     reference, prefix = f"{extrinsic.parent}/", f"{extrinsic.child}/"
@@ -106,7 +106,7 @@ def colmap_text(extrinsic: Extrinsic, existing: str | None) -> str:
 
 
 def plain_text(extrinsic: Extrinsic, existing: str | None) -> str:  # noqa: ARG001  the file holds this one transform
-    """The whole file: the transform in both directions and three forms."""
+    """The whole file: the transform in both directions and in three forms."""
     document = {
         "parent": extrinsic.parent,
         "child": extrinsic.child,

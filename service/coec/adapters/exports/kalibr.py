@@ -1,4 +1,4 @@
-"""Kalibr's camera chain: intrinsics, and `T_cam_lidar` beside them. Models: Kalibr's wiki, "Supported models"."""
+"""Kalibr's camera chain: intrinsics with `T_cam_lidar` beside them. Models: Kalibr's wiki, "Supported models"."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ DIRECTION = "T_cam_lidar maps coordinates in the parent to the optical camera fr
 
 
 def text(extrinsic: Extrinsic, existing: str | None) -> str:
-    """The chain with this camera. Its entry is the child frame where that is named as Kalibr does (`cam0`), else
+    """The chain with this camera. Its entry has the name of the child frame if that has Kalibr's form (`cam0`), else
     `cam0`.
 
     Raises:
-        OutputError: the intrinsics are not known, Kalibr has no such model, or what exists cannot be changed.
+        OutputError: the intrinsics are not known, Kalibr has no such model, or the existing file cannot be changed.
     """
     if extrinsic.camera is None:
         raise OutputError(

@@ -9,7 +9,7 @@ KITTI360_DIRECTION = "p_velo = M p_camera, three rows of M; velo is the parent, 
 
 
 def raw_text(extrinsic: Extrinsic, existing: str | None) -> str:  # noqa: ARG001  the file holds this one transform
-    """The whole file. Its readers take lines that are no numbers for text, as `calib_time` is."""
+    """The whole file. Its readers treat lines that are no numbers as text, such as `calib_time`."""
     T = extrinsic.T_child_parent
     lines = [
         f"calib_time: {utc(extrinsic.origin.data_stamp_ns)}",

@@ -12,13 +12,13 @@ DIRECTION = "maps coordinates in the parent to the optical camera frame (z forwa
 
 
 def text(extrinsic: Extrinsic, existing: str | None) -> str:
-    """The file with this matrix: in the place of the one of the same name, else as the last.
+    """The file with this matrix: it replaces the one of the same name, or is added at the end.
 
-    FileStorage is no YAML that a YAML library would read, so the lines of the matrix are found by how OpenCV writes
-    them: what belongs to a name at the margin is indented.
+    YAML libraries cannot read FileStorage, so that the lines of the matrix are found by the way OpenCV writes them: a
+    name at the margin, and indented lines below it.
 
     Raises:
-        OutputError: what exists does not begin as OpenCV's files do.
+        OutputError: the existing file does not begin like OpenCV's files.
     """
     name = re.sub(r"\W", "_", f"T_{extrinsic.child}_{extrinsic.parent}")
     data = ", ".join(repr(value) for value in extrinsic.T_child_parent.ravel().tolist())

@@ -1,4 +1,4 @@
-"""tf2's `static_transform_publisher`: a shell script, one command a transform."""
+"""A shell script for tf2's `static_transform_publisher`, with one command per transform."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MARK = "# coec: "
 
 
 def text(extrinsic: Extrinsic, existing: str | None) -> str:
-    """The script with this transform: its command takes the place of one of the same child, else comes last."""
+    """The script with this transform: its command replaces the one with the same child, or is added at the end."""
     x, y, z = translation_m(extrinsic.T_parent_child)
     qx, qy, qz, qw = quaternion_xyzw(extrinsic.T_parent_child)
     child = shlex.quote(extrinsic.child)

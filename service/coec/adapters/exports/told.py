@@ -1,4 +1,4 @@
-"""What is exported, from what the service and its commands tell: results of windows, and replies to `extrinsic`."""
+"""Makes the exported extrinsic from results of windows and from replies to `extrinsic`."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from coec.geometry import se3
 from coec.schemas.replies import CalibrationResult, ExtrinsicReply
 
 FRAME = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]{0,127}")
-"""Names of frames that are words in XML, YAML, JSON and a shell alike."""
+"""Frame names that are safe in XML, YAML, JSON and a shell."""
 
 NOMINAL = "It is the nominal calibration: nothing has been accepted yet."
 
 PITCH_HEIGHT, YAW_SIDE = (0, 4), (1, 3)
-"""Axes of the two correlations that a reply tells."""
+"""Axes of the two correlations in a reply."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
-    """Between which frames a transform is written; None: those that the pair's frames are called.
+    """The frames between which a transform is written; None: the pair's own frames.
 
     Attributes:
         T_parent_lidar: (4, 4) pose of the LiDAR in the parent; None: the parent is the LiDAR.
@@ -40,7 +40,7 @@ class Frames:
 
 
 def of_result(result: CalibrationResult, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
-    """A window's result, with its whole covariance; what its verdict says against it are the objections."""
+    """A window's result, with its whole covariance; the reasons of a negative verdict become the objections."""
     objections = tuple(reason.text for reason in result.verdict.reasons)
     origin = Origin(
         vehicle=result.vehicle,
@@ -63,8 +63,8 @@ def of_result(result: CalibrationResult, camera: CameraIntrinsics | None, frames
 
 
 def of_reply(reply: ExtrinsicReply, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
-    """What a service serves, with what a reply tells of its covariance: σ of each axis, and two correlations. Nothing
-    speaks against it but that it is the nominal calibration still."""
+    """The extrinsic that a service serves, with the part of its covariance that a reply holds: σ of each axis and two
+    correlations. The only possible objection is that it is still the nominal calibration."""
     served = reply.provenance != "nominal"
     origin = Origin(
         vehicle=reply.vehicle,
@@ -94,10 +94,10 @@ def framed(
     camera: CameraIntrinsics | None,
     origin: Origin,
 ) -> Extrinsic:
-    """An extrinsic between the frames that were asked for, else between its own: those of the LiDAR and the camera.
+    """An extrinsic between the requested frames, by default its own (LiDAR, camera).
 
     Raises:
-        OutputError: a frame has a name that not every format can hold.
+        OutputError: a frame has a name that some format cannot hold.
     """
     for name in (frames.parent or own[0], frames.child or own[1]):
         if not FRAME.fullmatch(name):
@@ -128,7 +128,7 @@ def _covariance(reply: ExtrinsicReply) -> NDArray[np.float64]:
 
 
 def pose_of(text: str) -> NDArray[np.float64]:
-    """(4, 4) of ``x,y,z,qx,qy,qz,qw``: metres, and a quaternion of any length.
+    """(4, 4) from ``x,y,z,qx,qy,qz,qw``: metres, and a quaternion of any length.
 
     Raises:
         ValueError: not seven finite numbers, or a quaternion of length zero.

@@ -14,7 +14,7 @@ DIRECTION = "origin: pose of the child (optical: z forward) in the parent; rpy i
 
 @dataclass(slots=True)
 class _Joint:
-    """A joint of a document: its name, its child link, and where it stands, bytes."""
+    """A joint of a document: its name, its child link, and its place in bytes."""
 
     name: str
     begin: int
@@ -24,7 +24,7 @@ class _Joint:
 
 @dataclass(slots=True)
 class _Found:
-    """The joints of a document, and where its root ends."""
+    """The joints of a document, and where the root element ends."""
 
     joints: list[_Joint] = field(default_factory=list)
     open: list[str] = field(default_factory=list)
@@ -32,10 +32,10 @@ class _Found:
 
 
 def text(extrinsic: Extrinsic, existing: str | None) -> str:
-    """The robot with this joint: in the place of the one that has the same child link, else as the last.
+    """The robot with this joint: it replaces the one with the same child link, or is added as the last one.
 
     Raises:
-        OutputError: what exists is no XML.
+        OutputError: the existing file is not XML.
     """
     if existing is None:
         joint = _joint(extrinsic, f"{extrinsic.child}_joint")
@@ -51,7 +51,7 @@ def text(extrinsic: Extrinsic, existing: str | None) -> str:
 
 
 _ROBOT = "vehicle"
-"""Name of a robot that has none yet."""
+"""Name of the robot in a new file."""
 
 
 def _joint(extrinsic: Extrinsic, name: str) -> str:
@@ -74,7 +74,7 @@ def _joints(data: bytes) -> _Found:
     found = _Found()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        # A joint stands below the root, or in a macro of xacro; one in a transmission has no child.
+        # A joint is below the root or in a xacro macro; a joint in a transmission has no child.
         if tag == "joint":
             found.joints.append(_Joint(attributes.get("name", ""), parser.CurrentByteIndex))
         elif tag == "child" and found.open[-1:] == ["joint"]:

@@ -1,4 +1,4 @@
-"""Cameras as viewers describe them: `foxglove.CameraCalibration`."""
+"""Cameras in the form of viewers: `foxglove.CameraCalibration`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from coec.geometry.cameras import Camera, intrinsics_of, name_of
 
 @dataclass(frozen=True, slots=True)
 class Counterpart:
-    """A camera in the viewers' words: the name of its model, its coefficients in their order, and the camera itself,
-    whose size, focal lengths and centre are told as they are."""
+    """A camera for viewers: their name of its model, its coefficients in their order, and the camera itself, whose
+    size, focal lengths and principal point are sent unchanged."""
 
     camera: Camera
     distortion_model: str
@@ -22,11 +22,12 @@ COUNTERPARTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "radtan": ("plumb_bob", ("k1", "k2", "p1", "p2", "k3")),
     "kannala_brandt": ("kannala_brandt", ("k1", "k2", "k3", "k4")),
 }
-"""The viewers' name of a model, and its coefficients by our names. Points on the image need none of it."""
+"""The viewers' name of each model, and coec's names of its coefficients in their order. Points on the image do not need
+them."""
 
 
 def counterpart_of(camera: Camera) -> Counterpart | None:
-    """None where the viewers know no such model."""
+    """The camera for viewers; None if they do not know its model."""
     found = COUNTERPARTS.get(name_of(camera))
     if found is None:
         return None

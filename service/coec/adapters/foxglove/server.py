@@ -1,4 +1,4 @@
-"""The WebSocket that viewers open. The only module that needs the library of the optional extra `foxglove`."""
+"""The WebSocket server for viewers; the only module that needs the library of the optional extra `foxglove`."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from coec.geometry.se3 import inverse, quaternion_xyzw_from_rotation
 NS_PER_S = 1_000_000_000
 
 BACKLOG = 32
-"""Messages that wait for a viewer who is slow, some four pictures; the oldest go first."""
+"""Most messages that wait for a slow viewer, some four pictures; the oldest are dropped first."""
 
 FLOAT_BYTES = 4
 
 TITLE_SHARE = 1 / 60
-"""Height of what is written on the image, as a share of its width."""
+"""Height of the text on the image, as a share of its width."""
 
 
 _LOG_LEVELS = (
@@ -35,21 +35,21 @@ _LOG_LEVELS = (
     messages.LogLevel.Error,
     messages.LogLevel.Warning,
 )
-"""By ROS level: OK, WARN, ERROR, STALE."""
+"""Log level by ROS level: OK, WARN, ERROR, STALE."""
 
 
 class Screen:
-    """What viewers see. One thread uses it; who sends and how fast they read is the library's own threads' business."""
+    """Sends to viewers. For use by one thread; the library's own threads send to each viewer at its speed."""
 
     def __init__(self, host: str, port: int, name: str) -> None:
-        """Listen at a host, without brackets, and a port; 0: one that is free. `name` is shown to viewers.
+        """Listen at a host, without brackets, and a port; 0: any free port. `name` is shown to viewers.
 
         Raises:
-            UnavailableError: nobody can listen there.
+            UnavailableError: it is not possible to listen there.
         """
-        # Whoever goes without a word, or says what is none, is no fault here.
+        # Do not report viewers that leave without closing, or that send malformed messages.
         logging.getLogger("foxglove").addHandler(logging.NullHandler())
-        context = self._context = Context()  # its channels close when it goes
+        context = self._context = Context()  # keep it, as its channels close when it is deleted
         self._image = channels.CompressedImageChannel(topics.IMAGE, context=context)
         self._marks = {
             pose: channels.ImageAnnotationsChannel(topic, context=context) for pose, topic in topics.POINTS.items()
@@ -72,11 +72,11 @@ class Screen:
 
     @property
     def wanted(self) -> frozenset[str]:
-        """Topics that somebody looks at."""
+        """Topics that some viewer subscribes to."""
         return frozenset(str(channel.topic()) for channel in self._all if channel.has_sinks())
 
     def show(self, picture: Picture) -> None:
-        """A pair, with all that it holds, to whom it may concern. Its parts carry the stamp of its image."""
+        """Send all parts of a picture, with the stamp of its image."""
         stamp = _stamp(picture.stamp_ns)
         if picture.image is not None:
             self._image.log(_image(picture, picture.image, stamp))
@@ -91,16 +91,16 @@ class Screen:
             self._calibration.log(calibration)
 
     def tell(self, moment: Moment) -> None:
-        """A line of the timeline."""
+        """Send a line of the timeline."""
         self._health.log(moment.document())
 
     def remark(self, ros_level: Literal[0, 1, 2, 3], text: str, source: str) -> None:
-        """A line of the log, now."""
+        """Send a line of the log, with the present time."""
         now = messages.Timestamp.now()
         self._log.log(messages.Log(timestamp=now, level=_LOG_LEVELS[ros_level], message=text, name=source))
 
     def close(self) -> None:
-        """Viewers are told that it ends."""
+        """Stop the server, which tells the viewers."""
         self._server.stop()
 
 
@@ -118,8 +118,8 @@ def _image(picture: Picture, image: EncodedImage, stamp: messages.Timestamp) -> 
 
 
 def _annotations(marks: Marks, row: int, width_px: int, stamp: messages.Timestamp) -> messages.ImageAnnotations:
-    """Points, and a line of text that is there even where no point is in view: viewers wait for what has the stamp of
-    the image."""
+    """Points and a line of text. The text is sent even if no point is in view, because viewers wait for annotations
+    with the stamp of the image."""
     size_px = max(8.0, width_px * TITLE_SHARE)
     title = messages.TextAnnotation(
         timestamp=stamp,
@@ -174,7 +174,7 @@ def _transforms(picture: Picture, stamp: messages.Timestamp) -> messages.FrameTr
 def _pose_in_lidar(
     picture: Picture, pose: Pose, T_camera_lidar: np.ndarray, stamp: messages.Timestamp
 ) -> messages.FrameTransform:
-    """The value of a transform is the pose of the child in the parent: T_camera_lidar the other way round."""
+    """The transform of a camera frame: the pose of the child in the parent, which is the inverse of T_camera_lidar."""
     T_lidar_camera = inverse(T_camera_lidar)
     x, y, z = T_lidar_camera[:3, 3].tolist()
     qx, qy, qz, qw = quaternion_xyzw_from_rotation(T_lidar_camera[:3, :3]).tolist()

@@ -1,5 +1,5 @@
-"""What of a pair is shown: the image, points on it at each extrinsic, a thinned cloud. Arrays in, values out; nothing
-here knows the protocol."""
+"""What is shown of a pair: the image, points on it at each extrinsic, and a thinned cloud. Arrays in, values out;
+nothing here depends on the protocol."""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ from coec.geometry.in_view import points_in_view
 from coec.geometry.thinning import thinned
 
 POINTS = 5000
-"""On the image, at one extrinsic: more cost a viewer its fluency (design notes of ROS 2, Foxglove)."""
+"""Most points on the image at one extrinsic; more make a viewer slow (design notes of ROS 2, Foxglove)."""
 
 CLOUD_POINTS = 20_000
-"""Of the sweep in space: 400 kB a frame."""
+"""Most points of the sweep in space: 400 kB per frame."""
 
 SILHOUETTES = 3000
-"""Of those, at most so many where the sweep jumps from a near surface to a far one: they lie on edges of the image
-where an extrinsic is right, and tell it from a wrong one."""
+"""Most of the `POINTS` that lie on silhouettes, where the sweep jumps from a near surface to a far one. With a right
+extrinsic they lie on edges of the image, which shows the difference to a wrong one."""
 
 BANDS = 32
-"""Colours of ranges: neighbours differ by an eighth of their range."""
+"""Number of colours of ranges; neighbouring colours differ by an eighth of their range."""
 
 POINT_SHARE, SILHOUETTE_SHARE = 1 / 1000, 1 / 600
-"""Radius of a point as a share of the image's width: 1.4 px on 1408; and of one that lies on a silhouette."""
+"""Radius of a point, and of one on a silhouette, as a share of the image's width: 1.4 px on 1408 for a point."""
 
 LEAST_WIDTH_PX = 720
-"""Points on narrower images are no smaller than on this."""
+"""On narrower images points are as large as on this width."""
 
 BAND_RGB = (WHOLE.colours_bgr(WHOLE.range_at((np.arange(BANDS) + 0.5) / BANDS))[:, ::-1] / 255).tolist()
-"""Colour in the middle of each, from near to far: red, green, blue; 0 to 1."""
+"""Colour in the middle of each band, from near to far: red, green, blue; 0 to 1."""
 
 CORNER_PX = 0.5
-"""Viewers count pixels from the corner of the first one; here its centre is the origin."""
+"""Offset to the viewers' pixel coordinates, whose origin is the corner of the first pixel; here it is its centre."""
 
 NO_POINTS, NO_FLAGS = np.zeros((0, 3), np.float32), np.zeros(0, np.bool_)
 
 STAMP_END_NS = 2**32 * 1_000_000_000
-"""Stamps of viewers end in 2106."""
+"""End of the stamps that viewers can hold, in 2106."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrinsic:
-    """T_camera_lidar (4, 4), or None where there is none; and what is written on the image about it."""
+    """T_camera_lidar (4, 4), or None if there is none, and the text about it on the image."""
 
     T_camera_lidar: Matrix4 | None
     title: str
@@ -64,8 +64,8 @@ class Extrinsic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
-    """Points of about one range: their colour (red, green, blue; 0 to 1), how large they are drawn, and (N, 2) pixels
-    as viewers count them, from the corner of the first one."""
+    """Points of about one range: their colour (red, green, blue; 0 to 1), the radius at which they are drawn, and their
+    pixels (N, 2) in viewers' coordinates, from the corner of the first pixel."""
 
     rgb: tuple[float, float, float]
     radius_px: float
@@ -74,8 +74,7 @@ class Band:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marks:
-    """Points on the image at one extrinsic, in the order in which they are drawn: from far to near, silhouettes on
-    top."""
+    """Points on the image at one extrinsic, in drawing order: from far to near, silhouettes on top."""
 
     title: str
     bands: tuple[Band, ...]
@@ -83,7 +82,7 @@ class Marks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """One pair as it is shown. What nobody looks at is None, or not in the mapping.
+    """One pair as it is shown. Parts that no viewer wants are None, or not in the mapping.
 
     Attributes:
         image: JPEG or PNG.
@@ -107,10 +106,10 @@ def picture_of(
     *,
     compensated: bool,
 ) -> Picture:
-    """What is shown of a pair under the topics that are `wanted`.
+    """The picture of a pair, with the parts for the topics in `wanted`.
 
     Raises:
-        DecodeError: a stamp that viewers have no word for, or raw pixels that are none.
+        DecodeError: viewers cannot hold the stamp, or the raw pixels do not have the size that they claim.
     """
     if not 0 <= pair.stamp_ns < STAMP_END_NS:
         raise DecodeError(Refusal.STAMP_INVALID, "viewers know stamps from 1970 to 2106")
@@ -128,8 +127,8 @@ def picture_of(
 
 
 def marks_of(rig: Rig, xyz_m: NDArray[np.float32], silhouette: NDArray[np.bool_], extrinsic: Extrinsic) -> Marks:
-    """At most `POINTS` of the points (N, 3), LiDAR frame, where the camera sees them at an extrinsic; its title alone
-    where there is none. `silhouette` (N,) tells which lie on the near side of a range jump."""
+    """At most `POINTS` of the points (N, 3), LiDAR frame, at the places where the camera sees them with an extrinsic;
+    only the title if there is no extrinsic. `silhouette` (N,) marks the points on the near side of a range jump."""
     if extrinsic.T_camera_lidar is None:
         return Marks(extrinsic.title, ())
     seen = points_in_view(rig.camera, extrinsic.T_camera_lidar, xyz_m, rig.mask, NEAREST_M)
@@ -150,14 +149,14 @@ def marks_of(rig: Rig, xyz_m: NDArray[np.float32], silhouette: NDArray[np.bool_]
 
 
 def silhouettes_of(sweep: LidarFrame) -> NDArray[np.bool_]:
-    """(N,) which points of a sweep, as it was measured, lie on the near side of a range jump."""
+    """(N,) which points of an uncompensated sweep lie on the near side of a range jump."""
     silhouette = np.zeros(len(sweep.xyz_m), np.bool_)
     silhouette[range_edges(sweep.xyz_m, sweep.ring).index] = True
     return silhouette
 
 
 def _bands(uv_px: NDArray[np.float64], range_m: NDArray[np.float64], radius_px: float) -> Iterator[Band]:
-    """By range, from far to near."""
+    """The points in bands of range, from far to near."""
     number = np.minimum((WHOLE.share_of(range_m) * BANDS).astype(np.int64), BANDS - 1)
     for band in range(BANDS - 1, -1, -1):
         if (number == band).any():
@@ -166,17 +165,17 @@ def _bands(uv_px: NDArray[np.float64], range_m: NDArray[np.float64], radius_px: 
 
 
 def thin_cloud(xyz_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """At most `CLOUD_POINTS` of the points (N, 3), with their range: (n, 4), metres."""
+    """At most `CLOUD_POINTS` of the points (N, 3), each with its range: (n, 4), metres."""
     chosen = xyz_m[thinned(len(xyz_m), CLOUD_POINTS)].astype(np.float64)
     range_m = np.sqrt((chosen**2).sum(axis=1))
     return np.column_stack([chosen, range_m]).astype(np.float32)
 
 
 def compressed(image: EncodedImage, limits: LimitsConfig) -> EncodedImage:
-    """The image as viewers take it: JPEG and PNG as they came, raw pixels as JPEG.
+    """The image in a form that viewers accept: JPEG and PNG unchanged, raw pixels as JPEG.
 
     Raises:
-        DecodeError: raw pixels of another size than they say.
+        DecodeError: the raw pixels do not have the size that they claim.
     """
     if image.format not in BYTES_PER_PIXEL:
         return image

@@ -1,5 +1,5 @@
-"""What the timeline of a viewer tells, as JSON with a schema that viewers read: plain types, nothing that may be null
-(what is not known is left out), every field named."""
+"""Lines of a viewer's timeline, as JSON with a schema that viewers can read: plain types, every field named, and no
+null (unknown values are left out)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 NOT_SERVED = "not_served"
-"""Nobody serves the pair: its liveliness token is not there."""
+"""State: no service serves the pair, as its liveliness token is absent."""
 
 SILENT = "silent"
-"""Somebody serves it, and does not answer."""
+"""State: a service serves the pair but does not answer."""
 
 RECORDED = "recorded"
-"""No service: a recording is played."""
+"""State: there is no service; a recording is played."""
 
 
 class _Told(BaseModel):
@@ -23,7 +23,7 @@ class _Told(BaseModel):
 
 
 class Axes(_Told):
-    """Rotation vector about, and translation along, the axes of the camera; what is not known is left out."""
+    """Rotation vector about, and translation along, the axes of the camera; unknown values are left out."""
 
     rx_deg: float | None = None
     ry_deg: float | None = None
@@ -34,16 +34,16 @@ class Axes(_Told):
 
 
 class Ages(_Told):
-    """Seconds since something last came; left out where nothing has, or where nobody listens to it."""
+    """Seconds since the last frame or answer; left out if nothing has come, or if it is not listened to."""
 
     camera_s: float | None = None
     lidar_s: float | None = None
     ego_s: float | None = None
-    answer_s: float | None = Field(default=None, description="of the service, to a question or by itself")
+    answer_s: float | None = Field(default=None, description="since the last word of the service, asked for or not")
 
 
 class Figure(_Told):
-    """Of the self-diagnosis, beside its limit."""
+    """A figure of self-diagnosis with its limit."""
 
     name: str
     value: float | None
@@ -52,7 +52,7 @@ class Figure(_Told):
 
 
 class Missed(_Told):
-    """Frames that came here and were not shown."""
+    """Received frames that were not shown."""
 
     stream: str
     cause: str
@@ -63,31 +63,31 @@ class Moment(_Told):
     """A line of the timeline."""
 
     pair: str
-    state: str = Field(description="of the service's health; or not_served, silent, recorded")
+    state: str = Field(description="state of the pair's health; or not_served, silent, recorded")
     level: Literal[0, 1, 2, 3] = Field(description="ROS: 0 OK, 1 WARN, 2 ERROR, 3 STALE")
     why: str = Field(description="sentences of the reasons")
-    reasons: tuple[str, ...] = Field(default=(), description="their codes")
+    reasons: tuple[str, ...] = Field(default=(), description="codes of the reasons")
     needs: tuple[str, ...] = Field(default=(), description="what is still missing")
-    provenance: str | None = Field(default=None, description="of the extrinsic that is served")
-    status: str | None = Field(default=None, description="of the latest attempt; of a recording, of its result")
-    percent_complete: float | None = Field(default=None, description="of the open window")
-    candidate: bool = Field(default=False, description="whether one is shown")
+    provenance: str | None = Field(default=None, description="where the served extrinsic comes from")
+    status: str | None = Field(default=None, description="status of the latest attempt, or of a recording's result")
+    percent_complete: float | None = Field(default=None, description="how full the open window is")
+    candidate: bool = Field(default=False, description="whether a candidate is shown")
     ages: Ages = Ages()
     pair_rate_hz: float | None = None
     sync_error_s: float | None = None
-    correction: Axes = Field(default=Axes(), description="of what is served, from nominal")
-    sigma: Axes = Field(default=Axes(), description="its standard deviations")
-    step: Axes = Field(default=Axes(), description="of the candidate, from what is served")
+    correction: Axes = Field(default=Axes(), description="served extrinsic, from nominal")
+    sigma: Axes = Field(default=Axes(), description="standard deviations of `correction`")
+    step: Axes = Field(default=Axes(), description="candidate, from the served extrinsic")
     figures: tuple[Figure, ...] = ()
     not_shown: tuple[Missed, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """As it is sent."""
+        """The line in the form in which it is sent."""
         return self.model_dump(mode="json", exclude_none=True)
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema of a `Moment`, without references and choices: viewers follow none."""
+    """JSON Schema of a `Moment`, without references and choices, which viewers do not follow."""
     whole = Moment.model_json_schema()
     plain: dict[str, Any] = _plain(whole, whole.get("$defs", {}))
     return plain | {"title": "coec.Moment"}

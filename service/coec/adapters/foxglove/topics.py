@@ -1,4 +1,4 @@
-"""Names of what a viewer subscribes to: `deploy/foxglove-layout.json` and every other layout count on them."""
+"""Names of the topics for viewers; `deploy/foxglove-layout.json` and all other layouts depend on them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Pose(StrEnum):
-    """Whose extrinsic points are drawn at, and what its frame is called after."""
+    """Which extrinsic is drawn; also the suffix of its frame's name."""
 
     SERVED = "served"
     NOMINAL = "nominal"
@@ -22,10 +22,10 @@ HEALTH = "/health"
 LOG = "/log"
 
 POINTS: Mapping[Pose, str] = {pose: f"/camera/points_{pose}" for pose in Pose}
-"""Points on the image, one topic for each extrinsic: each is shown or hidden by itself."""
+"""Topics of the points on the image, one per extrinsic, so that each can be shown or hidden separately."""
 
 PICTURES = frozenset({IMAGE, CALIBRATION, CLOUD, TRANSFORMS, *POINTS.values()})
-"""What needs the sensors' frames."""
+"""Topics that need the sensors' frames."""
 
 TOPICS: Mapping[str, str] = {
     IMAGE: "the camera's image as it came; raw pixels as JPEG",
@@ -36,7 +36,7 @@ TOPICS: Mapping[str, str] = {
     HEALTH: "once a second and at every change: state, reasons, figures, ages",
     LOG: "a line for every change of the state",
 }
-"""All of them, and what each holds."""
+"""All topics and what each holds."""
 
 
 def frame_of(camera_frame: str, pose: Pose) -> str:

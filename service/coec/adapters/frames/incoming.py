@@ -1,4 +1,4 @@
-"""What both encodings of frames check alike before a value is made of a message."""
+"""Checks that both encodings of frames share, made before a message becomes a value."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from coec.config import LimitsConfig
 from coec.errors import DecodeError
 
 MAX_FRAME_ID = 128
-"""Characters, as in config.CameraConfig.frame_id."""
+"""Most characters of a frame id, as in config.CameraConfig.frame_id."""
 
 MAX_TIME_OFFSET_S = 10.0
-"""A point further than this from the stamp of its sweep was timed by another clock: the longest period of
-config.SweepConfig."""
+"""Most time between a point and the stamp of its sweep, the longest period of config.SweepConfig. A point beyond it was
+timed by another clock."""
 
 MAX_SPEED = 1000.0
-"""m/s and rad/s: beyond every vehicle and gyroscope (as in coec.schemas.frames)."""
+"""Largest velocity, m/s and rad/s, beyond every vehicle and gyroscope (as in coec.schemas.frames)."""
 
 
 class Refusal(StrEnum):
-    """Every reason for which a frame is refused: the label under which the loss is counted."""
+    """Every reason for refusing a frame; also the label under which the loss is counted."""
 
     MESSAGE_TOO_LARGE = "message_too_large"
     MESSAGE_MALFORMED = "message_malformed"
@@ -65,8 +65,8 @@ def check_size(payload: bytes, limits: LimitsConfig) -> None:
 def finite_rows(
     xyz_m: NDArray[np.float32], time_offset_s: NDArray[np.float32] | None = None
 ) -> NDArray[np.bool_] | None:
-    """(N,) mask of the points whose place and time are finite, or None when all are (the usual case)."""
-    # First as a whole, and by a sum, which anything that is not finite would spoil: ten times as fast as by column.
+    """(N,) mask of the points whose position and time are finite; None if all are (the usual case)."""
+    # First check whole arrays by their sum, which any non-finite value spoils: ten times as fast as by column.
     with np.errstate(over="ignore", invalid="ignore"):
         if all(math.isfinite(column.sum()) for column in (xyz_m, time_offset_s) if column is not None):
             return None
@@ -87,7 +87,7 @@ def lidar_frame(
     sequence: int | None = None,
     timed_by: str = "",
 ) -> LidarFrame:
-    """A sweep without its non-finite points; every column loses the same rows. Copies only when there is one.
+    """A sweep without its non-finite points; every column loses the same rows. Copies only if there are such points.
 
     Args:
         xyz_m: (N, 3).
@@ -95,8 +95,7 @@ def lidar_frame(
         timed_by: see `LidarFrame`.
 
     Raises:
-        DecodeError: `cloud_empty` when no finite point is left, `cloud_time` when a point is too far from the
-        stamp.
+        DecodeError: `cloud_empty` if no finite point is left, `cloud_time` if a point is too far from the stamp.
     """
     keep = finite_rows(xyz_m, time_offset_s)
     if keep is not None:

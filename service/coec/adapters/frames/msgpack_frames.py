@@ -1,5 +1,5 @@
-"""The native encoding of frames in. The sender may be anyone: sizes are bounded before anything is built from
-them."""
+"""Decodes and encodes frames in the native encoding. Anybody may be the sender, so that sizes are bounded before
+anything is built from them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from coec.schemas import frames
 from coec.schemas.base import Message, to_msgpack
 
 MAX_ITEMS = 64
-"""Entries of one map or array, and containers in one message. Ours have at most 8 and 4; the rest is room for
-fields of newer senders. Together with msgpack's own limit of nesting they bound what a bomb can allocate to
-some hundred kB."""
+"""Most entries of one map or array, and most containers in one message. Messages of this version have at most 8 and 4;
+the rest is room for fields of newer senders. Together with msgpack's own limit of nesting, this bounds what a malicious
+message can allocate to some hundred kB."""
 
 MAX_TEXT = 4096
-"""Bytes of one string; frame ids have at most 128 characters."""
+"""Most bytes of one string; frame ids have at most 128 characters."""
 
 _REASONS = {
     "stamp_ns": Refusal.STAMP_INVALID,
@@ -32,16 +32,16 @@ _REASONS = {
     "linear_mps": Refusal.MOTION_INVALID,
     "angular_radps": Refusal.MOTION_INVALID,
 }
-"""By the field that was wrong; any other is `message_fields`."""
+"""Reason by the field that was wrong; for any other field it is `message_fields`."""
 
 W = TypeVar("W", bound=Message)
 
 
 def decode_camera(payload: bytes, limits: LimitsConfig) -> CameraFrame:
-    """A `coec.schemas.frames.CameraFrame` in msgpack. Of compressed images only the header is read.
+    """Decodes a `coec.schemas.frames.CameraFrame` in msgpack. Of compressed images only the header is read.
 
     Raises:
-        DecodeError: anything that is not one, with a reason of `Refusal`.
+        DecodeError: not a valid message; with a reason of `Refusal`.
     """
     wire = _read(frames.CameraFrame, payload, limits)
     return CameraFrame(
@@ -54,12 +54,11 @@ def decode_camera(payload: bytes, limits: LimitsConfig) -> CameraFrame:
 
 
 def decode_lidar(payload: bytes, limits: LimitsConfig) -> LidarFrame:
-    """A `coec.schemas.frames.LidarFrame` in msgpack. The columns are read-only views of the message unless
-    points had to be dropped: those with a non-finite coordinate or time go, together with their row in every
-    column.
+    """Decodes a `coec.schemas.frames.LidarFrame` in msgpack. Points with a non-finite coordinate or time are dropped,
+    with their row in every column. The columns are read-only views of the message unless points are dropped.
 
     Raises:
-        DecodeError: anything that is not one, with a reason of `Refusal`.
+        DecodeError: not a valid message; with a reason of `Refusal`.
     """
     wire = _read(frames.LidarFrame, payload, limits)
     count, rest = divmod(len(wire.points), 12)
@@ -79,10 +78,10 @@ def decode_lidar(payload: bytes, limits: LimitsConfig) -> LidarFrame:
 
 
 def decode_ego(payload: bytes, limits: LimitsConfig) -> EgoMotion:
-    """A `coec.schemas.frames.EgoMotion` in msgpack.
+    """Decodes a `coec.schemas.frames.EgoMotion` in msgpack.
 
     Raises:
-        DecodeError: anything that is not one, with a reason of `Refusal`.
+        DecodeError: not a valid message; with a reason of `Refusal`.
     """
     wire = _read(frames.EgoMotion, payload, limits)
     return EgoMotion(wire.stamp_ns, wire.frame_id, wire.linear_mps, wire.angular_radps, wire.sequence)
@@ -165,7 +164,7 @@ def _read(model: type[W], payload: bytes, limits: LimitsConfig) -> W:
         first = error.errors(include_input=False, include_url=False)[0]
         where = str(first["loc"][0]) if first["loc"] else "message"
         reason = _REASONS.get(where, Refusal.MESSAGE_FIELDS)
-        # The kind of the complaint, never the sender's text.
+        # Only the kind of the error, never text from the sender.
         raise DecodeError(reason, f"{model.__name__}: {where}: {first['type']}") from None
 
 

@@ -1,1 +1,1 @@
-"""Libraries that search in clouds of points."""
+"""Libraries that search in point clouds."""

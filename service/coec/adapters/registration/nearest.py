@@ -1,5 +1,5 @@
-"""The nearest points of a cloud, by the k-d tree of small_gicp (Koide 2024, MIT): one thread, so that every call gives
-the same bits."""
+"""The nearest points of a cloud, by the k-d tree of small_gicp (Koide 2024, MIT), on one thread so that every call
+gives the same bits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Tree:
 
 
 def installed() -> bool:
-    """Whether the optional extra is there."""
+    """Whether the optional extra is installed."""
     return importlib.util.find_spec("small_gicp") is not None
 
 

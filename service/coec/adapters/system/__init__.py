@@ -1,1 +1,1 @@
-"""The operating system: logs, threads, memory, the service manager."""
+"""The operating system: logs, threads, memory, service manager."""

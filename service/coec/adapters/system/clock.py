@@ -1,4 +1,4 @@
-"""Whether somebody keeps the clock of this computer right."""
+"""Whether the clock of this computer is synchronised."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import ctypes
 from dataclasses import dataclass
 
 TIME_ERROR = 5
-"""State of the kernel's clock that nobody keeps; adjtimex(2)."""
+"""State of a kernel clock that is not synchronised; adjtimex(2)."""
 
 
 class _Timex(ctypes.Structure):
-    """Its beginning; the rest is for the kernel to fill."""
+    """The beginning of `struct timex`, and room for the rest that the kernel fills."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -25,14 +25,14 @@ class _Timex(ctypes.Structure):
 
 @dataclass(frozen=True, slots=True)
 class ClockState:
-    """What the kernel knows: whether a daemon (NTP, PTP) steers the clock, and how far it may be off at most, s."""
+    """What the kernel knows: whether a daemon (NTP, PTP) steers the clock, and the clock's largest error, s."""
 
     synchronised: bool
     max_error_s: float
 
 
 def clock_state() -> ClockState | None:
-    """Now; None where the system does not tell."""
+    """The state now; None if the system does not tell."""
     adjtimex = getattr(ctypes.CDLL(None), "adjtimex", None)
     if adjtimex is None:
         return None

@@ -1,4 +1,4 @@
-"""One core for each of several processes: the libraries that calculate would start a thread for every core in each."""
+"""Keeps each of several processes to one core; otherwise the numeric libraries start a thread per core in each."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Variables that say how many threads a library starts; read when it is imported."""
+"""Environment variables that set how many threads a library starts; a library reads them when it is imported."""
 
 ONE_THREAD = dict.fromkeys(THREADS, "1")
 """The environment of a process that keeps to one core."""
@@ -15,7 +15,7 @@ ONE_THREAD = dict.fromkeys(THREADS, "1")
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """The processes that are begun in here keep to one core: the others have work of their own."""
+    """Processes started inside the context keep to one core each."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
     try:

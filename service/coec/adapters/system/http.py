@@ -1,7 +1,7 @@
-"""A few pages over HTTP, for a scraper on the same computer: GET, one answer, the end of the connection.
+"""A small HTTP server for a scraper on the same computer: GET, one answer, end of the connection.
 
-One thread looks after all connections and waits for none of them: whoever sends or reads slowly has a deadline, and
-when there are too many the oldest goes. Nothing of a request is kept, and of what was asked only the path is looked at.
+One thread serves all connections and waits for none of them. Slow clients have a deadline, and if there are too many
+connections the oldest is dropped. Requests are not kept, and only their path is used.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from coec.errors import UnavailableError
 _log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS = 16
-"""At once; a scraper has one, and it lasts for milliseconds."""
+"""Most connections at once; a scraper has one, for milliseconds."""
 
 MAX_REQUEST_BYTES = 4096
-"""Request line and headers; those of a scraper have 200 to 400."""
+"""Most bytes of request line and headers; a scraper sends 200 to 400."""
 
 DEADLINE_S = 3.0
-"""Of a connection, from its first byte or none to its last: on the same computer it takes milliseconds."""
+"""Longest duration of a connection; on the same computer it takes milliseconds."""
 
 POLL_S = 0.2
 
@@ -51,13 +51,13 @@ class _Connection:
 
 
 class HttpServer:
-    """Listens from its making until `close`; answers while `thread` runs."""
+    """Listens from construction until `close`; answers while `thread` runs."""
 
     def __init__(self, host: str, port: int, find: Callable[[str], Page | None]) -> None:
-        """`find(path)` is called on the thread; None is answered 404.
+        """`find(path)` is called on the thread; for None the answer is 404.
 
         Raises:
-            UnavailableError: nobody can listen there.
+            UnavailableError: it is not possible to listen there.
         """
         self._find = find
         self._listener = _listening(host, port)
@@ -67,7 +67,7 @@ class HttpServer:
         self.thread = ServiceThread("http", self._run)
 
     def close(self, deadline_s: float) -> bool:
-        """Stop listening and drop who is there; False when the thread did not end within the deadline."""
+        """Stop listening and drop all connections; False if the thread did not end within the deadline."""
         self.thread.request_stop()
         ended = self.thread.join(deadline_s)
         if ended:
@@ -91,7 +91,7 @@ class HttpServer:
     def _accept(self) -> None:
         try:
             accepted, _ = self._listener.accept()
-        except OSError:  # it has gone already, or the process has no descriptor left: there is time for others
+        except OSError:  # the client has gone, or the process has no descriptor left: go on with the others
             return
         accepted.setblocking(False)
         if len(self._connections) >= MAX_CONNECTIONS:

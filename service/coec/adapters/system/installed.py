@@ -1,4 +1,4 @@
-"""What is installed beside coec because coec needs it: from the metadata that every package brings along."""
+"""The packages that are installed because coec needs them, read from the metadata of each package."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NAMED: Mapping[str, str] = {
     "MIT License": "MIT",
     "any-OSI": "any-OSI",
 }
-"""What packages write into the field `License`, and the SPDX identifier of that."""
+"""Texts that packages write into the field `License`, and their SPDX identifiers."""
 
 CLASSIFIED: Mapping[str, str] = {
     "License :: OSI Approved :: Apache Software License": "Apache-2.0",
@@ -35,7 +35,7 @@ CLASSIFIED: Mapping[str, str] = {
     "License :: OSI Approved :: Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
     "License :: OSI Approved :: Python Software Foundation License": "PSF-2.0",
 }
-"""Classifiers that name one licence. `BSD License` names a family."""
+"""Classifiers that name a single licence; `BSD License` is not here because it names a family."""
 
 _PIN = re.compile(r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>\S+)")
 _HASH = re.compile(r"--hash=sha256:(?P<sha256>[0-9a-f]{64})\b")
@@ -43,14 +43,14 @@ _HASH = re.compile(r"--hash=sha256:(?P<sha256>[0-9a-f]{64})\b")
 
 @dataclass(frozen=True, slots=True)
 class NativeLibrary:
-    """A shared library of somebody else's that a package has packed in; `sha256` hexadecimal."""
+    """A third-party shared library inside a package; `sha256` is hexadecimal."""
 
     file: str
     sha256: str
 
     @property
     def name(self) -> str:
-        """Without the mark of the packer, and without the version: `libavcodec`."""
+        """The name without the packer's mark and without the version: `libavcodec`."""
         return re.sub(r"(-[0-9a-f]{8})+(?=[-.])|\.so.*", "", self.file)
 
 
@@ -59,10 +59,10 @@ class Package:
     """An installed package.
 
     Attributes:
-        licence: SPDX expression; None where the package says nothing that is one.
-        licence_files: names of the texts that it brings along, within its metadata.
-        requires: canonical names of the packages that it needs here.
-        native: libraries of others within it, whose licences are in its texts at best.
+        licence: SPDX expression; None if the package states none.
+        licence_files: names of the licence texts in its metadata.
+        requires: canonical names of the packages that it needs on this machine.
+        native: third-party libraries inside it, whose licences are at best in its texts.
     """
 
     name: str
@@ -74,8 +74,8 @@ class Package:
 
 
 def installed(name: str) -> dict[str, Package]:
-    """A package and all that it needs, directly or not, by canonical name in alphabetical order; of optional extras,
-    what the needed packages ask for by name.
+    """A package and everything that it needs, directly or not, by canonical name in alphabetical order. Optional extras
+    are included if a needed package asks for them by name.
 
     Raises:
         NotFoundError: the package, or one that it needs, is not installed.
@@ -111,8 +111,7 @@ def installed(name: str) -> dict[str, Package]:
 
 
 def pinned_hashes(lock: Path) -> dict[tuple[str, str], tuple[str, ...]]:
-    """sha256 (hexadecimal) of the archives that may be installed, by canonical name and version, from a
-    requirements.lock.
+    """sha256 (hexadecimal) of the archives that a requirements.lock allows, by canonical name and version.
 
     Raises:
         UsageError: the file cannot be read, or pins nothing.
@@ -135,7 +134,7 @@ def pinned_hashes(lock: Path) -> dict[tuple[str, str], tuple[str, ...]]:
 
 
 def _needs(package: Distribution, extras: frozenset[str]) -> Iterator[tuple[str, frozenset[str]]]:
-    """Those whose conditions hold on this machine."""
+    """The requirements of a package whose conditions hold on this machine, with their extras."""
     for line in package.requires or ():
         requirement = Requirement(line)
         marker = requirement.marker
@@ -144,7 +143,7 @@ def _needs(package: Distribution, extras: frozenset[str]) -> Iterator[tuple[str,
 
 
 def _licence(package: Distribution) -> str | None:
-    """What the package says of itself, the most precise first."""
+    """The licence that the package states, from its most precise statement."""
     metadata = package.metadata
     if "License-Expression" in metadata:
         return str(metadata["License-Expression"])
@@ -159,7 +158,7 @@ def _licence(package: Distribution) -> str | None:
 
 
 def bsd_of(text: str) -> str | None:
-    """Which licence of the BSD family a text is, by its clauses; None: it is none."""
+    """The licence of the BSD family that a text is, by its clauses; None if it is none."""
     words = " ".join(text.split())
     if "Redistribution and use in source and binary forms" not in words:
         return None
@@ -175,7 +174,8 @@ def _text(package: Distribution, name: str) -> str:
 
 
 def _native(package: Distribution) -> Iterator[NativeLibrary]:
-    """auditwheel and its kin put them into `NAME.libs`, and their digests into the list of files."""
+    """The third-party libraries of a package: auditwheel and similar tools put them into `NAME.libs`, and their digests
+    into the list of files."""
     for file in package.files or ():
         path = PurePosixPath(file)
         if (

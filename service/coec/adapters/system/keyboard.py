@@ -1,4 +1,4 @@
-"""Single keys of a terminal, without waiting for the end of a line."""
+"""Reads single keys from a terminal, without waiting for the end of a line."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 NAMED = {b"\x1b[A": "up", b"\x1b[B": "down", b"\x1b[5~": "page up", b"\x1b[6~": "page down", b"\r": "enter"}
-"""What keys without a letter send (ECMA-48, as xterm and the console of Linux have it)."""
+"""What keys without a letter send (ECMA-48, as in xterm and the Linux console)."""
 
 MAX_BYTES = 64
-"""Read at once: somebody who leans on a key."""
+"""Bytes read at once, enough for a key that is held down."""
 
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str | None]]:
-    """`poll(wait_s)` gives the next key that is pressed, or None. The terminal is as before afterwards. Signals
-    (Ctrl-C) work as ever. Where standard input is no terminal, nobody presses anything."""
+    """Yields `poll(wait_s)`, which returns the next pressed key or None. Afterwards the terminal is as before. Signals
+    (Ctrl-C) work as usual. If standard input is no terminal, `poll` always returns None."""
     if not sys.stdin.isatty():
         yield lambda wait_s: _nothing(wait_s)
         return

@@ -1,4 +1,4 @@
-"""Sockets of this computer that wait for others, whoever they belong to, as the kernel tells them (proc(5))."""
+"""Listening sockets of this computer, of any process, from the kernel's tables (proc(5))."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Transport = Literal["tcp", "udp"]
 
 TABLES = {"tcp": ("tcp", "tcp6"), "udp": ("udp", "udp6")}
 WAITS = {"tcp": "0A", "udp": "07"}
-"""Their state in the table: LISTEN; and CLOSE, in which a UDP socket is that is connected to nobody."""
+"""Their state in the tables: LISTEN for TCP, and CLOSE for UDP, the state of a socket without a peer."""
 
 PROC = Path("/proc/net")
-"""Of the network namespace of this process."""
+"""Tables of the network namespace of this process."""
 
 
 def addresses_of_port(protocol: Transport, port: int, tables: Path = PROC) -> set[Address]:
-    """Addresses at which somebody waits at a port.
+    """Addresses at which a process listens on a port.
 
     Raises:
         OSError: this system does not tell.
@@ -35,12 +35,12 @@ def _waiting(table: str, state: str) -> Iterator[tuple[Address, int]]:
         if columns[3] == state:
             digits, _, port = columns[1].partition(":")
             address = ipaddress.ip_address(_in_network_order(digits))
-            # A socket of IPv6 may be bound to an address of IPv4.
+            # An IPv6 socket may be bound to an IPv4 address.
             yield getattr(address, "ipv4_mapped", None) or address, int(port, 16)
 
 
 def _in_network_order(digits: str) -> bytes:
-    """The kernel writes an address as words of 32 bits in the order of the machine."""
+    """The bytes of an address; the kernel writes it as words of 32 bits in the byte order of the machine."""
     data = bytes.fromhex(digits)
     words = (data[start : start + 4] for start in range(0, len(data), 4))
     return b"".join(word[::-1] if sys.byteorder == "little" else word for word in words)

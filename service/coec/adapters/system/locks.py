@@ -1,4 +1,5 @@
-"""Who holds a lock on a file, without trying to take it: whoever starts meanwhile must not find it taken."""
+"""Which process holds a lock on a file. It is found without taking the lock, so that a process that starts meanwhile
+does not find it taken."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from pathlib import Path
 
 
 def holder_of(path: Path) -> int | None:
-    """Process id of one that holds flock(2) on a file; None where nobody does, or the system does not tell. 0: somebody
-    whom this process cannot see."""
+    """Id of a process that holds flock(2) on a file; None if none does, or if the system does not tell; 0 for a process
+    that this one cannot see."""
     try:
         status, lines = path.stat(), Path("/proc/locks").read_text().splitlines()
     except OSError:

@@ -1,4 +1,5 @@
-"""Logs on standard output, one line each, as JSON or for people, and counters whose log lines cannot flood it."""
+"""Logs on standard output, a line per record, as JSON or for people, and counters of losses that cannot flood the
+log."""
 
 from __future__ import annotations
 
@@ -35,11 +36,11 @@ class JsonFormatter(logging.Formatter):
 
 
 class HumanFormatter(logging.Formatter):
-    """For a person at a terminal: local time, level where it is not `info`, message, then the fields. What a sender may
-    have had a hand in moves no cursor and makes no second line."""
+    """For a person at a terminal: local time, level unless it is `info`, message, then the fields. Control characters
+    are escaped, so that text from a sender cannot move the cursor or make a second line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as one line, and the traceback below it where there is one."""
+        """The record as one line, with the traceback below it if there is one."""
         time = datetime.fromtimestamp(record.created, UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
         fields = getattr(record, "fields", None)
@@ -57,7 +58,7 @@ def configure(level: str, form: Form, stream: TextIO | None = None) -> None:
 
     Args:
         level: one of debug, info, warning, error.
-        form: `auto` is for people where the stream is a terminal, else JSON lines.
+        form: `auto` means `human` if the stream is a terminal, else JSON lines.
     """
     to = stream if stream is not None else sys.stdout
     human = form == "human" or (form == "auto" and to.isatty())
@@ -69,20 +70,20 @@ def configure(level: str, form: Form, stream: TextIO | None = None) -> None:
 
 
 class LossCounter:
-    """Counts what was lost, by place and reason, and logs the first of each kind and then every 2^n-th.
+    """Counts losses by place and reason, and logs the first of each kind and then every 2^n-th.
 
     Reasons come from fixed sets, never from a sender. Safe to use from several threads.
     """
 
     def __init__(self, logger: logging.Logger, name: str, kind: str = "pair") -> None:
-        """`name` stands in the log: of the pair, or of another `kind` of thing, whose losses these are."""
+        """`name` identifies in the log the pair, or another `kind` of thing, whose losses these are."""
         self._logger = logger
         self._whose = {kind: name}
         self._lock = threading.Lock()
         self._counts: Counter[tuple[str, str]] = Counter()
 
     def add(self, place: str, reason: str, count: int = 1, detail: str = "") -> None:
-        """Count `count` losses. `detail` is our own sentence; it must hold no text of the sender's."""
+        """Count `count` losses. `detail` is a sentence of the program; it must hold no text from the sender."""
         with self._lock:
             before = self._counts[place, reason]
             after = before + count

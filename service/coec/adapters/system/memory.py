@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def resident_bytes(pid: int | None = None) -> int:
-    """Of a process, or of this one; 0 when it is gone, or the system does not tell."""
+    """Resident memory of a process (None: this one); 0 if it is gone or the system does not tell."""
     try:
         pages = int(Path(f"/proc/{'self' if pid is None else pid}/statm").read_text().split()[1])
     except (OSError, ValueError, IndexError):

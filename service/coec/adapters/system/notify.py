@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 
 class Notifier:
-    """Tells the service manager how the process is; does nothing where there is none."""
+    """Tells the service manager the state of the process; does nothing if there is no manager."""
 
     def __init__(self, address: str | None) -> None:
         """`address` is the value of NOTIFY_SOCKET: a path, `@name` in the abstract namespace, or None."""
@@ -22,7 +22,7 @@ class Notifier:
         return cls(environment.get("NOTIFY_SOCKET"))
 
     def starting(self, within_s: float) -> None:
-        """The start gets on; more is heard within so many seconds."""
+        """The start makes progress; the next message comes within `within_s`."""
         self._send(f"EXTEND_TIMEOUT_USEC={round(within_s * 1e6)}")
 
     def ready(self) -> None:
@@ -30,7 +30,7 @@ class Notifier:
         self._send("READY=1")
 
     def reloading(self) -> None:
-        """The configuration is being read again; `ready` says when that is done."""
+        """The configuration is being read again; call `ready` when that is done."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def watchdog(self) -> None:
@@ -44,7 +44,7 @@ class Notifier:
     def _send(self, message: str) -> None:
         if not self._address:
             return
-        # A manager that went away is no reason to stop calibrating.
+        # Go on calibrating even if the manager has gone.
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
             sock.connect(self._address)
             sock.send(message.encode())

@@ -1,4 +1,4 @@
-"""What a process has to do with the one that started it."""
+"""The relation of a process to the one that started it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
 def die_with(parent: int) -> None:
-    """Die with the thread of the process `parent` that started this one, however that ends."""
+    """Have the kernel kill this process when the thread of process `parent` that started it ends, in whatever way."""
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # it died before the tie was made
+    if os.getppid() != parent:  # the parent died before the call above
         sys.exit(0)

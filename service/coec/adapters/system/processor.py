@@ -6,10 +6,10 @@ import time
 
 
 def processor_s(pid: int) -> float:
-    """Of all threads of a process since it began, s, to the microsecond.
+    """Processor time of all threads of a process since it began, s, to the microsecond.
 
     Raises:
-        OSError: it is gone.
+        OSError: the process is gone.
     """
     # The clock of a process: the complement of its id, and CPUCLOCK_SCHED (clock_getcpuclockid(3), Linux).
     return time.clock_gettime((~pid << 3) | 2)

@@ -1,4 +1,4 @@
-"""A thread whose death and whose standstill can be seen from outside."""
+"""Threads whose death or standstill can be seen from outside."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ class ServiceThread:
 
     @property
     def dead(self) -> bool:
-        """Whether the thread ended though nobody asked it to."""
+        """Whether the thread ended without having been asked to."""
         return self._thread.ident is not None and not self._thread.is_alive() and not self._stop.is_set()
 
     def request_stop(self) -> None:
-        """Ask the body to return; wake it yourself where it waits for something else than a short timeout."""
+        """Ask the body to return. If the body waits for more than a short timeout, the caller has to wake it."""
         self._stop.set()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the end; False when the thread still runs after `timeout_s`."""
+        """Wait for the end; False if the thread still runs after `timeout_s`."""
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()

@@ -1,1 +1,1 @@
-"""TLS without a socket: who gives a command proves it inside queries."""
+"""TLS without a socket: the sender of a command proves its name inside queries."""

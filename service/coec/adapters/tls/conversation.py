@@ -1,6 +1,6 @@
-"""Two programs prove to each other who they are, in two questions and their answers, over any carrier.
+"""Two programs prove their names to each other with two questions and their answers, over any carrier.
 
-A conversation is TLS 1.3 with certificates on both sides, whose bytes travel as payloads of questions and answers::
+A conversation is TLS 1.3 with certificates on both sides. Its bytes travel as payloads of questions and answers::
 
     speaker                              listener
     hello()      --  ClientHello  -->    hear()
@@ -8,8 +8,8 @@ A conversation is TLS 1.3 with certificates on both sides, whose bytes travel as
                  --  certificate, ..., text -->  hear()
     answer()     <-- sealed answer --    Heard
 
-Who carries the bytes can read, change, repeat and redirect nothing of what is said; he can only keep it back. Names are
-the common names of the certificates, both signed by one authority. (RFC 8446; `ssl.MemoryBIO`.)
+The carrier of the bytes cannot read, change, repeat or redirect what is said; it can only hold it back. Names are the
+common names of the certificates, both signed by one authority. (RFC 8446; `ssl.MemoryBIO`.)
 """
 
 from __future__ import annotations
@@ -27,29 +27,32 @@ from coec.config import AuthorityConfig
 from coec.errors import CoecError, ConfigError, NotProvenError
 
 WAITED_S = 5.0
-"""For the second question: what comes later is not heard. A carrier that keeps it back gains no more than this."""
+"""How long the listener waits for the second question; a later one is refused. A carrier that holds a question back
+gains at most this time."""
 
 CONVERSATIONS = 256
-"""Begun and not ended, some 36 kB each. The oldest makes room, once it has had the time to end."""
+"""Most conversations that have begun and not ended, some 36 kB each. The oldest one makes room once it is `LEFT_S`
+old."""
 
 MAX_SAID = 16_384
-"""Bytes of what is said: one record of TLS."""
+"""Most bytes that can be said: one record of TLS."""
 
 
 LEFT_S = 1.0
-"""For so long nobody's conversation is given up for another's: two queries take some milliseconds, and a busy computer
-a hundred times that."""
+"""Age before which no conversation is dropped for another. Two queries take some milliseconds, and on a busy computer a
+hundred times that."""
 
 
 class CrowdedError(CoecError):
-    """Too many conversations have begun just now; a beginning does nothing, and may be tried again."""
+    """Too many conversations have begun just now. Nothing was done, and the sender may begin again."""
 
     reply_code = "busy"
 
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """PEM files: a certificate with its private key, and the authority that others are held to."""
+    """PEM files: a certificate with its private key, and the authority that must have signed the certificates of
+    others."""
 
     certificate: Path
     private_key: Path
@@ -57,7 +60,7 @@ class Credentials:
 
 
 def credentials_of(config: AuthorityConfig) -> Credentials | None:
-    """Those of the service; None: it has none."""
+    """The credentials of the service; None: it has none."""
     if config.certificate is None or config.private_key is None or config.root_ca is None:
         return None
     return Credentials(config.certificate, config.private_key, config.root_ca)
@@ -65,8 +68,8 @@ def credentials_of(config: AuthorityConfig) -> Credentials | None:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """The end of a conversation: whose certificate it was (common name), what was said, and how to answer so that
-    only he can read it."""
+    """The end of a conversation: the speaker's name (common name of its certificate), what it said, and a function that
+    encrypts an answer for it."""
 
     name: str
     said: bytes
@@ -81,10 +84,10 @@ class _Line:
         self._tls = context.wrap_bio(self._came, self._goes, server_side=server_side)
 
     def shake_hands(self, came: bytes) -> bool:
-        """Whether the other one has proven himself; else his next bytes are needed.
+        """Whether the other end has proven its name; if not, its next bytes are needed.
 
         Raises:
-            NotProvenError: he cannot.
+            NotProvenError: it cannot.
         """
         self._came.write(came)
         try:
@@ -96,7 +99,7 @@ class _Line:
         return True
 
     def peer(self) -> str:
-        """The common name in his certificate."""
+        """The common name in the other end's certificate."""
         subject: Any = (self._tls.getpeercert() or {}).get("subject", ())
         names = [value for part in subject for kind, value in part if kind == "commonName"]
         if len(names) != 1:
@@ -104,7 +107,7 @@ class _Line:
         return str(names[0])
 
     def read(self, came: bytes = b"") -> bytes:
-        """What he said, in one record."""
+        """What the other end said, in one record."""
         self._came.write(came)
         try:
             return self._tls.read(MAX_SAID)
@@ -123,42 +126,43 @@ class _Line:
 
 
 class Listener:
-    """The end of the service: takes part in many conversations at once. One thread.
+    """The service's end, which takes part in many conversations at once. For use by one thread.
 
     Attributes:
-        digest: SHA-256 of what its files held.
+        digest: SHA-256 of the content of its files.
     """
 
     def __init__(self, credentials: Credentials, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock` tells seconds.
+        """`clock` returns seconds.
 
         Raises:
             ConfigError: a file cannot be used; names it.
         """
         self._context = _context(credentials, ssl.PROTOCOL_TLS_SERVER)
         self._context.verify_mode = ssl.CERT_REQUIRED
-        self._context.num_tickets = 0  # no conversation is taken up again
+        self._context.num_tickets = 0  # no conversation is resumed
         self.digest = _digest(credentials)
         self._clock = clock
         self._begun: OrderedDict[str, tuple[_Line, float]] = OrderedDict()
 
     def renewed(self, credentials: Credentials) -> Listener:
-        """One that goes on with what has begun here, and holds who begins from now on to these files, read now. For any
-        thread; this one is not to be asked any more.
+        """A listener that continues the conversations begun here and uses these files, read now, for new ones. For any
+        thread. Do not use this one afterwards.
 
         Raises:
-            ConfigError: as at first; this one goes on.
+            ConfigError: a file cannot be used; then this listener stays in use.
         """
         fresh = Listener(credentials, self._clock)
         fresh._begun = self._begun
         return fresh
 
     def hear(self, conversation: str, came: bytes) -> bytes | Heard:
-        """The next bytes of a conversation, which its speaker named: what to send back, or its end.
+        """Takes the next bytes of the conversation with this id, which its speaker chose. Returns the bytes to send
+        back, or the end of the conversation.
 
         Raises:
-            NotProvenError: whoever speaks cannot prove who he is, or took too long.
-            CrowdedError: it would begin, and there is no room.
+            NotProvenError: the speaker cannot prove its name, or took too long.
+            CrowdedError: the conversation would begin, but there is no room.
         """
         now_s = self._clock()
         while self._begun and next(iter(self._begun.values()))[1] < now_s:
@@ -172,7 +176,8 @@ class Listener:
 
     def _begin(self, conversation: str, came: bytes, now_s: float) -> bytes:
         if len(self._begun) >= CONVERSATIONS:
-            # Who was let in is left the time to go on: a flood of beginnings makes others wait, and ends none of them.
+            # Conversations that have begun get time to go on, so that a flood of new ones makes others wait but ends
+            # none.
             if next(iter(self._begun.values()))[1] > now_s + WAITED_S - LEFT_S:
                 raise CrowdedError("too many conversations have begun; begin again in a moment")
             self._begun.popitem(last=False)
@@ -186,16 +191,16 @@ class Listener:
 
 
 class Speaker:
-    """The other end, of one conversation."""
+    """The sender's end of one conversation."""
 
     def __init__(self, credentials: Credentials, to: str) -> None:
-        """`to` is the common name of whom is spoken to.
+        """`to` is the common name of the listener.
 
         Raises:
             ConfigError: as `Listener`.
         """
         context = _context(credentials, ssl.PROTOCOL_TLS_CLIENT)
-        context.check_hostname = False  # what is named here is no host: `say` looks at the name
+        context.check_hostname = False  # the name is not that of a host: `say` checks it
         self._line = _Line(context, server_side=False)
         self._to = to
 
@@ -205,10 +210,10 @@ class Speaker:
         return self._line.goes()
 
     def say(self, came: bytes, text: bytes) -> bytes:
-        """The bytes that end the conversation, once the other one has proven that he is the one meant.
+        """The bytes that end the conversation, after the listener has proven its name.
 
         Raises:
-            NotProvenError: he is not; nothing of the text was sent.
+            NotProvenError: it has another name or no proof; nothing of the text was sent.
         """
         if not self._line.shake_hands(came):
             raise NotProvenError("the answer holds no certificate")
@@ -219,10 +224,10 @@ class Speaker:
         return self._line.goes()
 
     def answer(self, came: bytes) -> bytes:
-        """What the other one answered.
+        """The listener's answer.
 
         Raises:
-            NotProvenError: these are not his bytes.
+            NotProvenError: these bytes are not from the listener.
         """
         return self._line.read(came)
 
@@ -261,7 +266,7 @@ def _digest(credentials: Credentials) -> str:
 
 
 def _nobody_types() -> str:
-    """For an encrypted key: else OpenSSL asks at the terminal, and a service would wait for ever."""
+    """An empty password for an encrypted key. Without it OpenSSL asks at the terminal and a service waits for ever."""
     return ""
 
 
@@ -270,7 +275,7 @@ def _reason(error: Exception) -> str:
 
 
 def _why(error: ssl.SSLError) -> str:
-    """In OpenSSL's words, which hold nothing of what came."""
+    """OpenSSL's reason, which quotes nothing that was received."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return error.verify_message
     return (error.reason or "malformed").lower().replace("_", " ")
