@@ -170,8 +170,8 @@ class VerdictConfig(Stage):
     max_intrinsics_certainty: float = Field(
         default=2.0,
         gt=0,
-        description="largest certainty that another lens explains the window better, in units of half a standard "
-        "deviation; at 1.5 that lens is as likely, and σ grows by what it moves; above this limit the intrinsics are "
+        description="largest certainty that another lens explains the window better: half its distance in standard "
+        "deviations; at 1.5 that lens is as likely, and σ grows by what it moves; above this limit the intrinsics are "
         "off (fused)",
     )
     held_translation_sigma_m: float = Field(

@@ -10,7 +10,8 @@ from coec.config.base import IDENTITY, FilePath, KeyExpression, Matrix4x4, Name,
 
 
 class CameraIntrinsics(Stage):
-    """Intrinsics as in `dataset.yaml`; which of the optional parameters are needed depends on `model`."""
+    """Intrinsics of a camera; `model` determines which of the optional parameters are needed. The names are those of
+    `dataset.yaml`."""
 
     model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"] = Field(
         description="model of the lens"
