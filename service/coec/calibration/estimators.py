@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.looks import look
 from coec.calibration.confidence.modes import Rivals
 from coec.calibration.frames.decoded_once import DecodedOnce
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
@@ -238,11 +239,15 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
             ends.append(polish_in_turn(bands, basin, to_rank, progress))
     polished = _with_ranks(fusion, [end.T_camera_lidar for end in ends])
 
+    _, highest = max(polished, key=lambda end: end[0])
+    independent = look(edges.sharp, highest).count / len(window.pairs)
+
     def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:
         rank, pose = end
-        # Half the square of a rank is, in nats, what the window says against chance. A maximum outside of the reach
-        # is a rival, but the answer has to lie inside.
-        told = 0.5 * rank**2 + log_prior(pose, start, window.start_known_to_rad)
+        # Half the square of a rank is, in nats, what the window says against chance, if its frames are independent:
+        # ten frames of one view fit a wrong pose ten times. A maximum outside of the reach is a rival, but the answer
+        # has to lie inside.
+        told = 0.5 * independent * rank**2 + log_prior(pose, start, window.start_known_to_rad)
         return not at_rim(pose, start, reach), told
 
     _, pose = max(polished, key=preferred)

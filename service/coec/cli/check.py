@@ -10,7 +10,6 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files.conversions import degrees_or_null
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
-from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import Estimate
 from coec.config import LimitsConfig
 from coec.errors import CalibrationError, SourceError
@@ -57,9 +56,9 @@ def run(source: str, *, depth: str | None, as_json: bool) -> int:
 def _trial(recording: Recording, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
     """A calibration of a few pairs near the recording's own extrinsic: shows how well this scene fixes the pose."""
     loaded = windows.chosen_from(recording, PAIRS, lambda done, total: times.step("load", done, total))
+    window = loaded.window
     configuration = configuration_of(Choices(depth=depth), loaded.configuration)
     limits = LimitsConfig()
-    window = replace(loaded.window, start_known_to_rad=MOUNT_RAD)
     try:
         return calibrate(window, open_depth(configuration.depth, limits), GreyImages(limits), configuration, times)
     except CalibrationError as error:

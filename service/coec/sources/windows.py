@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from coec.adapters.mcap.windows import is_window, read_result, read_window
 from coec.calibration.frames.pairing import Pairer
+from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import FramePair, Matrix4, Window
 from coec.config import CalibrationConfig, Config, PairingConfig
 from coec.errors import SourceError, UsageError
@@ -80,7 +81,7 @@ def chosen_from(
     recording: Recording, frames: int, heard: Callable[[int, int], None], between_s: tuple[float, float] = WHOLE
 ) -> Loaded:
     """The window of an open recording: at most `frames` of its camera frames, evenly chosen and paired. `heard` and
-    `between_s` as in `load`.
+    `between_s` as in `load`. The recording's own extrinsic counts as one in use, not as a guess.
 
     Raises:
         SourceError: a file cannot be read, or no camera frame has a sweep.
@@ -99,9 +100,8 @@ def chosen_from(
             f"{recording.name}: none of {len(chosen)} camera frames has a sweep within "
             f"{PairingConfig().tolerance_s} s: check the stamps of both"
         )
-    window = Window(
-        f"{recording.rig.pair}-{pairs[0].stamp_ns}", recording.rig, recording.T_camera_lidar_start, tuple(pairs)
-    )
+    window_id = f"{recording.rig.pair}-{pairs[0].stamp_ns}"
+    window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
     losses = {cause: count for cause, count in pairer.losses.items() if count}
     return Loaded(window, recording.configuration, _default_vehicle(), losses)
 
