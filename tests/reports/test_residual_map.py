@@ -56,6 +56,8 @@ def test_an_exact_fit_leaves_nothing_and_another_what_the_fit_says() -> None:
     size = np.linalg.norm(apart, axis=1)
     assert np.sqrt((size**2).mean()) == pytest.approx(fit.residual_rms_px, rel=1e-6)
     assert 0.5 * fit.residual_max_px < size.max() <= fit.residual_max_px
+    said = f"{fit.residual_rms_px:.3g} px rms, {fit.residual_max_px:.3g} px at most"
+    assert said in lens.sentences(fisheye, fit.camera, size)[0]
     picture = lens.lens_residual(fisheye, fit.camera)
     assert picture.shape[2] == 3
     assert (picture[:4] == 255).all()

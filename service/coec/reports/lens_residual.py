@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera, name_of
+from coec.geometry.cameras.double_sphere_fit import residual
 from coec.geometry.projection import project, unproject
 from coec.reports.canvas import DPI, bgr_of, box
 
@@ -88,8 +89,10 @@ def sentences(camera: Camera, fitted: Camera, size_px: NDArray[np.float64]) -> l
     names = f"{name_of(fitted)} fitted to {name_of(camera)}"
     if len(told) == 0:
         return [f"{names}: the two have no pixel in common"]
+    apart = residual(camera, fitted)
+    rms, largest = (f"{value if value >= LEAST_PX else 0.0:.3g}" for value in (apart.rms_px, apart.max_px))
     return [
-        f"{names}: {np.sqrt((told**2).mean()):.3g} px rms, {told.max():.3g} px at most",
+        f"{names}: {rms} px rms, {largest} px at most",
         f"Over {100 * len(told) / size_px.size:.0f} % of the image; grey: the lens or the model has no pixel there. "
         "Arrows: the direction.",
     ]

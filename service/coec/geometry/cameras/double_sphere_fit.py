@@ -32,14 +32,23 @@ _EXACT_PX = 1e-10
 _MIN_DAMPING, _MAX_DAMPING = 1e-12, 1e12
 
 
-class DoubleSphereFit(NamedTuple):
-    """The fitted camera and what separates it from its source.
+class Residual(NamedTuple):
+    """What separates a camera from the one that it stands for.
 
-    residual_rms_px: distance between the source's pixel and the fitted camera's for the same ray, over the `pixels`
-    compared that both cameras see. residual_max_px: the largest on these and along the border of the image. coverage:
-    share of the pixels compared that the fitted camera sees, of those that the source sees; below 1 it cannot see to
-    the edge of the source.
+    rms_px: distance between the source's pixel and the fitted camera's for the same ray, over the `pixels` compared
+    that both cameras see. max_px: the largest on these and along the border of the image. coverage: share of the pixels
+    compared that the fitted camera sees, of those that the source sees; below 1 it cannot see to the edge of the
+    source.
     """
+
+    rms_px: float
+    max_px: float
+    pixels: int
+    coverage: float
+
+
+class DoubleSphereFit(NamedTuple):
+    """The fitted camera, and the figures of its `Residual` to the source."""
 
     camera: DoubleSphere
     residual_rms_px: float
@@ -61,10 +70,19 @@ def fit_double_sphere(camera: Camera) -> DoubleSphereFit:
     problem = _Problem(camera.width, camera.height, uv_px, rays)
     _, xi, alpha = min(_descend(problem, np.array(start)) for start in _STARTS)
     fitted = problem.camera(xi, alpha)
-    error_px, valid = _errors_px(fitted, uv_px, rays)
+    return DoubleSphereFit(fitted, *residual(camera, fitted))
+
+
+def residual(camera: Camera, fitted: Camera) -> Residual:
+    """By how much `fitted` misses `camera` over its image, each part of it weighted equally.
+
+    Raises ValueError if no pixel compared is seen by both.
+    """
+    error_px, valid = _errors_px(fitted, *_seen(camera, _cell_centres_px(camera)))
+    if len(error_px) == 0:
+        raise ValueError("the two cameras have no pixel in common")
     border_error_px, _ = _errors_px(fitted, *_seen(camera, _border_px(camera)))
-    return DoubleSphereFit(
-        fitted,
+    return Residual(
         float(np.sqrt(np.mean(error_px**2))),
         float(np.concatenate([error_px, border_error_px]).max()),
         len(error_px),
@@ -96,7 +114,7 @@ def _seen(camera: Camera, uv_px: NDArray[np.float64]) -> tuple[NDArray[np.float6
 
 
 def _errors_px(
-    camera: DoubleSphere, uv_px: NDArray[np.float64], rays: NDArray[np.float64]
+    camera: Camera, uv_px: NDArray[np.float64], rays: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Reprojection error of the rays that the camera sees, and which of them it sees."""
     projected_px, valid = project(camera, rays)
