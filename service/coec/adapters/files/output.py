@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from coec.adapters.files import durable
@@ -12,13 +13,15 @@ from coec.schemas.base import M, from_json
 
 
 def try_folder(folder: Path) -> None:
-    """Make the folder and try to write into it, before the work whose result is to go there.
+    """Make the folder and try to write into it, before the work whose result is to go there. Then remove what was made:
+    work that fails leaves no empty folder, and `write` makes its own.
 
     Raises:
         OutputError: the folder cannot be made or written to.
     """
     if folder.is_file():
         raise OutputError(f"cannot write to {folder}: it is a file; name a folder with --output")
+    absent = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # A real write, because permissions say nothing about a full or read-only disk, and nothing at all to root.
@@ -26,6 +29,11 @@ def try_folder(folder: Path) -> None:
             trial.write(b"\0")
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror}; name another folder with --output") from error
+    finally:
+        # Innermost first; one into which somebody else has written by now stays.
+        with suppress(OSError):
+            for made in absent:
+                made.rmdir()
 
 
 def try_file(path: Path) -> None:
