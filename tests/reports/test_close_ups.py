@@ -38,7 +38,7 @@ def test_the_words_tell_time_difference_spread_and_network() -> None:
     moved = se3.perturb(truth, TURN)
     lines = _said(window, moved, truth, Caption("start", "accepted", SIGMA, "tiny.onnx"))
     assert lines[0].startswith("front, 2020-09-13 12:26:40.123Z: start and accepted are 0.50° and 0.0 cm apart")
-    assert lines[1] == "accepted − start: pitch +0.00 ± 0.02°, yaw -0.50 ± 0.03°, roll +0.00 ± 0.04°"
+    assert lines[1] == "accepted − start: pitch +0.00 ± 0.02°, yaw −0.50 ± 0.03°, roll +0.00 ± 0.04°"
     assert lines[2] == "depth network: tiny.onnx"
 
 
@@ -74,7 +74,8 @@ def test_outlines_are_found_through_every_camera(model: str) -> None:
     window = posts.window((-14.0, 10.0), posts.LENSES[model])
     truth = window.T_camera_lidar_start
     before, after = _said(window, se3.perturb(truth, TURN), truth, Caption())[-1].split("shown: ")[1].split(", ")
-    assert float(before.split()[1]) < 0.7 < 1.5 < float(after.split()[1])
+    before_sigma, after_sigma = (float(said.split()[1].replace("−", "-")) for said in (before, after))
+    assert before_sigma < 0.7 < 1.5 < after_sigma
 
 
 @pytest.mark.parametrize("model", ["pinhole", "double_sphere"])

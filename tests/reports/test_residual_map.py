@@ -29,7 +29,7 @@ def test_the_words_tell_what_all_parts_have_in_common() -> None:
     assert lines[0] == f"front, {when} to {when}: range edges on edges of the image at start"
     assert "from 4 pairs" in lines[1]
     assert "a pixel is 0.143° on the axis" in lines[1]
-    right_px = float(lines[2].split("to all: ")[1].split(" px")[0])
+    right_px = float(lines[2].split("to all: ")[1].split(" px")[0].replace("−", "-"))
     assert right_px == pytest.approx(-400.0 * np.tan(radians(0.5)), abs=1.0)
 
 

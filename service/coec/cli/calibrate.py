@@ -18,9 +18,8 @@ from coec.errors import OutputError
 from coec.geometry.cameras import Camera
 from coec.library.calibrating import Calibrated, calibrated
 from coec.library.camera_fit import CameraFit
-from coec.reports import calibration, console, page, pictures, provenance
+from coec.reports import calibration, console, page, provenance
 from coec.reports.calibration_page import calibration_page
-from coec.reports.close_ups import Caption
 from coec.reports.page import Pictures
 from coec.reports.page_parts import file_picture
 from coec.reports.stage_times import StageTimes
@@ -117,10 +116,14 @@ def _write(
 ) -> tuple[list[Path], tuple[str, ...]]:
     """Writes the files; returns them, and what was left out. `camera` is the recording's, to which another may have
     been fitted."""
+    # matplotlib takes a second to import.
+    from coec.reports import pictures
+    from coec.reports.close_ups import Caption
+
     window, result, compensated = done.window, done.result, done.configuration.motion_compensation
     caption = Caption(
         before="start",
-        after=f"result, {result.verdict.decision}",
+        after=f"result ({result.verdict.decision})",
         sigma=_sigma_of(result),
         network=pictures.network_text(done.configuration.depth.model, result.depth_identity),
     )

@@ -9,7 +9,6 @@ from pathlib import Path
 from coec.errors import LensError
 from coec.geometry.cameras import Camera
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
-from coec.reports import pictures
 
 
 @contextmanager
@@ -28,6 +27,9 @@ def drawn_if_refused(folder: Path | None, camera: Camera) -> Iterator[None]:
             raise LensError(
                 f"{error}; with --output DIR a picture shows where in the image it is off", error.details
             ) from error
+        # matplotlib takes a second to import.
+        from coec.reports import pictures
+
         drawn = pictures.write_lens(folder, camera, fit_double_sphere(camera).camera)
         told = {**error.details, "picture": str(drawn)}
         raise LensError(f"{error}. Where in the image it is off: {drawn}", told) from error

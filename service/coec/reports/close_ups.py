@@ -28,6 +28,7 @@ from coec.geometry import se3
 from coec.geometry.edges.image_edges import Rectangle
 from coec.reports.canvas import DPI, bgr_of, box, folded, scale_bar
 from coec.reports.instants import instant
+from coec.reports.page.words import count, number
 
 COLOURS = ("#E69F00", "#56B4E9")
 """Colours of the two extrinsics: orange, sky blue."""
@@ -129,9 +130,8 @@ def close_ups(
             left = GAP_PX + AXIS_PX + column * (PANEL_PX[0] + GAP_PX + AXIS_PX)
             axes = box(figure, left, below, *_fitted(place.part.width, place.part.height, PANEL_PX))
             _panel(axes, image, window.rig, telling.outlines, T, place.part, COLOURS[column])
-            axes.set_title(
-                f"{NAMES[row]}  {name}: {place.strength[column]:+.1f} σ", loc="left", size=10, pad=5, color="black"
-            )
+            strength = number(place.strength[column], 1, sign=True)
+            axes.set_title(f"{NAMES[row]}  {name}: {strength} σ", loc="left", size=10, pad=5, color="black")
     return bgr_of(figure)
 
 
@@ -151,7 +151,7 @@ def sentences(
     if shift is not None and shift.largest_px < SAME_PX:
         lines = [f"{where}: no difference between {names}: less than {SAME_PX:g} px anywhere in the image"]
     else:
-        on_image = "" if shift is None else f", mostly {shift.median_px:.1f} px in the image"
+        on_image = "" if shift is None else f", {shift.median_px:.1f} px in the image (median)"
         lines = [f"{where}: {names} are {difference_text(T_before, T_after)} apart{on_image}"]
         lines.append(
             f"{caption.after} − {caption.before}: {_axes_text(se3.difference(T_after, T_before), caption.sigma)}"
@@ -165,10 +165,9 @@ def sentences(
         )
         lines.append("σ: how much stronger these are under the outlines than on average, 0 is chance. Axes: pixels.")
         before, after = telling.strength
-        images = "1 image" if telling.frames == 1 else f"{telling.frames} images"
         lines.append(
-            f"All outlines of {images}, not only those shown: {caption.before} {before:+.2f} σ, "
-            f"{caption.after} {after:+.2f} σ."
+            f"All outlines of {count(telling.frames, 'image')}, not only those shown: {caption.before} "
+            f"{number(before, 2, sign=True)} σ, {caption.after} {number(after, 2, sign=True)} σ."
         )
     else:
         lines.append("No outline of a near thing is in view at both extrinsics: there is nothing to enlarge.")
@@ -183,7 +182,7 @@ def _axes_text(apart: NDArray[np.float64], sigma: NDArray[np.float64] | None) ->
         factor, unit, digits = (degrees(1.0), "°", 2) if axis < 3 else (100.0, " cm", 1)
         if axis < 3 or np.isfinite(spread[axis]) or np.abs(apart[3:]).max() * factor >= 0.05:
             known = f" ± {factor * spread[axis]:.{digits}f}" if np.isfinite(spread[axis]) else ""
-            told.append(f"{name} {factor * apart[axis]:+.{digits}f}{known}{unit}")
+            told.append(f"{name} {number(factor * apart[axis], digits, sign=True)}{known}{unit}")
     return ", ".join(told)
 
 

@@ -126,8 +126,8 @@ def _write_worst(folder: Path, bench: Bench, outcomes: Sequence[Outcome]) -> tup
     start_deg = windows.rotation_error_deg(outcome.trial.start, bench.reference)
     end_deg = degrees(outcome.rotation_rad)
     caption = Caption(
-        before=f"worst start, number {index}, {start_deg:.2f}° off",
-        after=f"its end, {verdict(outcome)}, {end_deg:.2f}° off",
+        before=f"worst start (number {index}, {start_deg:.2f}° off)",
+        after=f"its end ({verdict(outcome)}, {end_deg:.2f}° off)",
         network=pictures.network_text(bench.configuration.depth.model, bench.depth.identity),
     )
     estimate = outcome.trial.estimate

@@ -24,6 +24,7 @@ from coec.evaluation.local_shifts import LEAST_EDGES, LocalShifts, local_shifts
 from coec.geometry.cameras import pixel_rad
 from coec.reports.canvas import DPI, bgr_of, box, folded
 from coec.reports.instants import instant
+from coec.reports.page.words import count, number
 
 PICTURE_PX = (1060, 900)
 """Largest width and height of the image: with twelve cells in a row, each has room for its figures."""
@@ -77,7 +78,7 @@ def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
     when = first if len(window.pairs) == 1 else f"{first} to {last}"
     at = f" at {name}" if name else ""
     told, asked = int(shifts.told.sum()), int((shifts.edges >= LEAST_EDGES).sum())
-    pairs = f"{shifts.frames} pair{'s' if shifts.frames != 1 else ''}"
+    pairs = count(shifts.frames, "pair")
     lines = [f"{window.rig.pair}, {when}: range edges on edges of the image{at}"]
     if told == 0:
         lines.append(
@@ -88,10 +89,11 @@ def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
     beside = shifts.shift_px[shifts.told] - (right, down)
     spread = float(np.median(np.hypot(*beside.T)))
     pixel_deg = degrees(pixel_rad(window.rig.camera))
+    in_common = f"{number(right, 1, sign=True)} px right, {number(down, 1, sign=True)} px down"
     lines += [
         f"{told} of {asked} parts tell, from {pairs}. They lie {np.median(shifts.size_px[shifts.told]):.1f} px beside "
         f"(median; a pixel is {pixel_deg:.3f}° on the axis).",
-        f"In common to all: {right:+.1f} px right, {down:+.1f} px down; half of them are within {spread:.1f} px of it.",
+        f"In common to all: {in_common}; half of them are within {spread:.1f} px of it.",
         "Arrows: where range edges would lie best, enlarged. Figures: how far that is, and of how many range edges. "
         "No colour: not told.",
     ]
