@@ -203,7 +203,7 @@ def test_a_router_without_a_service_says_what_to_check(coec: Coec, endpoint: str
 
 def test_the_list_says_what_a_window_is_kept_for_and_names_snippets(coec: Coec, vehicle: str) -> None:
     outcome = coec("query", "windows", "--connect", vehicle)
-    assert "vehicle/front  1 windows, 1 snippets" in outcome.out
+    assert "vehicle/front  1 window, 1 snippet" in outcome.out
     (window,) = (line for line in outcome.out.splitlines() if "front-1" in line)
     assert "red event" in window
     (snippet,) = (line for line in outcome.out.splitlines() if "front-7.snippet" in line)

@@ -139,7 +139,7 @@ def test_keys_choose_a_pair_and_tell_its_reasons_history_and_overlay(router: Rou
 def test_what_is_not_answered_is_said(router: Router) -> None:
     with connected([router.endpoint], 5.0) as vehicle, board_of(router) as board:
         say(vehicle, "truck-9")
-        wait_until(lambda: "1 vehicles, 1 pairs" in text(board), "it is told")
+        wait_until(lambda: "1 vehicle, 1 pair" in text(board), "it is told")
         assert board.press("o")
         wait_until(lambda: "no overlay of truck-9/front: nobody answered" in text(board), "nobody answers")
 
@@ -178,7 +178,7 @@ def test_a_link_that_breaks_is_said_and_words_come_again_with_it(
             board = stack.enter_context(board_of(Router(session, endpoint)))
             wait_until(lambda: board.words.told.is_set(), "nobody has said anything")
             say(session, "truck-1")
-            wait_until(lambda: "1 vehicles, 1 pairs: 1 healthy" in text(board), "it is told")
+            wait_until(lambda: "1 vehicle, 1 pair: 1 healthy" in text(board), "it is told")
         wait_until(lambda: "no router: nothing new comes" in text(board), "the link is gone")
         board.clock = lambda: time.monotonic() + 200.0
         assert "silent (healthy)" in text(board), "its last state is not taken for the present one"

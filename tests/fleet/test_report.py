@@ -14,7 +14,7 @@ from coec.errors import UsageError
 from coec.fleet import questions, tables
 from coec.fleet.report import report
 from coec.reports import fleet_page
-from coec.reports.page import render
+from coec.reports.page import Verdict, render
 from coec.reports.provenance import Made
 from coec.schemas.fleet import FleetReport, WindowRow
 from coec.schemas.fleet_now import FleetNow, PairNow
@@ -158,9 +158,21 @@ def test_false_alarms_of_vehicles_stand_on_the_page(results: Path) -> None:
     pair = PairNow(word=word, standing="live", said_s=1.0, looked_s=1.0, worst=None, urgency=0.0)
     now = FleetNow(vehicles=1, known=1, states={}, matching=1, pairs=(pair,), refused={})
     text = render(fleet_page.page(report(results, None, now), "fleet", MADE))
-    assert "1 pairs were watched for 50.0 h of driving: 2 alarms were confirmed" in text
+    assert "1 pair watched for 50.0 h of driving: alarms confirmed by another extrinsic 2, false 1" in text
     assert "2.00 in 100 h (95 %: at most 9.4" in text
     assert "&lt;v&gt;/front" in text
+
+
+def test_a_drift_that_one_window_cannot_tell_is_not_denied(rows: list[WindowRow], tmp_path: Path) -> None:
+    tables.write(
+        tmp_path, [next(row for row in rows if row.result and row.result.verdict.decision == "accepted")], "part-1"
+    )
+    told = report(tmp_path, None)
+    (verdict,) = fleet_page.page(told, "fleet", MADE).opening
+    assert isinstance(verdict, Verdict)
+    assert (verdict.tone, verdict.word) == ("none", "Drift not known.")
+    assert fleet_page.sentence(told).startswith("1 vehicle, 1 window on 20")
+    assert fleet_page.sentence(told).endswith("too few accepted windows to tell a drift: 1.")
 
 
 def test_a_folder_without_tables_is_told(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.schemas.fleet_now import FleetNow, PairNow
 
 KEYS = "↑↓ choose   r reasons   h history   o overlay   f filter   q quit"
@@ -30,14 +31,14 @@ def board(fleet: FleetNow, chosen: int, first: int, rows: int, filtered: str) ->
 
 def head(fleet: FleetNow, filtered: str) -> Text:
     """The fleet in a line."""
-    line = Text(f"{fleet.vehicles} vehicles, {fleet.known} pairs: ")
-    for index, (state, count) in enumerate(fleet.states.items()):
+    line = Text(f"{count(fleet.vehicles, 'vehicle')}, {count(fleet.known, 'pair')}: ")
+    for index, (state, pairs) in enumerate(fleet.states.items()):
         line.append(", " if index else "")
-        line.append(f"{count} {state}", console.STATE_STYLES.get(state, "bold"))
+        line.append(f"{pairs} {state}", console.STATE_STYLES.get(state, "bold"))
     if filtered:
         line.append(f"   showing {fleet.matching}: {filtered}", "cyan")
     if fleet.refused:
-        refused = ", ".join(f"{count} {cause}" for cause, count in sorted(fleet.refused.items()))
+        refused = ", ".join(f"{words} {cause}" for cause, words in sorted(fleet.refused.items()))
         line.append(f"   not taken: {refused}", "yellow")
     return line
 
@@ -51,7 +52,8 @@ def detail(pair: PairNow) -> RenderableType:
             told(pair),
             f" since {duration(max(word.said_ns - word.since_ns, 0) * 1e-9 + pair.said_s)}",
             f", said {duration(pair.said_s)} ago, by coec {console.plain(word.version)}, "
-            f"configuration {console.plain(word.config_hash)}, {word.windows} windows{', held' if word.held else ''}",
+            f"configuration {console.plain(word.config_hash)}, {count(word.windows, 'window')}",
+            ", held" if word.held else "",
         )
     ]
     lines += [

@@ -24,6 +24,8 @@ WHERE_ALL_IS = (
 DRIFTED = 1.0
 """From this urgency on, a drift is large enough that a monitor has to notice it."""
 
+COMPARED = 2
+"""Accepted windows that a drift takes: an earlier and a later one."""
 
 DRAWN, LISTED = 100, 1000
 """Pairs with a plot, and pairs after them with a row, so that the page stays below 3 MB whatever the fleet. All others
@@ -62,7 +64,10 @@ def page(report: FleetReport, title: str, made: Made) -> Page:
 def _verdict(report: FleetReport) -> Verdict:
     urgent = [pair for pair in report.pairs if pair.urgency >= DRIFTED]
     if not urgent:
-        return Verdict("none" if report.first_ns is None else "good", "No drift.", sentence(report))
+        if all(pair.accepted < COMPARED for pair in report.pairs):
+            todo = "Judge windows of other days, too: a drift is what lies between earlier windows and later ones."
+            return Verdict("none", "Drift not known.", sentence(report), (todo,))
+        return Verdict("good", "No drift.", sentence(report))
     first = f"{urgent[0].vehicle}/{urgent[0].pair}"
     todo = f"Look at {first} first: see that its mount is tight, and commission it again where the camera was moved."
     return Verdict("unsure", "Drift.", sentence(report), (todo,))
@@ -71,21 +76,24 @@ def _verdict(report: FleetReport) -> Verdict:
 def sentence(report: FleetReport) -> str:
     """The fleet in a sentence or two."""
     if report.first_ns is None or report.last_ns is None:
-        return f"{report.windows} windows, none with a result."
-    drifted = sum(pair.urgency >= 1.0 for pair in report.pairs)
-    share = 100.0 * report.accepted / max(report.windows, 1)
+        return f"{count(report.windows, 'window')}, none with a result."
+    drifted = sum(pair.urgency >= DRIFTED for pair in report.pairs)
+    too_few = sum(pair.accepted < COMPARED for pair in report.pairs)
+    first, last = day(report.first_ns), day(report.last_ns)
+    when = f"on {first}" if first == last else f"from {first} to {last}"
+    untold = f" Pairs with too few accepted windows to tell a drift: {too_few}." if too_few else ""
     return (
-        f"{report.vehicles} vehicles, {report.windows} windows from {day(report.first_ns)} to {day(report.last_ns)},"
-        f" {share:.1f} % accepted. {drifted} of {len(report.pairs)} pairs have drifted by what a monitor has to see,"
-        " or more."
+        f"{count(report.vehicles, 'vehicle')}, {count(report.windows, 'window')} {when},"
+        f" {percent(report.accepted / max(report.windows, 1))} accepted. Pairs that have drifted by what a monitor has"
+        f" to see, or more: {drifted} of {len(report.pairs)}.{untold}"
     )
 
 
 def sentence_of_alarms(alarms: FalseAlarms) -> str:
     """How often pairs were accused without cause."""
     counted = (
-        f"{alarms.pairs} pairs were watched for {alarms.watched_h:.1f} h of driving: {alarms.confirmed} alarms were"
-        f" confirmed by another extrinsic, {alarms.withdrawn} were false"
+        f"{count(alarms.pairs, 'pair')} watched for {alarms.watched_h:.1f} h of driving: alarms confirmed by another"
+        f" extrinsic {alarms.confirmed}, false {alarms.withdrawn}"
     )
     if alarms.per_100_h is None or alarms.per_100_h_at_most is None:
         return f"{counted}."

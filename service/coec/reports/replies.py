@@ -12,6 +12,7 @@ from rich.text import Text
 from coec.reports import console
 from coec.reports.holds import hold_text
 from coec.reports.instants import second
+from coec.reports.page.words import count
 from coec.reports.service_status import duration, losses, status
 from coec.schemas import replies, rig_state
 from coec.schemas.base import from_json
@@ -121,8 +122,8 @@ def results_table(reply: replies.HistoryReply) -> Table:
 def windows(payload: bytes) -> None:
     """Recorded windows of a pair, and its snippets."""
     reply = from_json(replies.WindowsReply, payload)
-    snippets = f", {len(reply.snippets)} snippets" if reply.snippets else ""
-    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.windows)} windows{snippets}")
+    snippets = f", {count(len(reply.snippets), 'snippet')}" if reply.snippets else ""
+    console.show(f"{reply.vehicle}/{reply.pair}  {count(len(reply.windows), 'window')}{snippets}")
     kept = ("kept for",) if any(window.kept_for for window in reply.windows) else ()
     table = console.table("window", "pairs", "MB", "verdict", "sha256", *kept, right=(1, 2))
     for window in reply.windows:
