@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -32,3 +35,27 @@ def test_a_folder_below_a_file_is_refused_by_name(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match=r"cannot write to .*--output"):
             output.try_folder(folder)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@contextmanager
+def files_of_at_most(size_bytes: int) -> Iterator[None]:
+    """What a disk does that fills up while a file is written."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.fault("a disk that fills up while a picture is written", "said, and no half picture is left")
+def test_half_a_file_is_not_left(tmp_path: Path) -> None:
+    with files_of_at_most(1000), pytest.raises(OutputError, match="cannot write"):
+        output.write(tmp_path / "picture.png", bytes(100_000))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_device_that_is_full_stays() -> None:
+    with pytest.raises(OutputError, match="No space left"):
+        output.write(Path("/dev/full"), b"picture")
+    assert Path("/dev/full").exists()

@@ -53,11 +53,18 @@ def write(path: Path, data: bytes) -> Path:
     """Write a whole file, and make its folder if needed.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: it cannot be written; half a file is not left.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
+        with path.open("wb") as file:
+            try:
+                file.write(data)
+                file.flush()
+            except OSError:
+                if path.is_file():  # a device stays
+                    path.unlink()
+                raise
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
     return path
