@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from coec.reports import evaluation_charts
 from coec.reports.console import AXIS_NAMES, UNITS
-from coec.reports.evaluation_tables import setting
+from coec.reports.evaluation_tables import reference_doubt, setting
 from coec.reports.page import (
     Block,
     Cell,
@@ -135,6 +135,9 @@ def _verdict(report: EvaluationReport) -> Verdict:
     if misses:
         served = count(misses, "miss", "misses")
         told = f"{served} would have been served: look at the worst start below, and at its figures."
+        doubt = reference_doubt(report)
+        if doubt is not None:
+            return Verdict("unsure", "Beside the reference, and accepted.", sentence, (doubt, told))
         return Verdict("bad", "Wrong and accepted.", sentence, (told,))
     refused = report.verdicts.failed_hits
     tone: Tone = "good" if report.hits == report.starts and not refused else "unsure"

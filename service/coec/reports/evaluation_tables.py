@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from math import degrees
+from math import degrees, hypot, inf
 from typing import Any
 
 from coec.calibration.types import Matrix4
@@ -15,6 +15,7 @@ from coec.evaluation.statistics import Outcome
 from coec.geometry import se3
 from coec.reports import console
 from coec.reports.evaluation_documents import in_degrees
+from coec.reports.page.words import count
 from coec.schemas.evaluation import (
     ClosureReport,
     ComparisonReport,
@@ -38,6 +39,27 @@ CSV_FIGURES = (
 def setting(rotation_deg: float, translation_m: float) -> str:
     """How far away the starts are, in words."""
     return f"{rotation_deg:g}°" + (f" and {translation_m:g} m away" if translation_m > 0 else " away")
+
+
+def reference_doubt(report: EvaluationReport) -> str | None:
+    """Where searches from all around meet beside the source's calibration, and one that began at it ends there, too: a
+    sentence that says so, as the misses may be the reference's. None where they do not."""
+    apart = [middle - end for middle, end in zip(report.median, report.from_reference, strict=True)]
+    if not _is_hit(report, apart) or _is_hit(report, report.from_reference):
+        return None
+    where = f"{hypot(*report.from_reference[:3]):.2f}°"
+    if report.hit_translation_m is not None:
+        where += f" and {hypot(*report.from_reference[3:]):.2f} m"
+    return (
+        f"Searches from all around meet {where} beside the source's calibration, and one that began at it ended there, "
+        "too: either that calibration is off, or this objective is on this recording. The close-ups show which."
+    )
+
+
+def _is_hit(report: EvaluationReport, error: Sequence[float]) -> bool:
+    """Whether a vector of six, deg and m, is within what counts as a hit."""
+    limit_m = inf if report.hit_translation_m is None else report.hit_translation_m
+    return hypot(*error[:3]) < report.hit_rotation_deg and hypot(*error[3:]) < limit_m
 
 
 def verdict(outcome: Outcome) -> str:
@@ -104,10 +126,12 @@ def show(report: EvaluationReport) -> None:
     box = f"±{report.search_rotation_deg:g} deg"
     if report.search_translation_m > 0:
         box += f", ±{report.search_translation_m:g} m"
-    console.show(
-        f"{report.starts} starts {setting(report.start_rotation_deg, report.start_translation_m)}, search {box}"
-    )
-    console.show(f"{report.hits} hits within {limits}: {100 * report.hit_rate:.1f} %", "bold")
+    away = setting(report.start_rotation_deg, report.start_translation_m)
+    console.show(f"{count(report.starts, 'start')} {away}, search {box}")
+    console.show(f"{count(report.hits, 'hit')} within {limits}: {100 * report.hit_rate:.1f} %", "bold")
+    doubt = reference_doubt(report)
+    if doubt is not None:
+        console.show(doubt, "yellow")
     spreads = console.table("all starts", "median", "p95", "max", "unit", right=(1, 2, 3))
     _add(spreads, "rotation error", report.rotation_deg, "deg", 3)
     if report.dof == 6 or report.start_translation_m > 0:
@@ -121,7 +145,7 @@ def show(report: EvaluationReport) -> None:
     verdicts.add_row(console.styled("accepted"), str(counts.accepted_hits), str(counts.accepted_misses))
     verdicts.add_row(console.styled("failed"), str(counts.failed_hits), str(counts.failed_misses))
     console.out.print(verdicts)
-    ended = ", ".join(f"{count} {reason}" for reason, count in report.stop_reasons.items())
+    ended = ", ".join(f"{starts} {reason}" for reason, starts in report.stop_reasons.items())
     console.show(f"classified correctly: {100 * report.classified_correctly:.1f} %; searches ended: {ended}")
     _show_experiments(report)
     console.show(_seconds(report.elapsed_s))
