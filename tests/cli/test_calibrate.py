@@ -11,10 +11,11 @@ import pytest
 
 from cli.conftest import SMALL, Coec
 from coec.adapters.depth.maps import open_depth
+from coec.adapters.files import output
 from coec.adapters.images.codec import encode_png
 from coec.calibration.ports import DepthModel
 from coec.config import DepthConfig, LimitsConfig, VerdictConfig
-from coec.errors import UsageError
+from coec.errors import OutputError, UsageError
 from coec.sources.windows import evenly, vector_of
 
 TOLERANCE_DEG = 0.35
@@ -73,10 +74,10 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(coec: Coe
 def test_a_result_that_cannot_be_written_in_the_end_is_printed(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, _: bytes) -> int:
-        raise OSError(28, "No space left on device", str(path))
+    def full(path: Path, data: bytes) -> Path:
+        raise OutputError(f"cannot write {path}: No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(output, "write", full)
     arguments = ("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--output", tmp_path)
     outcome = coec(*arguments, "--json")
     assert outcome.status == 1
