@@ -34,7 +34,7 @@ def sensor(name: str, kind: SensorKind, state: SensorState, **more: Any) -> Sens
         "since_ns": 4 * NS,
         "moved": None,
         "pairs": ("front", "left") if kind == "lidar" else (name,),
-        "reasons": (Reason(code="fits", text=f"What was looked at fits without a move of {name}."),),
+        "reasons": (Reason(code="fits", text=f"The pairs that were looked at fit without a move of {name}."),),
     }
     return SensorReply(name=name, kind=kind, state=state, **{**told, **more})
 

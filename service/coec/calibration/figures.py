@@ -33,7 +33,7 @@ class Figure:
 _MORE_SCENES = "Take a longer window, in motion, past objects at different distances."
 _MORE_STRUCTURE = "Take a window where buildings, poles or parked cars are in reach; see that lens and mask are clean."
 _CALIBRATE = "Calibrate: `coec calibrate` on a window of this mount tells where the camera is."
-_COMPARE_ONLY = "Nothing: the paper's figures are told for comparison, the edges decide."
+_COMPARE_ONLY = "Nothing: the paper's figures are reported for comparison only; the edges decide."
 
 FIGURES: Mapping[str, Figure] = MappingProxyType(
     {
@@ -44,7 +44,7 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "Mutual information of the LiDAR's ranges with the depth maps of their own frames, over that with the maps "
             "of other frames. 1 is chance.",
             "depth and LiDAR agree no better than a cloud with the depth map of another frame",
-            "Try a depth network that suits the scene (`coec models assess` tells), or a window with more in reach.",
+            "Try a depth network that suits the scene (see `coec models assess`), or a window with more in reach.",
         ),
         "range_edges": Figure(
             "Range edges",
@@ -56,8 +56,7 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
         "edge_contrast": Figure(
             "Edge contrast",
             "σ",
-            "How far the edges stand out at the result from how they do at other poses, in standard deviations of "
-            "those.",
+            "How far the edge score at the result stands above that at other poses, in standard deviations of those.",
             "no pose stands out from the others",
             _MORE_STRUCTURE,
         ),
@@ -71,8 +70,8 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
         "edges_once": Figure(
             "Edges, counted once",
             "σ",
-            "How significantly the LiDAR's edges lie on those of the images of a vehicle on the move, what all its "
-            "frames have in common counted once.",
+            "How significantly the LiDAR's edges lie on those of the images while the vehicle drives. What all frames "
+            "have in common is counted once.",
             "what fits is the same in all frames although the vehicle drives: lines along the road fit one another",
             "Take a window that passes other things: houses, cars, posts and trees within reach of the LiDAR.",
         ),
@@ -102,14 +101,14 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "σ, rotation",
             "°",
             "Standard deviation of the least certain rotation axis.",
-            "what was seen does not settle a rotation, or is too little to tell",
+            "what was seen does not determine every rotation axis, or is too little to say",
             _MORE_SCENES,
         ),
         "sigma_m": Figure(
             "σ, translation",
             "m",
             "Standard deviation of the least certain translation axis.",
-            "what was seen does not settle a translation, or is too little to tell",
+            "what was seen does not determine every translation axis, or is too little to say",
             "Take a longer window with objects near the camera, or search the rotation only.",
         ),
         "overlap": Figure(
@@ -167,21 +166,21 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "of its limit",
             "How far the rotation at which the edges fit best is from the extrinsic, squared and in the standard "
             "deviations of a check.",
-            "the edges fit best at another rotation, farther off than a right extrinsic has it",
+            "the edges fit best at another rotation, farther away than they do when the extrinsic is right",
             _CALIBRATE,
         ),
         "distance_pose": Figure(
             "Distance, pose",
             "of its limit",
             "Likewise of rotation and translation together, on the axis that is farthest off.",
-            "the edges fit best at another pose, farther off than a right extrinsic has it",
+            "the edges fit best at another pose, farther away than they do when the extrinsic is right",
             _CALIBRATE,
         ),
         "edge_score": Figure(
             "Edge score",
             "σ",
             "How strongly the image has edges where the LiDAR has them, at the extrinsic that is checked.",
-            "the image has hardly an edge where the LiDAR has them",
+            "the image has hardly any edges where the LiDAR has them",
             _MORE_STRUCTURE,
         ),
         "edges_per_pair": Figure(
@@ -208,14 +207,14 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
         "certainty_rotation": Figure(
             "Certainty, rotation",
             "σ",
-            "How certainly the gain of another rotation is more than what frames differ by.",
+            "How certainly another rotation gains more than the frames differ from one another.",
             "the frames insist on another rotation",
             _CALIBRATE,
         ),
         "certainty_pose": Figure(
             "Certainty, pose",
             "σ",
-            "How certainly the gain of another pose is more than what frames differ by.",
+            "How certainly another pose gains more than the frames differ from one another.",
             "the frames insist on another pose",
             _CALIBRATE,
         ),

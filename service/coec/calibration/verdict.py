@@ -145,6 +145,6 @@ def judge(
     if stop is not StopReason.TOLERANCE:
         reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
     if saw_one_scene(looks, frames) and any(reason.code in UNCERTAIN for reason in reasons):
-        told = f"{frames} frames are worth {looks:.1f} independent ones: a window that passes other things tells more"
+        told = f"{frames} frames are worth {looks:.1f} independent ones: a window past other things would settle more"
         reasons.append(Reason("motion", told))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

@@ -34,5 +34,5 @@ def test_distance_from_an_estimated_spread(probability: float, dof: int, known_b
 
 
 def test_a_spread_that_two_draws_tell_has_no_rare_quantile() -> None:
-    with pytest.raises(ValueError, match="2 degrees of freedom tell no quantile"):
+    with pytest.raises(ValueError, match="2 degrees of freedom determine no quantile"):
         distance2_quantile(0.9999, 3, 2)

@@ -38,7 +38,7 @@ def test_a_wrong_origin_is_told_with_the_right_one(T: NDArray[np.float64], noise
     found = apparent_origin(in_frame(a_sweep(noise_rad=np.radians(noise_deg), walkers=walkers), T))
     assert isinstance(found, ApparentOrigin)
     np.testing.assert_allclose(found.origin_m, T[:3, 3], atol=0.1)
-    assert "look measured from (+1." in found.sentence
+    assert "look as if measured from (+1." in found.sentence
 
 
 def test_a_turned_frame_is_no_wrong_origin() -> None:

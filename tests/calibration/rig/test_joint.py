@@ -165,5 +165,5 @@ def test_hostile_windows_are_refused() -> None:
             estimate(rig, {**told, "front-roof": window})
     with pytest.raises(ValueError, match="no edge of this rig"):
         estimate(rig, {"other": one})
-    with pytest.raises(ValueError, match="no window tells anything"):
+    with pytest.raises(ValueError, match="no window says anything"):
         estimate(rig, {"front-roof": replace(one, uncertainty=Uncertainty.unknown())})

@@ -36,7 +36,9 @@ def of_model(baselines: Sequence[Baseline]) -> Baseline:
         CalibrationError: fewer than `MIN_VEHICLES`, or baselines that do not belong together.
     """
     if len(baselines) < MIN_VEHICLES:
-        raise CalibrationError(f"{len(baselines)} baselines: at least {MIN_VEHICLES} vehicles tell how they differ")
+        raise CalibrationError(
+            f"{len(baselines)} baselines: at least {MIN_VEHICLES} vehicles are needed to see how they differ"
+        )
     for what, found in (
         ("pair", {one.pair for one in baselines}),
         ("number of degrees of freedom", {str(one.dof) for one in baselines}),

@@ -40,7 +40,7 @@ def distance2_quantile(probability: float, dof: int, known_by: int) -> float:
     a, b = 1.0 - h, 1.0 - g
     left = a * a - z * z * h
     if left <= 0.0:
-        raise ValueError(f"{known_by} degrees of freedom tell no quantile of {probability}")
+        raise ValueError(f"{known_by} degrees of freedom determine no quantile of {probability}")
     root = (a * b + sqrt(a * a * b * b - left * (b * b - z * z * g))) / left
     return dof * root**3
 

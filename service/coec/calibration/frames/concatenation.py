@@ -64,7 +64,7 @@ class SeveralOrigins:
     def sentence(self) -> str:
         """For people."""
         places = " and ".join("(" + ", ".join(f"{value:+.2f}" for value in origin) + ")" for origin in self.origins_m)
-        return f"The cloud is concatenated: its points look measured from {places} m of their frame."
+        return f"The cloud is concatenated: its points look as if measured from {places} m in their frame."
 
 
 def several_origins(rings: Rings, before: SeveralOrigins | None = None) -> SeveralOrigins | None:

@@ -61,7 +61,7 @@ class ApparentOrigin:
     def sentence(self) -> str:
         """For people."""
         place = ", ".join(f"{value:+.2f}" for value in self.origin_m)
-        return f"The points contradict their origin: they look measured from ({place}) m of their frame."
+        return f"The points contradict their origin: they look as if measured from ({place}) m in their frame."
 
 
 def from_origin(sweep: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str) -> LidarFrame:

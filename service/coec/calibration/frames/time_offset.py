@@ -100,7 +100,7 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
     moving = tuple(p for p in window.pairs if p.motion is not None and p.motion.linear_mps is not None)
     if len(moving) <= len(FITTED):
         return _unobservable(
-            f"{len(moving)} pairs have ego-motion with a velocity, it takes more than {len(FITTED)}", nan
+            f"{len(moving)} pairs have ego-motion with a velocity; more than {len(FITTED)} are needed", nan
         )
     rig = window.rig
     twists = [sensor_twist(pair.motion, rig.T_lidar_ego) for pair in moving if pair.motion is not None]
@@ -120,7 +120,7 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
 def _judged(offset_s: float, sigma_s: float, spread: float, limits: TimeOffsetConfig) -> TimeOffset:
     least, known_s = radians(limits.min_turn_spread_deg_per_s), sigma_s if np.isfinite(sigma_s) else nan
     if spread < least:
-        told = f"the turn rate varies by {np.degrees(spread):.1f} deg/s only, it takes {np.degrees(least):.1f}"
+        told = f"the turn rate varies by {np.degrees(spread):.1f} deg/s only; {np.degrees(least):.1f} are needed"
         return TimeOffset(offset_s, known_s, spread, False, f"{told}: a straight drive looks like a shifted mount")
     if abs(offset_s) > AT_BOUND * limits.reach_s:
         return TimeOffset(offset_s, nan, spread, False, "the best offset lies at the bound of the search")

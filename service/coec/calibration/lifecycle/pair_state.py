@@ -394,10 +394,10 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
     if monitor.outcome is Finding.CONFIRMED:
         return happened(state, Event.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
     if monitor.outcome is Finding.SUSPECT:
-        text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to tell."
+        text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to decide."
         return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
     if monitor.outcome is Finding.AT_ODDS:
-        text = "The latest checks accuse the mount, but do not add up to a move; a window is being taken to tell."
+        text = "The latest checks accuse the mount, but do not add up to a move; a window is being taken to decide."
         return _poor(state, Event.AT_ODDS, observation.stamp_ns, Reason("checks_at_odds", text))
     # A clear monitor does not outweigh an accepted window that contradicts the served extrinsic.
     if monitor.outcome is Finding.CLEAR and (state.pending is None or not state.pending.contradicts):

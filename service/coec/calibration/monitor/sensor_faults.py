@@ -103,17 +103,17 @@ CAMERA_FROZEN = Cause(
 BEAMS_LOST = Cause(
     "lidar_beams_lost",
     "Some directions of the LiDAR return far fewer points than when commissioned.",
-    "Clean the LiDAR, and see what stands before it.",
+    "Clean the LiDAR, and look for what stands in front of it.",
 )
 EGO_MOTION_WRONG = Cause(
     "ego_motion_wrong",
     "The sweeps fit the images better with another ego-motion.",
-    "See to scale, sign and frame of the ego-motion (`ego.T_lidar_ego`).",
+    "Check the scale, sign and frame of the ego-motion (`ego.T_lidar_ego`).",
 )
 TIME_OFFSET = Cause(
     "time_offset",
     "The sweeps fit the images better with another time between the sensors.",
-    "See to the clocks of camera and LiDAR; `coec calibrate --time-offset` measures the camera's.",
+    "Check the clocks of camera and LiDAR; `coec calibrate --time-offset` measures the camera's.",
 )
 INTRINSICS_WRONG = Cause(
     INTRINSICS_OFF,

@@ -319,10 +319,10 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
     looked = [name for name in edges if state.histories[name].looks]
     of = state.posterior
     if of is None and sensor.name in state.named:
-        text = "It had moved when the service was stopped; no pair of it was looked at since."
+        text = "It had moved when the service was stopped; none of its pairs has been looked at since."
         return SensorState(sensor.name, sensor.kind, _moved(sensor), 1.0, None, (Reason("last_known", text),))
     if of is None or not looked:
-        text = "No pair of it was looked at yet." if edges else "No pair has it: nothing can tell where it is."
+        text = "None of its pairs has been looked at yet." if edges else "It is in no pair: nothing shows where it is."
         return SensorState(sensor.name, sensor.kind, SensorHealth.UNKNOWN, 0.0, None, (Reason("not_looked_at", text),))
     probability = of.sensors[sensor.name]
     disturbed = max((of.disturbed[name] for name in edges), default=0.0)
@@ -334,13 +334,15 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
         health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
         if probability >= NAMED_AT:
             decides = (
-                "a window of it decides" if _is_hidden(sensor.name, _probable(of), graph) else "the next looks decide"
+                "a window of its pairs decides"
+                if _is_hidden(sensor.name, _probable(of), graph)
+                else "the next looks decide"
             )
             text = f"It seems to have moved ({100.0 * probability:.1f} %); {decides}."
             reasons = (Reason("one_more_look", text), *reasons[1:])
     else:
         health = SensorHealth.CALIBRATED
-        text = f"What was looked at fits without a move of it: {', '.join(looked)}."
+        text = f"The pairs that were looked at fit without a move of it: {', '.join(looked)}."
         reasons = (Reason("fits", text),)
     return SensorState(sensor.name, sensor.kind, health, probability, moved, reasons)
 

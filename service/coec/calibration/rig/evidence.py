@@ -85,10 +85,10 @@ def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):
         told = np.flatnonzero(np.isfinite(variances) & (variances < MOST_SIGMA**2))
     if not len(told):
-        raise ValueError("a covariance tells no axis: every variance is missing or beyond all use")
+        raise ValueError("a covariance says nothing about any axis: every variance is missing or beyond all use")
     block = covariance[np.ix_(told, told)]
     if not np.isfinite(block).all() or (variances[told] < LEAST_SIGMA**2).any():
-        raise ValueError("a covariance is not finite, or smaller than anything is known to")
+        raise ValueError("a covariance is not finite, or smaller than anything can be known to")
     if np.abs(block - block.T).max() > 1e-6 * np.abs(block).max():
         raise ValueError("a covariance is not symmetric")
     # Scaled to a unit diagonal: radians and metres differ by powers of ten.

@@ -107,7 +107,7 @@ def estimate(graph: RigGraph, windows: Mapping[str, Measurement], before: Before
         raise ValueError(f"{', '.join(strange)}: no edge of this rig, it has {', '.join(graph.edge)}")
     measured = tuple(name for name in graph.edge if name in windows and windows[name].told_axes())
     if not measured:
-        raise ValueError("no window tells anything of this rig")
+        raise ValueError("no window says anything about this rig")
     told = {name: windows[name] for name in measured}
     system = System.of(graph, told) if before is None else System.of(before.joined(graph), {**told, **before.measured})
     solution = system.solved(frozenset())

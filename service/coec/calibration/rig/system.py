@@ -191,7 +191,7 @@ def _of_window(known: Known, window: Measurement) -> Measured:
     shared: dict[str, Array] = {}
     for name, shift in window.uncertainty.systematic.items():
         if shift.shape != (6,) or not np.isfinite(shift[told]).all() or np.abs(shift[told]).max() > 10.0:
-            raise ValueError(f"{known.name}: the error {name} is no shift of six finite numbers")
+            raise ValueError(f"{known.name}: the error {name} must be a shift of six finite numbers")
         owner = OWNERS.get(name, OWN)
         parts = ((f"{whose(known.a)} {name}", owner.of_a), (f"{whose(known.b)} {name}", owner.of_b))
         if owner is OWN:

@@ -111,7 +111,9 @@ class RigGraph:
         names = {sensor.name for sensor in sensors}
         for known in all_known:
             if known.a == known.b or not {known.a, known.b} <= names:
-                raise ValueError(f"{known.name}: joins {known.a} and {known.b}, which are no two sensors of the rig")
+                raise ValueError(
+                    f"{known.name}: joins {known.a} and {known.b}, which are not two different sensors of the rig"
+                )
             if not se3.is_rigid(known.T_a_b):
                 raise ValueError(f"{known.name}: T_a_b must be a rigid transform (4, 4)")
         for link in links:
@@ -201,4 +203,4 @@ def _known(edges: Sequence[Edge], links: Sequence[Link]) -> tuple[Known, ...]:
 
 def _once(what: str, names: Sequence[str]) -> None:
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"{what} of a rig need names of their own, twice there are: {', '.join(twice)}")
+        raise ValueError(f"{what} of a rig need names of their own; these are given twice: {', '.join(twice)}")
