@@ -258,7 +258,7 @@ def test_the_end_goes_on_after_steps_that_raise(tmp_path: Path, drive: Drive, ro
         running.until(running.counters, lambda pair: pair["selected"] >= SHORT_PAIRS - 1, "the pairs")
         assert running.terminate() == 0
         log = running.log.read_text()
-    for step in ("take no more samples", "finish a window", "take the answers away"):
+    for step in ("take no more samples", "finish a window", "withdraw the answers"):
         assert f'"step": "{step}"' in log
     assert '"message": "stopped"' in log
     assert list((tmp_path / "state" / "windows").glob("*.mcap")), "the recorder was ended all the same"

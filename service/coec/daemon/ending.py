@@ -17,7 +17,7 @@ def attempt(name: str, step: Callable[[], object]) -> object:
     try:
         return step()
     except Exception:
-        _log.exception("a step of the end failed", extra={"fields": {"step": name}})
+        _log.exception("a step of the shutdown failed", extra={"fields": {"step": name}})
         return None
 
 

@@ -314,12 +314,12 @@ class Daemon:
             ("end the worker", self._worker.request_stop),
             ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
             ("end the rig", self._end_rig),
-            ("write all books", self._end_scribe),
+            ("write all that is to be remembered", self._end_scribe),
             ("end the answers", lambda: stopped(self._bus.threads, QUERIES_STOP_S)),
-            ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
-            ("tell ROS no more", lambda: self._ros_outputs.close(ROS_STOP_S)),
-            ("take the answers away", self._bus.undeclare_queryables),
-            ("be no node of ROS", self._ros_side.close),
+            ("stop serving HTTP", lambda: self._door.close(HTTP_STOP_S)),
+            ("stop publishing to ROS", lambda: self._ros_outputs.close(ROS_STOP_S)),
+            ("withdraw the answers", self._bus.undeclare_queryables),
+            ("leave the ROS graph", self._ros_side.close),
         )
         for name, step in steps:
             attempt(name, step)

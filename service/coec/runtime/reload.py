@@ -20,7 +20,7 @@ from coec.errors import ConfigError
 RELOADED: Mapping[str, str] = {
     "log.*": "at once in the service; its worker logs as it was started until the next start",
     "authority.*": "with the next command; the files of the certificate are read again with every reload",
-    "metrics.*": "at once; where the new address cannot be had, nobody listens, and status says so",
+    "metrics.*": "at once; if the new address is not available, nobody listens, and status says so",
     "uplink.*": "with the next word and the next answer",
     "budget.cores": "with the next check",
     "stale_after_s": "with the next look at the clocks, within a second",

@@ -118,9 +118,9 @@ def test_a_command_is_acknowledged_refused_and_counted(awaited: Awaited, name: s
 
 def test_its_status_has_what_was_lost_and_what_was_found_so_far(awaited: Awaited) -> None:
     awaited.nominal = Nominal(
-        awaits=(NO_CLOUD,), origins={"camera.frame_id": "the first image"}, losses={"info_wrong_type": 3}
+        awaits=(NO_CLOUD,), origins={"camera.frame_id": "the latest image"}, losses={"info_wrong_type": 3}
     )
     status = awaited.answers.status()
     assert [reason.code for reason in status.awaits] == ["no_cloud"]
-    assert (status.found, status.losses) == ({"camera.frame_id": "the first image"}, {"info_wrong_type": 3})
+    assert (status.found, status.losses) == ({"camera.frame_id": "the latest image"}, {"info_wrong_type": 3})
     assert status.ego is None, "it has no such stream"

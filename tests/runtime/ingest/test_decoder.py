@@ -100,7 +100,7 @@ def test_a_cloud_that_contradicts_its_origin_is_refused(desk: Desk, caplog: pyte
     cloud = replace(in_frame(a_sweep(), ROOF), frame_id="lidar")
     assert desk.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is None
     assert desk.losses.snapshot() == {(LIDAR, "cloud_origin"): 1}
-    assert "look measured from" in caplog.text
+    assert "look as if measured from" in caplog.text
 
 
 def test_where_points_come_from_is_looked_at_once_a_second_and_always_while_it_is_wrong(desk: Desk) -> None:

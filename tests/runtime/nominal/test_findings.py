@@ -124,7 +124,7 @@ def test_the_frames_that_are_there_are_listed_and_no_others_words() -> None:
     result = found_of(pair(), heard(cloud="\x1b[31m"), transforms)
     assert not isinstance(result, Found)
     (text,) = (reason.text for reason in result)
-    assert "'cam' and (a frame of no plain name)" in text
+    assert "'cam' and (a frame whose name is not plain)" in text
     assert "there are base, f0" in text
     assert "17 more" in text
     assert "\x1b" not in text

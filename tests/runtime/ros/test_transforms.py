@@ -82,7 +82,9 @@ def test_a_camera_of_two_pairs_has_a_calibrated_frame_for_each_and_none_of_its_o
         ("bumper", "camera__2nd_calibrated"),
     ]
     assert replacing.placed == ()
-    assert set(replacing.words.values()) == {"not published: camera is the camera of several pairs, and has one parent"}
+    assert set(replacing.words.values()) == {
+        "not published: camera is the camera of several pairs, and a frame has one parent"
+    }
 
 
 def test_frames_are_named_as_tf2_has_them() -> None:

@@ -112,7 +112,7 @@ def needs_of(report: StreamStatistics, pair: PairConfig, latest: Estimate | None
     if lacking > 0:
         needs.append(f"{lacking} more pairs")
     if latest is not None and latest.verdict.decision is Decision.FAILED:
-        needs += [f"a window that can tell: {reason.text}" for reason in latest.verdict.reasons]
+        needs += [f"a better window: {reason.text}" for reason in latest.verdict.reasons]
     if pair.calibration.motion_compensation:
         ego = report.streams.get(EGO)
         if pair.ego is None or (report.pairs and (ego is None or not ego.accepted)):

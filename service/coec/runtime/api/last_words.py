@@ -64,7 +64,7 @@ class LastWords:
         """
         word = self._words.get(pair)
         if word is None:
-            raise NotFoundError("no such pair has said anything")
+            raise NotFoundError("no pair of this name has reported anything")
         return answer_of(word, form)
 
     def _word_of(self, service: ServiceState, config_hash: str, answers: PairAnswers | AwaitedAnswers) -> LastWord:

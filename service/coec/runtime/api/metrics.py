@@ -294,7 +294,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "coec_sensor_moved_probability",
         "gauge",
-        "That a sensor has moved.",
+        "Probability that a sensor has moved.",
         ("sensor",),
         _of_rig(lambda rig: {(sensor.name,): sensor.probability for sensor in rig.sensors}),
     ),
@@ -313,7 +313,9 @@ FAMILIES: tuple[Family, ...] = (
         _of_rig(lambda rig: {(cause,): count for cause, count in rig.losses.items()}),
     ),
     Family("coec_reason", "gauge", "1 for each reason that health gives, by its code.", ("pair", "code"), _reasons),
-    Family("coec_check_age_seconds", "gauge", "Since data were last judged.", _PAIR, _of_health(lambda one: one.age_s)),
+    Family(
+        "coec_check_age_seconds", "gauge", "Time since data were last judged.", _PAIR, _of_health(lambda one: one.age_s)
+    ),
     Family("coec_diagnosis", "gauge", "Figures of self-diagnosis.", ("pair", "metric"), _figures("value")),
     Family("coec_diagnosis_limit", "gauge", "Their limits.", ("pair", "metric"), _figures("limit")),
     Family(
@@ -364,7 +366,9 @@ FAMILIES: tuple[Family, ...] = (
     ),
     Family("coec_samples_received", "counter", "Samples that came.", _STREAM, _streams(lambda one: one.received)),
     Family("coec_samples_waiting", "gauge", "Samples not decoded yet.", _STREAM, _streams(lambda one: one.waiting)),
-    Family("coec_sample_age_seconds", "gauge", "Since the last sample came.", _STREAM, _streams(lambda one: one.age_s)),
+    Family(
+        "coec_sample_age_seconds", "gauge", "Time since the last sample came.", _STREAM, _streams(lambda one: one.age_s)
+    ),
     Family("coec_frames_accepted", "counter", "Frames made of samples.", _STREAM, _streams(lambda one: one.accepted)),
     Family("coec_losses", "counter", "What was lost, by cause.", ("pair", "place", "cause"), _losses),
     Family("coec_pairs", "counter", "Camera-LiDAR pairs formed.", _PAIR, _per_pair(lambda one: one.pairs)),
@@ -412,7 +416,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(PAIR_WAIT, "histogram", "From a pair's last frame until it is looked at.", _PAIR),
     Family(WRITE, "histogram", "Writing of a pair into its window.", _PAIR),
     Family(JOB, "histogram", "From a question to the worker to its result, by kind: check, solve, ...", ("kind",)),
-    Family(WORK, "histogram", "What of that the worker itself needed.", ("kind",)),
+    Family(WORK, "histogram", "Time that the worker itself needed for a job, by kind.", ("kind",)),
     Family(
         "coec_worker_jobs",
         "counter",
@@ -441,7 +445,7 @@ FAMILIES: tuple[Family, ...] = (
         ("kind",),
         _of_worker(lambda view: view.status.worker.waiting),
     ),
-    Family("coec_worker_job_age_seconds", "gauge", "Of what is with the worker.", ("kind",), _job_age),
+    Family("coec_worker_job_age_seconds", "gauge", "Age of the job that the worker has.", ("kind",), _job_age),
     Family("coec_worker_restarts", "counter", "Workers replaced.", (), _one(lambda view: view.status.worker.restarts)),
     Family(
         "coec_worker_processor_seconds",
@@ -450,7 +454,9 @@ FAMILIES: tuple[Family, ...] = (
         ("kind",),
         _of_budget(lambda budget: {(kind,): cpu_s for kind, cpu_s in budget.spent_s.items()}),
     ),
-    Family("coec_budget_cores", "gauge", "What may be spent.", (), _of_budget(lambda budget: {(): budget.cores})),
+    Family(
+        "coec_budget_cores", "gauge", "What the worker may spend.", (), _of_budget(lambda budget: {(): budget.cores})
+    ),
     Family(
         "coec_budget_spent_cores",
         "gauge",
@@ -482,7 +488,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "coec_unseen_seconds",
         "gauge",
-        "Since the worker last looked at a pair.",
+        "Time since the worker last looked at a pair.",
         _PAIR,
         _of_budget(lambda budget: {(name,): share.unseen_s for name, share in budget.pairs.items()}),
     ),

@@ -188,7 +188,7 @@ class PairAnswers:
 
         Raises:
             NotFoundError: no such window of this pair.
-            UsageError: the offset lies behind the end of the file.
+            UsageError: the offset lies beyond the end of the file.
         """
         snippets = self._outside.snippets
         if snippets is not None and window_id.endswith(SNIPPET):

@@ -29,7 +29,7 @@ def _reason(rig: VehicleRig, pair: str, objection: Objection) -> Reason:
     edge = rig.graph.edge[pair]
     if objection is Objection.MOVED and rig.event is not None:
         moved = " and ".join(name for name in rig.event.sensors if name in (edge.a, edge.b))
-        text = f"{moved} moved, and this pair serves what was before; a window of after it puts it right."
+        text = f"{moved} moved, and this pair still serves what was before; a window from after the move puts it right."
         return Reason(MOVED, text)
     if objection is Objection.SUSPECTED:
         undecided = (one.name for one in rig.sensors if one.health is SensorHealth.UNDECIDED)

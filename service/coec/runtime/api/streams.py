@@ -24,7 +24,7 @@ def troubles_of(streams: Mapping[str, StreamCounts], pair: PairConfig, topics: T
         if counts.taking_turns:
             known = topics.nodes_of(counts.taking_turns)
             who = f": {listed(known)}" if known else ""
-            text = f"{len(counts.taking_turns)} publishers send on {stream.place} at a time{who}."
+            text = f"{len(counts.taking_turns)} publishers send on {stream.place} at the same time{who}."
             found.append(Reason("two_senders", f"{text} Their frames are taken as one sensor's."))
         if counts.stamped_by_sender:
             text = f"Messages on {stream.place} have no stamp: each has the stamp from the sender's clock."

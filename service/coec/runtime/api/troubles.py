@@ -20,53 +20,53 @@ class Trouble:
 TROUBLES: Mapping[str, Trouble] = {
     "no_router": Trouble(
         "There is no router: no frames come in, and nobody is answered.",
-        "Start it, or see to the network; `coec doctor` tells how far one gets. The service connects by itself.",
+        "Start it, or check the network; `coec doctor` says how far a connection gets. The service connects by itself.",
     ),
     "two_senders": Trouble(
-        "Two publishers send on one topic at a time; their frames are taken as one sensor's.",
+        "Two publishers send on one topic at the same time; their frames are taken as one sensor's.",
         "End one of the two, or name the topic of the one that is meant; `coec doctor` lists topics and nodes.",
     ),
     "sender_clock": Trouble(
-        "Messages of a stream have no stamp; the time at which they were sent, not that of the sensor, stands for it.",
+        "Messages of a stream have no stamp; the time at which they were sent replaces the sensor's.",
         "Have the driver stamp its messages by the clock of the sensors.",
     ),
     "inconsistent_rig": Trouble(
-        "The pairs of the vehicle do not agree where its sensors are; `coec query rig` tells what does not close.",
-        "Nothing while windows come: one from before a move fits again with the next. If it stays, see to what a pair "
-        "has of its own: intrinsics, clocks, masks; and to `links`.",
+        "The pairs of the vehicle do not agree where its sensors are; `coec query rig` shows what does not fit.",
+        "Nothing while windows come: a pair whose window is from before a move fits again with its next one. If it "
+        "stays, check what a pair has of its own (intrinsics, clocks, masks), and `links`.",
     ),
     "sensor_suspected": Trouble(
         "The pairs of the vehicle do not agree where its sensors are, and one of this pair may have moved; `coec query "
-        "rig` tells by how much, and how likely.",
-        "Nothing: the next looks name it, or say `inconsistent_rig`, or that all fits.",
+        "rig` says by how much, and how likely that is.",
+        "Nothing: the next looks name the sensor, or lead to `inconsistent_rig`, or show that all fits.",
     ),
     "sensor_moved": Trouble(
-        "A sensor of the pair moved, as `coec query rig` tells, and the pair serves what was before.",
+        "A sensor of the pair moved (see `coec query rig`), and the pair still serves the calibration from before.",
         "Nothing while windows come: one correction puts all its pairs right. If it stays, `health` says what the "
         "windows of the pair lack, or the pair is held or waits for `apply`.",
     ),
     "one_pair": Trouble(
-        "Said of `rig`: the vehicle has one pair, which cannot tell its camera from its LiDAR.",
+        "About `rig`: the vehicle has one pair, which cannot tell its camera from its LiDAR.",
         "Nothing: `health` of the pair says whether either moved. A second camera on that LiDAR would tell them apart.",
     ),
     "no_rig": Trouble(
-        "Said of `rig`: its pairs are not put together, as the vehicle has more sensors than that is made for.",
-        "Nothing: every pair is calibrated by itself. Leave pairs out that are of no use, to have the others together.",
+        "About `rig`: its pairs are not put together, because the vehicle has more sensors than that can handle.",
+        "Nothing: every pair is calibrated by itself. Leave out pairs that are of no use, to have the others together.",
     ),
     "lidars_not_installed": Trouble(
-        "There are several LiDARs, and what measures where they sit to one another is not installed.",
+        "There are several LiDARs, and the package that measures their poses to one another is not installed.",
         "Install the extra `lidars`, or set `lidar_edges.period_s: 0`; all else goes on without it.",
     ),
     "rig_state_damaged": Trouble(
-        "Said of `rig`: what was known of it before the restart cannot be read; it is kept aside and learnt anew.",
-        "See to the disk of `state.directory`. A sensor that was knocked meanwhile is told by its pairs only.",
+        "About `rig`: what was known of it before the restart cannot be read; it is kept aside and learnt anew.",
+        "Check the disk of `state.directory`. Only its pairs report a sensor that was knocked meanwhile.",
     ),
     "insecure": Trouble(
-        "The service listens where whoever comes is let in without a certificate.",
+        "The service listens where anyone is let in without a certificate.",
         "Listen on loopback or on TLS with client certificates, and take `zenoh.insecure` out.",
     ),
     "http_unavailable": Trouble(
-        "Metrics are not served over HTTP: the address cannot be had.",
+        "Metrics are not served over HTTP: the address is not available.",
         "Free the port or name another in `metrics.http`, and reload.",
     ),
     "http_insecure": Trouble(
@@ -75,23 +75,23 @@ TROUBLES: Mapping[str, Trouble] = {
     ),
     "worker_failed": Trouble(
         "The process that infers and solves has ended and is being replaced.",
-        "Nothing, once; if it goes on, see to its memory (`worker.max_memory_bytes`) and to the log.",
+        "Nothing if it happens once; if it goes on, check its memory (`worker.max_memory_bytes`) and the log.",
     ),
     "recording_failed": Trouble(
         "The last window could not be written; the next one is tried.",
-        "See to the disk of `state.directory`: room, owner, errors.",
+        "Check the disk of `state.directory`: room, owner, errors.",
     ),
     "recording_stuck": Trouble(
         "The disk does not answer: no window can be written.",
-        "See to the disk of `state.directory`; `coec doctor` measures it.",
+        "Check the disk of `state.directory`; `coec doctor` measures it.",
     ),
     "disk_slow": Trouble(
-        "The disk takes longer than a command may wait: what is acknowledged says that it is not durable yet.",
-        "See to what else writes to the disk of `state.directory`; `coec doctor` measures it.",
+        "The disk takes longer than a command may wait: acknowledgements say that the command is not durable yet.",
+        "Check what else writes to the disk of `state.directory`; `coec doctor` measures it.",
     ),
     "disk_failing": Trouble(
         "The disk refuses what is to be remembered; it is kept in memory and tried again.",
-        "See to the disk of `state.directory`: errors, owner, mount.",
+        "Check the disk of `state.directory`: errors, owner, mount.",
     ),
     "disk_read_only": Trouble(
         "The state directory is mounted read-only: nothing is remembered over a restart.",
@@ -102,12 +102,12 @@ TROUBLES: Mapping[str, Trouble] = {
         "Make room; nothing has to be restarted.",
     ),
     "state_damaged": Trouble(
-        "What was remembered cannot be used and is kept beside; nominal is served.",
-        "Calibrate, or restore the file from a backup; look into the disk.",
+        "What was remembered cannot be used and is kept aside; the nominal calibration is served.",
+        "Calibrate, or restore the file from a backup; check the disk.",
     ),
     "history_damaged": Trouble(
-        "The chain of the history is broken; what there was is kept beside.",
-        "Look into who may write the state directory, and into the disk.",
+        "The chain of the history is broken; what there was is kept aside.",
+        "Find out who may write the state directory, and check the disk.",
     ),
     "baseline_damaged": Trouble(
         "The baseline of the rig cannot be read; limits are those of the configuration.",
@@ -119,36 +119,36 @@ TROUBLES: Mapping[str, Trouble] = {
     ),
     "monitor_blind": Trouble(
         "Check after check comes to nothing.",
-        "Read the reason: it names what fails; see to frames and network.",
+        "Read the reason: it names what fails; check frames and network.",
     ),
     "windows_in_vain": Trouble(
         "Window after window comes to nothing.",
-        "Read the reason: it names what fails; see to frames and network.",
+        "Read the reason: it names what fails; check frames and network.",
     ),
     "overdue_worker": Trouble(
         "No check has been completed for three periods: the worker has not answered.",
-        "Nothing while it starts; else see to its load and to the log.",
+        "Nothing while it starts; else check its load and the log.",
     ),
     "overdue_depth": Trouble(
         "No check has been completed for three periods: no depth comes.",
-        "See to the depth network, or to the depth maps that come with the frames.",
+        "Check the depth network, or the depth maps that come with the frames.",
     ),
     "overdue_pairing": Trouble(
-        "No check has been completed for three periods: frames come and make no pairs.",
-        "See to the clocks of camera and LiDAR: `coec doctor` tells how far they are apart.",
+        "No check has been completed for three periods: frames come, but make no pairs.",
+        "Check the clocks of camera and LiDAR: `coec doctor` says how far they are apart.",
     ),
     "overdue_data": Trouble(
         "No check has been completed for three periods: frames do not come, are refused, or are too few.",
-        "See to the sensors, their keys and the router's rules: `coec doctor` listens.",
+        "Check the sensors, their keys and the router's rules: `coec doctor` listens for frames.",
     ),
     "overdue_budget": Trouble(
-        "No check has been completed for three periods: the budget of the processor does not suffice.",
+        "No check has been completed for three periods: the processor budget does not suffice.",
         "Raise `budget.cores` to what `status` says under `budget.wanted`, or lengthen `monitor.period_s` and "
         "`window.slice_s`.",
     ),
     "service_stuck": Trouble(
         "What is known of the pair is not renewed: a disk or a thread is stuck.",
-        "The service manager restarts the service if it stays so; see to the disk.",
+        "The service manager restarts the service if it stays so; check the disk.",
     ),
     "thread_died": Trouble(
         "A thread of the service has died; the service ends with exit code 70.",
@@ -167,27 +167,27 @@ TROUBLES: Mapping[str, Trouble] = {
         "Nothing; it looks four times a second.",
     ),
     "no_image": Trouble(
-        "A pair waits for its first image, which tells the camera's frame and the size of its images.",
-        "See to the camera and its topic (`camera.topic`), or set `camera.frame_id` and `camera.intrinsics`.",
+        "A pair waits for its first image, which gives the camera's frame and the size of its images.",
+        "Check the camera and its topic (`camera.topic`), or set `camera.frame_id` and `camera.intrinsics`.",
     ),
     "no_cloud": Trouble(
-        "A pair waits for its first cloud, which tells the frame of the points.",
-        "See to the LiDAR and its topic, or set `lidar.frame_id` and `lidar.cloud_frame_id`.",
+        "A pair waits for its first cloud, which gives the frame of the points.",
+        "Check the LiDAR and its topic, or set `lidar.frame_id` and `lidar.cloud_frame_id`.",
     ),
     "no_motion": Trouble(
-        "A pair waits for its first ego-motion, which tells the frame of the velocities.",
-        "See to its topic, set `ego.T_lidar_ego`, or take `ego` out.",
+        "A pair waits for its first ego-motion, which gives the frame of the velocities.",
+        "Check its topic, set `ego.T_lidar_ego`, or take `ego` out.",
     ),
     "no_frame_id": Trouble(
         "The headers of a stream name no frame.",
         "Set the frame that the text names, or have the driver say it.",
     ),
     "no_camera_info": Trouble(
-        "A pair waits for the `CameraInfo` that tells the intrinsics.",
+        "A pair waits for the `CameraInfo` that gives the intrinsics.",
         "Have the driver publish it, name its topic in `camera.info_topic`, or set `camera.intrinsics`.",
     ),
     "camera_info_refused": Trouble(
-        "The `CameraInfo` is no calibration: not one in CDR, uncalibrated, or of a lens that is not known here.",
+        "The `CameraInfo` cannot be used: it is not in CDR, uncalibrated, or of a lens that is not known here.",
         "Calibrate the camera, or set `camera.intrinsics`.",
     ),
     "camera_info_size": Trouble(
@@ -196,7 +196,7 @@ TROUBLES: Mapping[str, Trouble] = {
     ),
     "tf_static": Trouble(
         "`/tf_static` does not connect two frames of a pair.",
-        "Publish the joint that is missing (robot_state_publisher does, of a URDF), or set what the text names.",
+        "Publish the joint that is missing (robot_state_publisher does so from a URDF), or set what the text names.",
     ),
     "tf_static_no_tree": Trouble(
         "`/tf_static` contradicts itself on the way between two frames: a frame with two parents, or a loop.",
@@ -208,14 +208,14 @@ TROUBLES: Mapping[str, Trouble] = {
     ),
     "cannot_be_built": Trouble(
         "What was found does not make a rig: a mask of another size, for instance.",
-        "See to what the text says; the service tries again when the bus says something else.",
+        "Correct what the text says; the service tries again when something on the bus changes.",
     ),
     "nominal_changed": Trouble(
-        "`/tf_static` or `CameraInfo` say otherwise than when the pair was built; its nominal calibration stays.",
-        "Where the new one is right: stop the service, remove `nominal.json` from `state.directory`, start it.",
+        "`/tf_static` or `CameraInfo` now differ from when the pair was built; its nominal calibration stays.",
+        "If the new one is right: stop the service, remove `nominal.json` from `state.directory`, start it.",
     ),
     "held": Trouble(
-        "A person holds the extrinsic as it is; its text says who, since when and why. Nothing ails the service.",
+        "A person holds the extrinsic as it is; its text says who, since when and why. The service itself is well.",
         "`coec query command/hold --release` releases it.",
     ),
 }

@@ -47,7 +47,7 @@ class IncidentPictures:
         """Draws the windows before and after the event, each at the served extrinsic and at `found` (4, 4), the result
         of the window after it. The first one fits the images before the event, the second one those after it."""
         poses = (matrix_of(event.camera_from_lidar), found)
-        names = (SERVED, f"told by the window after it ({decision})")
+        names = (SERVED, f"found by the window after it ({decision})")
         sides: tuple[tuple[Side, str | None], ...] = (("before", event.window_before), ("after", event.window_after))
         for side, window_id in sides:
             if window_id is not None:

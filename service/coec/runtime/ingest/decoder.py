@@ -242,8 +242,8 @@ class Decoder:
         if sweep.ring is not None and telling(sweep.ring) is None and not self._ring_told:
             self._ring_told = True
             _log.warning(
-                "the field `ring` of the clouds holds one number: it is ignored, beams are told by their elevation; "
-                "see to the driver of the LiDAR",
+                "the field `ring` of the clouds holds one number: it is ignored, beams are told apart by their "
+                "elevation; check the driver of the LiDAR",
                 extra={"fields": {"sensor": self._stream.sensor}},
             )
         found = self._origin.look(sweep)

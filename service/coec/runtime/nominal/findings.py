@@ -187,7 +187,7 @@ class _Search:
         assert image is not None
         if not image.frame_id:
             raise _MissingError(Reason("no_frame_id", _frameless("Images", pair.camera, "camera.frame_id")))
-        self.origins[CAMERA_FRAME] = f"the first image on {pair.camera.place}"
+        self.origins[CAMERA_FRAME] = f"the latest image on {pair.camera.place} before the pair was built"
         return image.frame_id
 
     def cloud_frame(self) -> str | None:
@@ -199,7 +199,7 @@ class _Search:
         if not cloud:
             raise _MissingError(Reason("no_frame_id", _frameless("Clouds", lidar, "lidar.cloud_frame_id")))
         if lidar.frame_id is None:
-            self.origins[LIDAR_FRAME] = f"the first cloud on {lidar.place}"
+            self.origins[LIDAR_FRAME] = f"the latest cloud on {lidar.place} before the pair was built"
         return cloud
 
     def T_cloud_lidar(self, cloud: str | None, lidar: str | None) -> Matrix4x4 | None:
@@ -266,8 +266,8 @@ def changed(found: Found, pair: OpenPairConfig, heard: Heard, transforms: Static
     if not told:
         return None
     text = (
-        f"The bus says otherwise than when this pair was built: {' and '.join(told)}. What it was built with goes on "
-        "to be the nominal calibration: to take the new one, stop the service, remove nominal.json from its state "
+        f"The bus has changed since this pair was built: {' and '.join(told)}. What it was built with remains the "
+        "nominal calibration: to take the new one, stop the service, remove nominal.json from its state "
         "directory, and start it."
     )
     return Reason("nominal_changed", text)
@@ -284,7 +284,7 @@ def _frameless(what: str, stream: AnyStreamConfig, place: str) -> str:
 
 def _named(frame: str) -> str:
     """The name of a frame for people to read; a name that is not plain is not repeated."""
-    return repr(frame) if _PLAIN.fullmatch(frame) else "(a frame of no plain name)"
+    return repr(frame) if _PLAIN.fullmatch(frame) else "(a frame whose name is not plain)"
 
 
 def _listed(frames: Iterable[str]) -> str:

@@ -78,7 +78,7 @@ class SnippetStore:
 
         Raises:
             NotFoundError: no such snippet of the pair.
-            UsageError: the offset lies behind the end.
+            UsageError: the offset lies beyond the end.
         """
         with self._lock:
             known = name in self._found and _pair_of(name) == pair

@@ -168,7 +168,7 @@ class WindowStore:
 
         Raises:
             NotFoundError: no such window.
-            UsageError: the offset lies behind the end.
+            UsageError: the offset lies beyond the end.
         """
         return read_piece(self.existing(pair, window_id), "the window", offset, length)
 

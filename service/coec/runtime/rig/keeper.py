@@ -242,7 +242,7 @@ class RigKeeper:
             self._after(said.pair, said.due_ns, said.what)
         except ValueError as error:  # unusable numbers, from an estimate that went wrong
             self._losses["refused"] += 1
-            _log.warning(f"the rig does without what {said.pair} said: {error}")
+            _log.warning(f"what {said.pair} reported is left out of the rig: {error}")
         with self._condition:
             self._tell_pairs(before, said.due_ns)
             self._order.took(said)

@@ -99,7 +99,7 @@ class RigFile:
                 self._found = _sound(StoredRig.model_validate(loaded.body))
             except (ValidationError, ValueError):
                 self._file.distrust()
-                damage.append(f"{FILE}: it has another form, or a pose in it is none")
+                damage.append(f"{FILE}: it has another form, or a pose in it is no rigid transform")
         text = (
             f"What was known of the rig cannot be used: {'; '.join(damage)}. It is kept aside; the rig is learnt anew."
         )
@@ -174,7 +174,7 @@ def _sound(stored: StoredRig) -> StoredRig:
             raise ValueError("a pose is no rigid transform")
         information_of(measured.uncertainty.noise)
         if any(abs(value) >= MOST_SIGMA for shift in known.systematic.values() for value in shift):
-            raise ValueError("a shift is larger than any")
+            raise ValueError("a shift is larger than any that is estimated")
     for edge in stored.edges.values():
         if not (se3.is_rigid(_pose(edge.nominal)) and se3.is_rigid(_pose(edge.T_camera_lidar))):
             raise ValueError("a pose is no rigid transform")

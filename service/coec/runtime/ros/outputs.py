@@ -185,7 +185,7 @@ def _sayable(rig: Rig) -> _Sayable:
     try:
         camera, residual_px = outgoing.sayable(rig.camera)
     except UnsayableCameraError as error:
-        _log.warning(f"ROS is told no intrinsics: {error}", extra={"fields": {"pair": rig.pair}})
+        _log.warning(f"no intrinsics are published to ROS: {error}", extra={"fields": {"pair": rig.pair}})
         return _Sayable(rig, None, f"not published: {error}")
     word = "as configured" if camera is rig.camera else f"as equidistant, at most {residual_px:.2g} px off"
     return _Sayable(rig, replace(rig, camera=camera), word)

@@ -44,7 +44,9 @@ class CalibratedFrames:
             camera, lidar = _frame(extrinsic.camera_frame), _frame(extrinsic.lidar_frame)
             child = self._child(extrinsic.pair, camera, shared=cameras[camera] > 1)
             if child is None:
-                words[extrinsic.pair] = f"not published: {camera} is the camera of several pairs, and has one parent"
+                words[extrinsic.pair] = (
+                    f"not published: {camera} is the camera of several pairs, and a frame has one parent"
+                )
             elif child == lidar:
                 words[extrinsic.pair] = f"not published: {child} is the frame of the LiDAR, too"
             elif not self._is_due(extrinsic):

@@ -135,7 +135,7 @@ class Child:
         try:
             return self._link.receive(MAX_ANSWER_BYTES)
         except NoMessageError as error:
-            raise ChildError(Fault.MALFORMED_ANSWER, f"sent what is no message: {error}") from error
+            raise ChildError(Fault.MALFORMED_ANSWER, f"sent something that is not a message: {error}") from error
         except (OSError, EOFError) as error:
             raise self._broken(error) from error
 

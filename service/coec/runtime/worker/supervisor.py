@@ -265,7 +265,7 @@ class Worker:
                 if not self._was_ready:
                     self._unusable = Reason(code, text)
                 raise ChildError(Fault.UNUSABLE, f"cannot work with this configuration: {text}")
-        raise ChildError(Fault.MALFORMED_ANSWER, "said something else than that it is ready")
+        raise ChildError(Fault.MALFORMED_ANSWER, "sent something other than that it is ready")
 
     def _take_turn(self, child: Child) -> bool:
         """Checks the worker, then gives it the next job, if there is one. Returns whether it has answered a job."""
