@@ -161,9 +161,9 @@ def camera(**changes: Any) -> dict[str, Any]:
             r"cameras\.front\.intrinsics\.fx: .*greater than 0",
         ),
         (rig(cameras=[camera(colour="red")]), r"cameras\.front\.colour: there is no such key"),
-        (rig(cameras=[camera(), camera()]), "cameras: front stands there twice"),
-        (rig(cameras=[camera(intrinsics=None)]), r"cameras\.front\.intrinsics: to be given where"),
-        (rig(lidars=[{"name": "roof", "key": "roof"}]), r"lidars\.roof\.T_vehicle_lidar: to be given where"),
+        (rig(cameras=[camera(), camera()]), "cameras: front is given twice"),
+        (rig(cameras=[camera(intrinsics=None)]), r"cameras\.front\.intrinsics: must be given where"),
+        (rig(lidars=[{"name": "roof", "key": "roof"}]), r"lidars\.roof\.T_vehicle_lidar: must be given where"),
         (rig(cameras=[camera(T_vehicle_camera={"xyz": [0, 0, 0]})]), r"cameras\.front\.T_vehicle_camera: .*quaternion"),
         (
             rig(cameras=[camera(T_vehicle_camera={"xyz": [0, 0, 0], "quaternion": [1, 1, 0, 0]})]),

@@ -124,7 +124,7 @@ class RigConfig(Stage):
             names = [sensor.name for sensor in sensors]
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
-                raise ValueError(f"{place}: {', '.join(twice)} stands there twice")
+                raise ValueError(f"{place}: {', '.join(twice)} is given twice")
         return self
 
 
@@ -149,7 +149,7 @@ def written_out(document: Mapping[str, Any]) -> dict[str, Any]:
     pairs = list(found)
     if not pairs:
         raise ConfigError(
-            "pairs: by the poses that are told no camera sees what a LiDAR sees: look at T_vehicle_camera, "
+            "pairs: with the poses that are given, no camera sees what a LiDAR sees: check T_vehicle_camera, "
             "T_vehicle_lidar and field_of_view, or list the pairs"
         )
     links = [link.model_dump(exclude_none=True) for link in rig.links]
@@ -240,7 +240,7 @@ def _check_told(camera: RigCamera, lidar: RigLidar) -> None:
     }
     places = ", ".join(place for place, value in lacking.items() if value is None)
     if places:
-        raise ConfigError(f"{places}: to be given where `middleware` is `native`, as nothing on the bus tells it")
+        raise ConfigError(f"{places}: must be given where `middleware` is `native`, because nothing on the bus says it")
 
 
 def _nominal(camera: RigCamera, lidar: RigLidar) -> Any:

@@ -96,7 +96,7 @@ class Config(Stage):
         if not 0 < len(self.every_pair) <= MAX_PAIRS:
             raise ValueError(f"pairs: give 1 to {MAX_PAIRS}")
         if self.awaited and self.middleware == "native":
-            raise ValueError("awaited: nothing tells what a pair leaves out where `middleware` is `native`")
+            raise ValueError("awaited: nothing on the bus says what a pair leaves out where `middleware` is `native`")
         return self
 
     @model_validator(mode="after")
@@ -143,11 +143,13 @@ class Config(Stage):
             return self
         if self.middleware == "native":
             raise ValueError(
-                "ros.publish: nobody is told of ROS topics on native keys: set `middleware` to `rmw_zenoh` or `ros2dds`"
+                "ros.publish: nothing is published to ROS on native keys: set `middleware` to `rmw_zenoh` or `ros2dds`"
             )
         tokens = [ros_name(pair.name) for pair in self.every_pair]
         if len(set(tokens)) != len(tokens):
-            raise ValueError("ros.publish: names of pairs must differ in letters, digits or underscores: others are _")
+            raise ValueError(
+                "ros.publish: names of pairs must differ in letters, digits or underscores: others become _"
+            )
         return self
 
 

@@ -71,7 +71,7 @@ def parse_yaml(text: str) -> Any:
     except (
         Exception
     ) as error:  # constructors of numbers, dates and the like raise any exception that Python's own raise
-        raise ConfigError(f"a value in it is none: {type(error).__name__}") from error
+        raise ConfigError(f"a value in it is invalid: {type(error).__name__}") from error
     _check_extent(document)
     return document
 

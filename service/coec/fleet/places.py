@@ -171,7 +171,7 @@ def _store(url: str) -> tuple[Any, str]:
     except ImportError as error:
         extra = EXTRAS.get(_scheme(url))
         hint = "" if extra is None else f": pip install 'coec[{extra}]'"
-        raise SourceError(f"{url}: what speaks to {_scheme(url)}:// is not installed{hint}") from error
+        raise SourceError(f"{url}: the package that reads {_scheme(url)}:// is not installed{hint}") from error
     except ValueError as error:
         raise UsageError(f"{url}: {error}") from error
     return store, place

@@ -132,7 +132,7 @@ def evaluate(
         ("detection", detection, 0),
     ):
         if not value >= least:
-            raise UsageError(f"{name}={value!r}: at least {least:g}")
+            raise UsageError(f"{name}={value!r}: must be at least {least:g}")
     stages = ToldStages(progress)
     cut = window.window(progress=progress) if isinstance(window, Recording) else window
     plan = Plan(rotation_deg, translation_m, directions, halves=halves, detection=detection)

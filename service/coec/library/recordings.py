@@ -202,7 +202,7 @@ class Recording:
             SourceError, WindowError: as `window`.
         """
         if not 0.0 < seconds < inf:
-            raise UsageError(f"seconds={seconds:g}: a window takes more than none, and not for ever")
+            raise UsageError(f"seconds={seconds:g}: give a finite length above 0")
         count = max(1, round(self.seconds / seconds))
         for index in range(count):
             # `window` includes both ends; a frame on the border belongs to the window that begins there.

@@ -150,7 +150,7 @@ class Result:
         """
         pose = None if T_parent_lidar is None else np.array(T_parent_lidar, dtype=np.float64)
         if pose is not None and (pose.shape != (4, 4) or not np.isfinite(pose).all()):
-            raise UsageError(f"T_parent_lidar: (4, 4) finite numbers are expected, these are {pose.shape}")
+            raise UsageError(f"T_parent_lidar: (4, 4) finite numbers are expected, not {pose.shape}")
         camera = intrinsics_config(self._calibrated.window.rig.camera)
         extrinsic = of_result(self.document, camera, Frames(parent, child, pose))
         accepted(extrinsic, self.document.window_id, "force=True", force=force)

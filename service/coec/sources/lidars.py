@@ -75,7 +75,7 @@ def open_lidars(source: str, a: str, b: str) -> LidarRecording:
         SourceError: the bag is absent or damaged, has no such topic, or does not give the poses of the LiDARs.
     """
     if a == b:
-        raise UsageError(f"{a} twice: name two LiDARs")
+        raise UsageError(f"{a} is named twice: name two LiDARs")
     spec = parse_spec(source)
     if is_rig(spec):
         return _of_rig(spec, a, b)
@@ -83,7 +83,7 @@ def open_lidars(source: str, a: str, b: str) -> LidarRecording:
         from coec.sources.bag.lidars import lidars_of_bag
 
         return lidars_of_bag(spec, a, b)
-    raise UsageError(f"{source}: two LiDARs are in a bag, or in sim:rig=four-fisheyes&... without `pair`")
+    raise UsageError(f"{source} has no two LiDARs: give a bag, or sim:rig=four-fisheyes&... without `pair`")
 
 
 def _of_rig(spec: SourceSpec, a: str, b: str) -> LidarRecording:

@@ -110,7 +110,7 @@ def _parse_header(data: bytes) -> _Header:
     if points != width * height or points > MAX_POINTS:
         raise PcdError(f"line {line_number}: {points} POINTS do not agree with {width} x {height}, or are too many")
     if len(names) > MAX_FIELDS:
-        raise PcdError(f"line {line_number}: {len(names)} FIELDS; more than {MAX_FIELDS} are none of a LiDAR")
+        raise PcdError(f"line {line_number}: {len(names)} FIELDS; more than {MAX_FIELDS} do not come from a LiDAR")
     encoding = (values["DATA"] or [""])[0]
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise PcdError(f"line {line_number}: DATA must be ascii, binary or binary_compressed")

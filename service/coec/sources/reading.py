@@ -80,7 +80,7 @@ def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[np.gener
     with archive.open(item) as stream:
         shape, _, dtype = _header(stream)
         if shape and (min(shape) < 0 or max(shape) > MAX_FILE_BYTES):
-            raise ValueError("its shape is none")
+            raise ValueError("its shape is invalid")
         if int(np.prod(shape, dtype=object)) * dtype.itemsize > item.file_size:
             raise ValueError("it promises more than the archive holds")
     with archive.open(item) as stream:

@@ -67,7 +67,7 @@ def test_several_sources_are_refused_unless_one_of_them_is_chosen(source: int | 
 
 
 def test_a_source_that_no_field_tells_is_refused() -> None:
-    with pytest.raises(DecodeError, match="no field tells sources"):
+    with pytest.raises(DecodeError, match="no field of the points names one"):
         taken(a_cloud("laser_id"), 2)
 
 

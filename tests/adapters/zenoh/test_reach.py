@@ -64,7 +64,7 @@ def test_whatever_else_is_not(config: ZenohConfig, waiting: Iterable[tuple[Trans
 def test_gossip_may_tell_of_anybody(tmp_path: Path) -> None:
     file = tmp_path / "zenoh.json5"
     file.write_text("{ scouting: { gossip: { enabled: true } } }")
-    assert outside(ZenohConfig(file=file)) == "it connects to whom gossip tells it of"
+    assert outside(ZenohConfig(file=file)) == "it connects to peers that it learns of by gossip"
 
 
 def test_what_cannot_be_told_is_not_this_computers_alone() -> None:
@@ -72,4 +72,4 @@ def test_what_cannot_be_told_is_not_this_computers_alone() -> None:
         raise FileNotFoundError
 
     reach = Reach(settings_of(to("tcp/127.0.0.1:7447"), LIMITS), untold)
-    assert reach.outside() == "this system does not tell where its router listens"
+    assert reach.outside() == "this system does not show where its router listens"

@@ -21,7 +21,7 @@ def text(extrinsic: Extrinsic, existing: str | None) -> str:
     """
     if extrinsic.camera is None:
         raise OutputError(
-            "kalibr needs the intrinsics of the camera, which are not told here: export from a window, or give --config"
+            "kalibr needs the intrinsics of the camera, which are unknown here: export from a window, or give --config"
         )
     name = extrinsic.child if re.fullmatch(r"cam\d+", extrinsic.child) else "cam0"
     model, intrinsics, distortion_model, distortion = _camera(extrinsic.camera)

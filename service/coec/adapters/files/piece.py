@@ -13,13 +13,13 @@ def read_piece(path: Path, what: str, offset: int, length: int) -> bytes:
 
     Raises:
         NotFoundError: it cannot be read.
-        UsageError: the offset lies behind the end.
+        UsageError: the offset lies beyond the end.
     """
     try:
         with path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             if offset > size:
-                raise UsageError(f"`offset` lies behind the end of the file ({size} bytes)")
+                raise UsageError(f"`offset` lies beyond the end of the file ({size} bytes)")
             stream.seek(offset)
             return stream.read(length)
     except OSError as error:

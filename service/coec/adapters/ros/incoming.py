@@ -36,7 +36,7 @@ REFUSED: Final = {
     "hesai_ros_driver/msg/UdpFrame": _PACKETS,
     "rslidar_msg/msg/RslidarPacket": _PACKETS,
     "sensor_msgs/msg/PointCloud": "PointCloud has been replaced by PointCloud2: convert it (point_cloud_converter)",
-    messages.TF: "a transform tells where a frame is, not what it sees; motion it tells where `ego.type` is this one",
+    messages.TF: "a transform tells where a frame is, not what it sees; it counts as motion if `ego.type` is this one",
 }
 """Types that people configure by mistake, and what to do instead."""
 

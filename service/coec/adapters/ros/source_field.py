@@ -53,7 +53,7 @@ def of_source(message: PointCloud2, source: int | None) -> PointCloud2:
             return message
         raise DecodeError(
             Refusal.CLOUD_CONCATENATED,
-            f"source {source} is asked for, and no field tells sources: {', '.join(SOURCE_FIELDS)} would",
+            f"source {source} is asked for, but no field of the points names one: {', '.join(SOURCE_FIELDS)} would",
         )
     wanted = int(values[0, 0]) if source is None else source
     mine = values == wanted

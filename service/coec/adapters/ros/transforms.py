@@ -48,11 +48,13 @@ def pose_of(stamped: Any) -> Matrix4:
     rotation, place = stamped.transform.rotation, stamped.transform.translation
     place_m = np.array([place.x, place.y, place.z])
     if not (np.abs(place_m) <= MAX_PLACE_M).all():
-        raise DecodeError(Refusal.TRANSFORM_INVALID, "a transform is none: no finite place, or far away")
+        raise DecodeError(
+            Refusal.TRANSFORM_INVALID, "not a rigid transform: its translation is not finite, or far away"
+        )
     try:
         turn = rotation_from_quaternion_xyzw(np.array([rotation.x, rotation.y, rotation.z, rotation.w]))
     except ValueError as error:
-        raise DecodeError(Refusal.TRANSFORM_INVALID, f"a transform is none: {error}") from error
+        raise DecodeError(Refusal.TRANSFORM_INVALID, f"not a rigid transform: {error}") from error
     return transform_from(turn, place_m)
 
 

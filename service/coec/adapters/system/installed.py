@@ -92,7 +92,7 @@ def installed(name: str) -> dict[str, Package]:
             at_hand = distribution(wanted[0])
         except PackageNotFoundError as error:
             raise NotFoundError(
-                f"the package {wanted[0]} is needed, not installed: install coec with all of them (pip install coec)"
+                f"the package {wanted[0]} is needed but not installed: install coec with all of them (pip install coec)"
             ) from error
         needs = list(_needs(at_hand, wanted[1]))
         waiting += needs

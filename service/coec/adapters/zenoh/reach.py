@@ -34,7 +34,7 @@ class Reach:
         """A clause that says why programs on other computers may reach the session; None: as far as this computer can
         tell they cannot. Examined anew at each call, because a router may be started or stopped at any time."""
         if self._gossip:
-            return "it connects to whom gossip tells it of"
+            return "it connects to peers that it learns of by gossip"
         for text in (*self._listened, *self._connected):
             endpoint = Endpoint.parse(text)
             if not endpoint.on_loopback:
@@ -52,6 +52,6 @@ class Reach:
         try:
             found = self._addresses(protocol, port)
         except OSError:
-            return "this system does not tell where its router listens"
+            return "this system does not show where its router listens"
         wide = sorted(str(address) for address in found if not address.is_loopback)
         return f"its router's port {port} is open at {wide[0]}, too" if wide else None

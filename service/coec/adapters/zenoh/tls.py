@@ -147,7 +147,7 @@ def _alert(error: ssl.SSLError) -> str:
     reason = _words(error)
     if "alert" in reason:
         return f"the other end refuses: {reason.rpartition('alert ')[2]}"
-    return f"no TLS comes about: {reason}"
+    return f"no TLS connection comes about: {reason}"
 
 
 def _words(error: ssl.SSLError) -> str:

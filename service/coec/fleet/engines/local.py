@@ -77,7 +77,7 @@ class _Seat:
             self.process.join(END_S)
             status = self.process.exitcode
             if not self._ready:
-                raise FleetError(f"a process that is to judge windows ended at its start, with status {status}")
+                raise FleetError(f"a process for judging windows ended at its start, with status {status}")
             return PROCESS_DIED, f"the process that judged it ended with status {status}"
         if self.has and time.monotonic() - self._told_s > bounds.seconds:
             return DEADLINE, bounds.late

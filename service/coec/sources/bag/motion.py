@@ -48,7 +48,7 @@ def moved_on(index: Index, reader: Reader, topic: str, frames: tuple[str, str]) 
         told = ", ".join(f"{parent},{child}" for parent, child in there[:_LISTED])
         more = ", ..." if len(there) > _LISTED else ""
         raise SourceError(
-            f"{index.path}: {topic} does not tell how {frames[1]!a} moves in {frames[0]!a}; name the frames with "
+            f"{index.path}: {topic} does not say how {frames[1]!a} moves in {frames[0]!a}; name the frames with "
             f"?moving=PARENT,CHILD; there: {told or 'none'}{more}"
         )
     return tuple(sorted(motions, key=lambda motion: motion.stamp_ns))
