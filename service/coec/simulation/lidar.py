@@ -16,7 +16,8 @@ from coec.simulation.weather import CLEAR, DROP_M, DROP_REFLECTANCE, Air
 Doubles = NDArray[np.float64]
 
 WEAKEST = 4.0e-6
-"""Returns below this (reflectance · cosine / range², 1/m²) are not detected: a tenth reflectance at 110 m, head on."""
+"""Returns below this (reflectance · cosine / range², 1/m²) are not detected: a reflectance of 0.05 at 110 m
+or of 0.1 at 158 m, head on."""
 CLUSTER_M = 0.35
 """Length of the pulse: echoes nearer to each other than this come back as one, at their mean range."""
 SPREAD: tuple[tuple[float, float], ...] = ((1.0, 0.0), (-0.5, 0.866), (-0.5, -0.866))
