@@ -74,7 +74,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(coec: Coe
 def test_a_result_that_cannot_be_written_in_the_end_is_printed(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, data: bytes) -> Path:
+    def full(path: Path, _: bytes) -> Path:
         raise OutputError(f"cannot write {path}: No space left on device")
 
     monkeypatch.setattr(output, "write", full)
