@@ -75,5 +75,5 @@ def test_a_silent_stream_is_told_with_who_is_there_and_two_senders_by_name() -> 
     (unheard,) = [one for one in found if one.where == "/front/image"]
     assert "no publisher" not in unheard.text
     senders, clock = [one.text for one in found if one.check == "senders"]
-    assert senders.startswith("2 publishers send on /front/image at a time: /left, /right.")
+    assert senders.startswith("2 publishers send on /front/image at the same time: /left, /right.")
     assert "the stamp from the sender's clock" in clock

@@ -82,7 +82,7 @@ def test_the_page_says_the_level_of_every_state() -> None:
 
 
 def test_the_page_says_the_defaults_and_limits() -> None:
-    assert f"Beyond {MAX_RESIDUAL_PX} px" in PAGE
+    assert f"beyond {MAX_RESIDUAL_PX} px" in PAGE
     assert f"`<camera frame>{RosConfig().calibrated_suffix}`" in PAGE
 
 

@@ -103,7 +103,7 @@ def test_two_drivers_on_one_topic_are_a_trouble_with_their_names(
         sent += 2
     told = running.until(lambda: reasons(running), lambda told: "two_senders" in told, "two senders")
     assert told["two_senders"].startswith(
-        f"2 publishers send on {TOPICS['camera']} at a time: /left_driver, /right_driver."
+        f"2 publishers send on {TOPICS['camera']} at the same time: /left_driver, /right_driver."
     )
     for _ in range(8):  # in portions that the inbox holds, each once the counters know of the one before
         for _ in range(9):

@@ -82,10 +82,10 @@ def sentence(report: FleetReport) -> str:
     first, last = day(report.first_ns), day(report.last_ns)
     when = f"on {first}" if first == last else f"from {first} to {last}"
     untold = f" Pairs with too few accepted windows to tell a drift: {too_few}." if too_few else ""
+    accepted = f"{100.0 * report.accepted / max(report.windows, 1):.1f} % accepted"
     return (
-        f"{count(report.vehicles, 'vehicle')}, {count(report.windows, 'window')} {when},"
-        f" {percent(report.accepted / max(report.windows, 1))} accepted. Pairs that have drifted by what a monitor has"
-        f" to see, or more: {drifted} of {len(report.pairs)}.{untold}"
+        f"{count(report.vehicles, 'vehicle')}, {count(report.windows, 'window')} {when}, {accepted}. Pairs that have"
+        f" drifted by what a monitor has to see, or more: {drifted} of {len(report.pairs)}.{untold}"
     )
 
 
