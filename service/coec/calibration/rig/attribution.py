@@ -279,10 +279,8 @@ def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], 
 def _stepped(history: History, since_ns: int, place_times: float = 1.0) -> bool:
     """Whether an edge lies elsewhere since a stamp than before, by more than chance, if streets scatter its looks by
     `place_times` their usual standard deviation."""
-    step = steps_at(history, [since_ns])
-    place = np.max([look.place for look in history.looks], axis=0)
-    covariance = step.covariance[0] + np.diag(2.0 * (place_times**2 - 1.0) * place**2)
-    apart = float(dense.squared(dense.inverse(covariance), step.xi[0]))
+    step = steps_at(history, [since_ns], place_times)
+    apart = float(dense.squared(dense.inverse(step.covariance[0]), step.xi[0]))
     return bool(step.looks[0] >= SEEN and apart > STEPPED2)
 
 

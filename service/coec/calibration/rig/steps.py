@@ -129,8 +129,9 @@ class Steps:
     log_still: float
 
 
-def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
-    """What the looks say of a step at each of some times: looks from that stamp on lie after the step."""
+def steps_at(history: History, times_ns: Sequence[int], place_times: float = 1.0) -> Steps:
+    """What the looks say of a step at each of some times: looks from that stamp on lie after the step. Places scatter
+    the looks by `place_times` their usual standard deviation."""
     stamps = np.array([look.stamp_ns for look in history.looks], np.int64)
     after = stamps[None, :] >= np.asarray(times_ns, np.int64)[:, None]
     stack = _Stack.of(history.origin, history.looks)
@@ -141,6 +142,7 @@ def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
     for t, (was, is_now) in enumerate(zip(before.offset, since.offset, strict=True)):
         xi[t] = se3.difference(se3.perturb(history.origin, is_now), se3.perturb(history.origin, was))
     place = np.max(np.array([look.place for look in history.looks]).reshape(-1, 6), axis=0, initial=0.0)
+    place = place_times * place
     covariance = before.covariance + since.covariance + np.diag(2.0 * place**2)  # one place before, one place since
     good = since.good
     looks = good.sum(axis=1)
