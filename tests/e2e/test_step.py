@@ -178,7 +178,8 @@ def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path,
         fetch_window(running.session, running.keys, *names, fetched, PATIENCE_S, PATIENCE_S, lambda *_: None)
         bag = opened(fetched)
         images = [topic for topic, kind in bag.types.items() if kind == "sensor_msgs/msg/CompressedImage"]
-        assert bag.counts[images[0]] > 20, "every frame of some seconds"
+        # Those after the event may never be sent: on a busy machine the drive ends before the check is answered.
+        assert bag.counts[images[0]] > 10, "every frame of the seconds before the event"
         assert "/tf_static" in bag.latched
 
         # Silence ends the slice that is open, and its window is the newer candidate.
