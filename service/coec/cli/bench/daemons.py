@@ -25,6 +25,9 @@ POLL_S, READY_S = 0.1, 300.0
 """Period of asking whether the daemon runs, because it cannot announce that; and the time limit, because a first start
 compiles every kernel, for a minute and a half on two busy cores."""
 
+FLOWING_S = 60.0
+"""Time limit for the first frame of every sensor, once the daemon runs."""
+
 SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(*sys.argv[1:]))"
 """Program of the process that sends frames; its arguments are those of `load.main`."""
 
@@ -55,6 +58,21 @@ def await_running(session: zenoh.Session, keys: Keys) -> None:
                 return
         time.sleep(POLL_S)
     raise ConnectionFailedError(f"the daemon of the benchmark did not become ready within {READY_S:g} s")
+
+
+def await_frames(session: zenoh.Session, keys: Keys) -> None:
+    """Wait until a frame of every camera and of every LiDAR has been accepted.
+
+    Raises:
+        ConnectionFailedError: none came from one of them within `FLOWING_S`.
+    """
+    end_s = time.monotonic() + FLOWING_S
+    while time.monotonic() < end_s:
+        pairs = status(session, keys)["pairs"]
+        if all(pair[kind]["accepted"] for pair in pairs for kind in ("camera", "lidar")):
+            return
+        time.sleep(POLL_S)
+    raise ConnectionFailedError(f"a sensor of the benchmark sent nothing that was accepted within {FLOWING_S:g} s")
 
 
 def status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:

@@ -92,10 +92,11 @@ def _settled(
 def loaded(
     folder: Path, form: str, stages: tuple[WindowConfig, BudgetConfig], heard: Callable[[str], None], pace: float = 1.0
 ) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
-    """A daemon under the load `form` of `load.LOADS`, at `pace` seconds of driving in a second, with a session.
+    """A daemon under the load `form` of `load.LOADS`, at `pace` seconds of driving in a second, with a session: frames
+    of every sensor arrive.
 
     Raises:
-        ConnectionFailedError: the daemon did not become ready.
+        ConnectionFailedError: the daemon did not become ready, or a sensor sends nothing.
     """
     heard(f"the daemon starts, {form}")
     endpoint = f"tcp/127.0.0.1:{daemons.free_port()}"
@@ -110,6 +111,7 @@ def loaded(
     ):
         heard(f"the daemon under load, {form}")
         daemons.await_running(session, KEYS)
+        daemons.await_frames(session, KEYS)
         yield session, ProcessReading(daemon.pid)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +47,18 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
         ConnectionFailedError: the daemon did not become ready.
     """
     document: dict[str, Any] = {}
-    for form, seconds in SECONDS.items():
+    for form in SECONDS:
         with live.loaded(folder, form, (WindowConfig(), BudgetConfig()), heard, PACE) as (session, process):
             time.sleep(SETTLE_S / PACE)
-            figures = _figures(session, process, load.LOADS[form].pairs, seconds)
+            figures = _figures(session, process, form, heard)
             document |= {f"{form}_{name}": figure for name, figure in figures.items()}
     return document
 
 
-def _figures(session: zenoh.Session, service: ProcessReading, pairs: Sequence[str], seconds: float) -> dict[str, Any]:
+def _figures(
+    session: zenoh.Session, service: ProcessReading, form: str, heard: Callable[[str], None]
+) -> dict[str, Any]:
+    pairs, seconds = load.LOADS[form].pairs, SECONDS[form]
     worker = ProcessReading(service.children[0])
     before, begin_s = daemons.status(session, KEYS), time.monotonic()
     for process in (service, worker):
@@ -64,6 +67,8 @@ def _figures(session: zenoh.Session, service: ProcessReading, pairs: Sequence[st
     unseen_s = dict.fromkeys(pairs, 0.0)
     while time.monotonic() < begin_s + seconds / PACE:
         time.sleep(LOOK_S / PACE)
+        driven_s = PACE * (time.monotonic() - begin_s)
+        heard(f"the daemon under load, {form}: {driven_s:.0f} of {seconds:.0f} s of driving")
         for name in pairs:
             age_s = daemons.answered(session, KEYS.health(name))["age_s"]
             elapsed_s = time.monotonic() - begin_s
