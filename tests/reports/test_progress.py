@@ -56,6 +56,24 @@ def test_what_is_long_says_a_line_now_and_then(bars: Bars, clock: Clock, said: l
     assert said[0] == "coec: starts: 6 of 100, 5 hits"
 
 
+def test_what_is_not_counted_says_what_it_does(clock: Clock, said: list[str]) -> None:
+    with Bars(Console(file=io.StringIO()), said.append, counted=False, now_s=clock) as bars:
+        task = bars.add_task("processes", total=None, note="")
+        clock.now_s += LINE_S
+        bars.update(task, description="the daemon starts")
+        clock.now_s += LINE_S
+        bars.update(task, note="3 s left")
+    assert said == ["coec: the daemon starts", "coec: the daemon starts: 3 s left"]
+
+
+def test_a_download_says_how_much_is_there(clock: Clock, said: list[str]) -> None:
+    with Bars(Console(file=io.StringIO()), said.append, counted=False, now_s=clock) as bars:
+        heard = bars.add_download("a window")
+        clock.now_s += LINE_S
+        heard(1_500_000, 12_000_000)
+    assert said == ["coec: a window: 1.5 of 12.0 MB"]
+
+
 def test_a_compiler_at_work_is_said_once_and_then_now_and_then(bars: Bars, clock: Clock, said: list[str]) -> None:
     with bars:
         compile_news.tell("first")

@@ -274,7 +274,6 @@ class _Fetch:
 
         def fetch() -> None:
             with console.progress(counted=False) as bars:
-                task = bars.add_task(recording_id, note="")
                 info = fetch_window(
                     self.session,
                     self.keys,
@@ -283,7 +282,7 @@ class _Fetch:
                     self.folder / name,
                     self.options.timeout_s,
                     self.options.patience_s,
-                    lambda done, total: bars.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} MB"),
+                    bars.add_download(recording_id),
                 )
             self.files[name] = FetchedFile(name=name, sha256=str(info.sha256), size_bytes=info.size_bytes)
             found.append(info)

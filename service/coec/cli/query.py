@@ -316,7 +316,6 @@ def _download(options: Options, way: Way, keys: Keys, window_id: str) -> int:
     with connected_by(way, options.timeout_s) as session, console.progress(counted=False) as bars:
         pair = _pair_of(session, options, keys, window_id)
         single_key(keys.window(pair, window_id))
-        task = bars.add_task(window_id, note="")
         info = fetch_window(
             session,
             keys,
@@ -325,7 +324,7 @@ def _download(options: Options, way: Way, keys: Keys, window_id: str) -> int:
             options.output,
             options.timeout_s,
             PATIENCE_S,
-            lambda done, total: bars.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} MB"),
+            bars.add_download(window_id),
         )
     if options.as_json:
         console.print_json({"path": str(options.output), **info.model_dump(mode="json")})

@@ -8,7 +8,16 @@ from types import TracebackType
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 from coec.geometry import compile_news
 
@@ -60,6 +69,7 @@ class Bars(Progress):
     ) -> None:
         """`say` prints a line; `counted` shows how many of how many parts are done."""
         self._say = say
+        self._counted = counted
         self._now_s = now_s
         self._told_s = now_s()
         self._news = CompilingNews(now_s)
@@ -87,14 +97,27 @@ class Bars(Progress):
         super().__exit__(kind, error, at)
         self._listening.__exit__(None, None, None)
 
+    def add_download(self, description: str) -> Callable[[int, int], None]:
+        """Adds a task that is told, by a call of what this returns, how many bytes are there and how many there will
+        be."""
+        task = self.add_task(description, note="")
+
+        def heard(done: int, total: int) -> None:
+            self.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} of {total / 1e6:.1f} MB")
+
+        return heard
+
     def update(self, task_id: TaskID, **changes: Any) -> None:
         """Updates a task as in rich, and prints a line when it is time."""
         super().update(task_id, **changes)
         if self.disable and self._is_time():
-            task = self._tasks[task_id]
-            note = task.fields.get("note", "")
-            done = f"{task.completed:g}" + ("" if task.total is None else f" of {task.total:g}")
-            self._say(f"coec: {task.description}: {f'{done}, {note}' if note else done}")
+            self._say(f"coec: {self._line(self._tasks[task_id])}")
+
+    def _line(self, task: Task) -> str:
+        """What a task does, how far it is if that is counted, and its note."""
+        done = f"{task.completed:g}" + ("" if task.total is None else f" of {task.total:g}") if self._counted else ""
+        so_far = ", ".join(part for part in (done, task.fields.get("note", "")) if part)
+        return f"{task.description}: {so_far}" if so_far else task.description
 
     def _hear(self, kernel: str) -> None:
         self._news.hear(kernel)
