@@ -253,7 +253,9 @@ def _rings(seen: Fitness) -> Remark | None:
     if seen.rings != 1:
         return None
     return Remark(
-        "warn", "constant_ring", "The field `ring` holds one number and is ignored: beams are told by their elevation."
+        "warn",
+        "constant_ring",
+        "The field `ring` holds one number and is ignored: beams are told apart by their elevation.",
     )
 
 

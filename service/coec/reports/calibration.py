@@ -56,7 +56,9 @@ def show(
     console.show(settings_text(configuration, result.depth_identity))
     console.show(compensation_text(result.compensation))
     if any(pair.lidar.ring is not None and telling(pair.lidar.ring) is None for pair in window.pairs):
-        console.show("the field `ring` holds one number and was ignored: beams were told by their elevation", "yellow")
+        console.show(
+            "the field `ring` holds one number and was ignored: beams were told apart by their elevation", "yellow"
+        )
     for remark in remarks(camera_fit, time_offset):
         console.show(remark)
     if result.independent_looks is not None:

@@ -49,7 +49,19 @@ def _section(words: tuple[str, ...], command: Any) -> str:
     items = "".join(_item(_argument(one).strip("[]"), one) for one in arguments) + "".join(
         _item(_option(one), one) for one in options
     )
-    return f"## {_name(words)}\n\n{prose(command.help or '')}\n\n```text\n{usage}\n```\n\n{items}"
+    return f"## {_name(words)}\n\n{_help(command.help or '')}\n\n```text\n{usage}\n```\n\n{items}"
+
+
+def _help(text: str) -> str:
+    """The paragraphs of a help text; those that click prints as they are stay so."""
+    paragraphs = text.split("\n\n")
+    as_they_are = "\b\n"
+    return "\n\n".join(
+        f"```text\n{paragraph.removeprefix(as_they_are)}\n```"
+        if paragraph.startswith(as_they_are)
+        else prose(paragraph)
+        for paragraph in paragraphs
+    )
 
 
 def _item(term: str, parameter: Any) -> str:
@@ -59,7 +71,8 @@ def _item(term: str, parameter: Any) -> str:
         remarks.append(f"One of {', '.join(map(code, choices))}.")
     default = _default(parameter)
     if default is not None:
-        remarks.append(f"Default: {code(default)}.")
+        told_in_words = isinstance(default, str) and " " in default
+        remarks.append(f"Default: {prose(str(default)) if told_in_words else code(default)}.")
     elif parameter.required and term.startswith("-"):
         remarks.append("Required.")
     return f"`{term}`\n:   {' '.join(remarks)}\n\n"
