@@ -91,3 +91,7 @@ def test_rigs_share_the_roads_and_no_road_is_driven_twice() -> None:
     seeds = {drive.seed for drive in drives}
     assert len(seeds) == 2 * len(check_drives.PLACES)
     assert not seeds & {seed for _, seed in check_drives.COMMISSIONED_ON}
+
+
+def test_later_rounds_alone_are_those_that_follow() -> None:
+    assert [*check_drives.drives(1), *check_drives.drives(2, first=2)] == list(check_drives.drives(3))

@@ -27,7 +27,7 @@ def run(options: Options) -> int:
         DrivesError: a process died.
     """
     require_extra()
-    outings = list(check_drives.drives(options.rounds))
+    outings = list(check_drives.drives(options.rounds, options.first))
     drives = [drive for outing in outings for drive in outing]
     rows = {
         drive.name: row

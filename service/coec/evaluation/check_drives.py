@@ -65,10 +65,10 @@ class CheckDrive:
         return "sim:" + "&".join([*words, "ego_hz=20", RIGS[self.rig], *filter(None, [PLACES[self.place]])])
 
 
-def drives(rounds: int) -> Iterator[tuple[CheckDrive, ...]]:
-    """Every place with every rig, `rounds` times, each time with another seed, so that part of a run covers them all.
-    Drives that differ only in their lens come together."""
-    for turn in range(rounds):
+def drives(rounds: int, first: int = 1) -> Iterator[tuple[CheckDrive, ...]]:
+    """Every place with every rig, `rounds` times from round `first` on, each time with another seed, so that part of a
+    run covers them all. Drives that differ only in their lens come together."""
+    for turn in range(first - 1, first - 1 + rounds):
         for number, place in enumerate(PLACES):
             for _, rigs in groupby(RIGS, lambda rig: RIGS[rig].partition("&")[0]):
                 yield tuple(CheckDrive(rig, place, FIRST_SEED + turn * len(PLACES) + number) for rig in rigs)

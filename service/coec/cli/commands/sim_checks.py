@@ -20,6 +20,16 @@ class Options:
         int,
         typer.Option(help="Number of drives in every place with every rig, each with another seed.", min=1, max=10_000),
     ] = 4
+    first: Annotated[
+        int,
+        typer.Option(
+            "--first-round",
+            help="The round to begin with: earlier ones may have been looked at when rules were chosen.",
+            min=1,
+            max=10_000,
+            metavar="N",
+        ),
+    ] = 1
     hours: Annotated[
         float,
         typer.Option(help="Hours of driving to resample from these drives, whole drives at a time.", min=0, max=10_000),
