@@ -10,7 +10,7 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from cli.conftest import Coec
 from coec.evaluation import rig_drives
-from coec.evaluation.rig_drives import FIRST_SEED, KnockedDrive
+from coec.evaluation.knocked_drive import FIRST_SEED, KnockedDrive
 from coec.schemas.rig import RigDriveRow, RigDrivesReport
 
 
@@ -19,11 +19,11 @@ def test_what_was_drawn_is_kept_and_what_is_damaged_is_drawn_again(
 ) -> None:
     drawn: list[str] = []
 
-    def looked_at(drive: KnockedDrive) -> RigDriveRow:
+    def driven(drive: KnockedDrive) -> RigDriveRow:
         drawn.append(drive.name)
-        return RigDriveRow(name=drive.name, seed=FIRST_SEED + drive.number, camera=drive.camera, looks=())
+        return RigDriveRow(name=drive.name, seed=FIRST_SEED + drive.number, camera=drive.camera)
 
-    monkeypatch.setattr(rig_drives, "looked_at", looked_at)
+    monkeypatch.setattr(rig_drives, "driven", driven)
     words = ("sim", "rig-drives", "--output", tmp_path, "--camera", "fisheye128", "--jobs", 1)
     report = RigDrivesReport.model_validate(coec(*words, "--drives", 1, "--json").document)
     assert report.drives == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import radians
 
 import numpy as np
@@ -10,14 +11,16 @@ import pytest
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from coec.calibration.types import Matrix4
-from coec.evaluation import rig_drives
+from coec.evaluation import knocked_drive
 from coec.evaluation.check_drives import CHECK_PAIRS
+from coec.evaluation.knocked_drive import FIRST_SEED, LIDAR, KnockedDrive
 from coec.evaluation.rig_drive_statistics import KNOCKS, Knock, moves_of, report
-from coec.evaluation.rig_drives import FIRST_SEED, LIDAR, KnockedDrive, looked_at
+from coec.evaluation.rig_drive_windows import answer_ns, asked_ns, variant
+from coec.evaluation.rig_drives import driven
 from coec.evaluation.rig_looks import PERIOD_S, TURN_S, due
 from coec.geometry import se3
 from coec.schemas.replies import Vector6
-from coec.schemas.rig import Mounts, RigDriveRow, RigLook
+from coec.schemas.rig import Mounts, RigDriveRow, RigLook, RigWindow
 from coec.simulation.journey import START_NS
 from coec.simulation.rig_drive import RigDrive
 
@@ -60,6 +63,17 @@ def drawn(number: int) -> RigDriveRow:
                     )
                 )  # fmt: skip
     return RigDriveRow(name=drive.name, seed=FIRST_SEED + number, camera=CAMERA, looks=tuple(looks))
+
+
+def flagged(row: RigDriveRow, edge: str, *, weak: bool = False) -> RigDriveRow:
+    """The looks of a pair whose camera was knocked accuse the mount, if it was."""
+
+    def told(look: RigLook) -> RigLook:
+        moved = look.edge == edge and look.mounts is Mounts.CAMERA
+        late = look.pair_stamps_ns[0] - START_NS > KnockedDrive(1, CAMERA).at_s * 1e9
+        return look.model_copy(update={"flagged": True, "weak": weak, "distance2": 40.0}) if moved and late else look
+
+    return row.model_copy(update={"looks": tuple(map(told, row.looks))})
 
 
 @pytest.fixture(scope="module")
@@ -118,13 +132,46 @@ def test_one_that_nothing_tells_of_is_not_named(rows: list[RigDriveRow]) -> None
     assert (told.named_s, told.wrong) == (None, ())
 
 
+def test_a_pair_that_suspects_a_move_asks_for_windows_and_not_again_before_the_answer(rows: list[RigDriveRow]) -> None:
+    drive = KnockedDrive(1, CAMERA)
+    knock_ns, period_ns = START_NS + drive.at_s * 1e9, PERIOD_S * 1e9
+    edge = f"{drive.cameras[0]}-{LIDAR}"
+    looks, late_ns = flagged(rows[0], edge).looks, answer_ns(Mounts.CAMERA)
+    assert list(asked_ns(drive.served[edge], variant(looks, edge, Mounts.AS_BUILT), late_ns)) == []
+    first, *others = asked_ns(drive.served[edge], variant(looks, edge, Mounts.CAMERA), late_ns)
+    assert knock_ns < first < knock_ns + 4 * period_ns
+    assert all(later - earlier >= late_ns for earlier, later in pairwise([first, *others]))
+
+
+def test_where_looks_are_too_faint_an_accepted_window_names_the_camera(rows: list[RigDriveRow]) -> None:
+    drive = KnockedDrive(1, CAMERA)
+    edge = f"{drive.cameras[0]}-{LIDAR}"
+    faint = flagged(rows[0], edge, weak=True)
+    begin_ns = START_NS + round((drive.at_s + 8.0) * 1e9)
+    offset = se3.difference(truth(drive, drive.cameras[0], Mounts.CAMERA, begin_ns), drive.served[edge])
+    noise = np.diag(np.array([radians(0.03)] * 3 + [0.01] * 3) ** 2)
+    known_ns = begin_ns + 20_500_000_000
+    window = RigWindow.model_validate(
+        {
+            "edge": edge, "mounts": Mounts.CAMERA, "first_ns": begin_ns, "last_ns": begin_ns + 20_000_000_000,
+            "known_ns": known_ns, "accepted": True, "reasons": (), "offset": six(offset), "noise": noise.tolist(),
+            "systematic": {},
+        }
+    )  # fmt: skip
+    refused = window.model_copy(update={"accepted": False})
+    assert moves_of(faint.model_copy(update={"windows": (refused,)}), ONE_CAMERA).named_s is None
+    named = moves_of(faint.model_copy(update={"windows": (window,)}), ONE_CAMERA)
+    assert named.named_s == pytest.approx((known_ns - START_NS) / 1e9 - drive.at_s)
+    assert named.wrong == ()
+
+
 @pytest.mark.slow
 def test_a_drive_is_drawn_and_looked_at_pair_by_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """As small and short as it goes: what the looks say of so few pixels is of no interest."""
-    monkeypatch.setattr(rig_drives, "AT_S", (6.5, 6.6))
-    monkeypatch.setattr(rig_drives, "AFTER_S", 2.0)
+    monkeypatch.setattr(knocked_drive, "AT_S", (6.5, 6.6))
+    monkeypatch.setattr(knocked_drive, "AFTER_S", 2.0)
     drive = KnockedDrive(0, "fisheye64")
-    row = looked_at(drive)
+    row = driven(drive)
     assert row.failure is None
     assert (row.name, row.seed) == (f"fisheye64_{FIRST_SEED}", FIRST_SEED)
     as_built = [look for look in row.looks if look.mounts is Mounts.AS_BUILT]

@@ -22,14 +22,15 @@ def run(options: Options) -> int:
     """
     require_extra()
     from coec.evaluation import rig_drive_statistics, rig_drives
+    from coec.evaluation.knocked_drive import KnockedDrive
 
-    drives = [rig_drives.KnockedDrive(number, options.camera) for number in range(options.drives)]
+    drives = [KnockedDrive(number, options.camera) for number in range(options.drives)]
     paths = {drive.name: options.output / "drives" / f"{drive.name}.json" for drive in drives}
     rows = {name: row for name, path in paths.items() if (row := output.kept(path, RigDriveRow)) is not None}
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
         waiting = [drive for drive in drives if drive.name not in rows]
-        for row in finished(rig_drives.looked_at, waiting, options.jobs):
+        for row in finished(rig_drives.driven, waiting, options.jobs):
             output.replace(paths[row.name], to_json(row))
             rows[row.name] = row
             bars.update(task, advance=1, note=row.name)

@@ -1,28 +1,21 @@
-"""Which sensor moved on rendered drives of a rig: attribution and alarms of the pairs, run on looks taken before."""
+"""Which sensor moved on rendered drives of a rig: attribution and alarms of the pairs, run on looks and windows
+taken before."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from coec.calibration.lifecycle import PairState, Provenance, Rules, Status, after_observation
-from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation
-from coec.calibration.monitor.sensor_faults import CAUSES
-from coec.calibration.rig.attribution import RigState, after_look, begun, sensors, served
+from coec.calibration.lifecycle import after_observation
+from coec.calibration.monitor.change_detector import Finding
+from coec.calibration.rig.attribution import RigState, after_look, after_window, begun, sensors, served
 from coec.calibration.rig.evidence import of_check
-from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
-from coec.evaluation.check_drives import CHECK_PAIRS
-from coec.evaluation.rig_drives import FIRST_SEED, LIDAR, KnockedDrive
+from coec.evaluation.knocked_drive import FIRST_SEED, LIDAR, KnockedDrive
+from coec.evaluation.rig_drive_windows import NS_PER_S, RULES, look_of, observation_of, pair_at, variant
 from coec.evaluation.rig_evidence import WINDOW
-from coec.evaluation.rig_looks import PERIOD_S
 from coec.evaluation.rig_moves import ALLOWED_S, MOVED
-from coec.schemas.rig import Mounts, RigDriveMoves, RigDriveRow, RigDrivesReport, RigDrivesRow, RigLook
+from coec.schemas.rig import Mounts, RigDriveMoves, RigDriveRow, RigDrivesReport, RigDrivesRow, RigLook, RigWindow
 from coec.simulation.journey import START_NS
-
-NS_PER_S = 1_000_000_000
-RULES = Rules(PolicyConfig(), TrackerConfig(), MonitorConfig(period_s=PERIOD_S, pairs=CHECK_PAIRS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +43,7 @@ def report(rows: Sequence[RigDriveRow], camera: str) -> RigDrivesReport:
     """All figures of the rows."""
     good = [row for row in rows if row.failure is None]
     looks = [look for row in good for look in row.looks]
+    windows = [window for row in good for window in row.windows]
     return RigDrivesReport(
         allowed_s=ALLOWED_S,
         camera=camera,
@@ -58,6 +52,8 @@ def report(rows: Sequence[RigDriveRow], camera: str) -> RigDrivesReport:
         looks=len(looks),
         faint=sum(look.weak for look in looks),
         blind=sum(bool(look.causes) for look in looks),
+        windows=len(windows),
+        accepted=sum(window.accepted for window in windows),
         moves=tuple(_row(knock, good) for knock in KNOCKS),
     )
 
@@ -76,13 +72,13 @@ def _row(knock: Knock, rows: Sequence[RigDriveRow]) -> RigDrivesRow:
 def moves_of(row: RigDriveRow, knock: Knock) -> RigDriveMoves:
     """What was named on one drive with one fault. Where no sensor moved, the drive is right after 0 s if none is ever
     named."""
-    drive = KnockedDrive(row.seed - FIRST_SEED, row.camera)
+    drive = _drive(row)
     who = knock.sensors(drive)
     named_s: float | None = None if who else 0.0
     alarm_s: float | None = None
     wrong: set[str] = set()
     wrong_s: float | None = None
-    for at_s, named, alarmed in _told(drive, _looks_of(row, who)):
+    for at_s, named, alarmed in _told(row, who):
         late_s = at_s - drive.at_s
         if late_s > ALLOWED_S:
             break
@@ -100,44 +96,41 @@ def moves_of(row: RigDriveRow, knock: Knock) -> RigDriveMoves:
     )  # fmt: skip
 
 
-def _looks_of(row: RigDriveRow, who: frozenset[str]) -> Iterator[RigLook]:
-    """The variant of each look in which the sensors `who` have moved."""
-    taken: dict[tuple[str, int], dict[Mounts, RigLook]] = {}
-    for look in row.looks:
-        taken.setdefault((look.edge, look.pair_stamps_ns[-1]), {})[look.mounts] = look
-    for (edge, _), by_mounts in taken.items():
-        camera, _, lidar = edge.partition("-")
-        moved = Mounts.LIDAR if lidar in who else Mounts.CAMERA if camera in who else Mounts.AS_BUILT
-        yield by_mounts.get(moved, by_mounts[Mounts.AS_BUILT])
-
-
-def _told(drive: KnockedDrive, looks: Iterator[RigLook]) -> Iterator[tuple[float, frozenset[str], frozenset[str]]]:
-    """After each look: the second of the drive, the sensors named, and the pairs that have confirmed a move."""
+def _told(row: RigDriveRow, who: frozenset[str]) -> Iterator[tuple[float, frozenset[str], frozenset[str]]]:
+    """After each look and each accepted window of a drive on which the sensors `who` moved: the second of the drive,
+    the sensors named, and the pairs that have confirmed a move."""
+    drive = _drive(row)
     graph = drive.graph
     state: RigState = begun(graph)
     for edge, pose in drive.served.items():
         state = served(state, edge, pose, WINDOW)
-    pairs = {
-        edge: PairState(pose, Provenance.ESTIMATED, Status.ACCEPTED, START_NS, monitor=MonitorState(vouched=True))
-        for edge, pose in drive.served.items()
-    }
-    for look in looks:
-        observation = observation_of(look)
-        pairs[look.edge] = pair = after_observation(pairs[look.edge], observation, RULES)
-        pose = drive.served[look.edge]
-        evidence = of_check(look.edge, pose, observation, stepped_ns=pair.flagged_since_ns)
-        if evidence is not None:
-            state = after_look(state, graph, evidence)
+    pairs = {edge: pair_at(pose) for edge, pose in drive.served.items()}
+    for known_ns, told in _heard(row, drive, who):
+        pose = drive.served[told.edge]
+        if isinstance(told, RigWindow):
+            if (evidence := look_of(told, pose)) is not None:
+                state = after_window(state, graph, evidence)
+        else:
+            observation = observation_of(told)
+            pairs[told.edge] = pair = after_observation(pairs[told.edge], observation, RULES)
+            evidence = of_check(told.edge, pose, observation, stepped_ns=pair.flagged_since_ns)
+            if evidence is not None:
+                state = after_look(state, graph, evidence)
         named = frozenset(one.name for one in sensors(state, graph) if one.health in MOVED)
         sure = frozenset(name for name, of in pairs.items() if of.monitor.outcome is Finding.CONFIRMED)
-        yield (observation.stamp_ns - START_NS) / NS_PER_S, named, sure
+        yield (known_ns - START_NS) / NS_PER_S, named, sure
 
 
-def observation_of(look: RigLook) -> Observation:
-    """The look as the change detector takes it, without the figures that decide nothing."""
-    offset, sigma, noise, place = (np.array(six) for six in (look.offset, look.sigma, look.noise, look.place))
-    return Observation(
-        stamp_ns=look.pair_stamps_ns[-1], pair_stamps_ns=look.pair_stamps_ns, metrics=(), offset=offset, sigma=sigma,
-        noise=noise, place=place, dispersion=look.dispersion, distance2=look.distance2, flagged=look.flagged,
-        weak=look.weak, flagged_by_paper=None, causes=tuple(CAUSES[code] for code in look.causes),
-    )  # fmt: skip
+def _heard(row: RigDriveRow, drive: KnockedDrive, who: frozenset[str]) -> list[tuple[int, RigLook | RigWindow]]:
+    """The looks and accepted windows at each pair with the sensors `who` moved, by the stamp at which they count."""
+    heard: list[tuple[int, RigLook | RigWindow]] = []
+    for edge in drive.graph.edges:
+        mounts = Mounts.LIDAR if edge.b in who else Mounts.CAMERA if edge.a in who else Mounts.AS_BUILT
+        heard += [(look.pair_stamps_ns[-1], look) for look in variant(row.looks, edge.name, mounts)]
+        of_edge = (one for one in row.windows if (one.edge, one.mounts) == (edge.name, mounts))
+        heard += [(window.known_ns, window) for window in of_edge if window.accepted]
+    return sorted(heard, key=lambda one: (one[0], one[1].edge))
+
+
+def _drive(row: RigDriveRow) -> KnockedDrive:
+    return KnockedDrive(row.seed - FIRST_SEED, row.camera)

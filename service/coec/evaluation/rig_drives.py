@@ -1,150 +1,75 @@
 """Rendered drives of a rig on which sensors are knocked. Each drive is drawn twice, with the rig as it was built and
-with the knocked sensors displaced, and every pair is looked at. `rig_drive_statistics` later asks which sensor moved.
-
-All faults of one drive number share a street, so the frames of a sensor that did not move are the same in all of them.
+with the knocked sensors displaced. Every pair is looked at, and windows of pairs that suspect a move are solved.
+`rig_drive_statistics` later asks which sensor moved.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from math import degrees, radians
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.monitor.sensors import PreparedSweep, prepare_sweep
-from coec.calibration.rig.types import RigGraph
-from coec.calibration.types import FramePair, LidarFrame, Matrix4
+from coec.calibration.types import FramePair, LidarFrame
 from coec.errors import CoecError
 from coec.evaluation.check_drives import CHECK_PAIRS
-from coec.evaluation.rig_evidence import WINDOW
-from coec.evaluation.rig_looks import ROWS, TURN_S, SeenPair, due, graph_of, look_at
-from coec.geometry import se3
-from coec.geometry.vectors import random_direction
+from coec.evaluation.knocked_drive import FIRST_SEED, LIDAR, KnockedDrive
+from coec.evaluation.rig_drive_windows import urgent_windows
+from coec.evaluation.rig_looks import TURN_S, SeenPair, due, look_at
 from coec.schemas.replies import Vector6
 from coec.schemas.rig import Mounts, RigDriveRow, RigLook
-from coec.simulation.faults import SensorFault, Step
 from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigConfig, RigDrive
 from coec.simulation.rig_instants import Instant, instants, pair_of
 
-LIDAR = "roof"
-"""Name of the rig's LiDAR; the rig has four fisheyes and one LiDAR of 64 beams."""
-
-AT_S = (16.0, 22.0)
-"""Sensors are knocked at a random time within these, seconds of the drive: after two or three looks at every pair."""
-
-AFTER_S = 60.5
-"""Driving after the knock: as long as an alarm may take, and long enough that the last pair is begun."""
-
-STEP_RAD = radians(1.0)
-
-FIRST_SEED = 1_760_001
-"""Beyond all seeds from which anything was learned."""
+Seen = Mapping[tuple[str, Mounts], SeenPair]
+"""The pairs of an instant by camera, and by which of their sensors has moved."""
 
 
-@dataclass(frozen=True)
-class KnockedDrive:
-    """A drive by its number.
-
-    Attributes:
-        camera: model of every camera, `fisheyeW`.
-    """
-
-    number: int
-    camera: str
-
-    @property
-    def name(self) -> str:
-        """What it is called."""
-        return f"{self.camera}_{FIRST_SEED + self.number}"
-
-    @cached_property
-    def _drawn(self) -> tuple[float, tuple[str, str], dict[str, NDArray[np.float64]]]:
-        rng = np.random.default_rng([FIRST_SEED, self.number])
-        one, other = (str(name) for name in rng.permutation(RigConfig().drive().cameras)[:2])
-        at_s = float(rng.uniform(*AT_S))
-        turns = {name: STEP_RAD * random_direction(rng) for name in (one, other, LIDAR)}
-        return at_s, (one, other), turns
-
-    @property
-    def at_s(self) -> float:
-        """When sensors are knocked."""
-        return self._drawn[0]
-
-    @property
-    def cameras(self) -> tuple[str, str]:
-        """The cameras that may be knocked: a fault takes the first alone, or both."""
-        return self._drawn[1]
-
-    @cached_property
-    def right(self) -> RigDrive:
-        """As the rig was built."""
-        return self._config(()).drive()
-
-    @cached_property
-    def knocked(self) -> RigDrive:
-        """Both cameras and the LiDAR turned, each about an axis of its own."""
-        faults = []
-        for name, turn in self._drawn[2].items():
-            rx, ry, rz = (degrees(angle) for angle in turn)
-            faults.append(SensorFault(name, Step(self.at_s, float("inf"), rx=rx, ry=ry, rz=rz)))
-        return self._config(tuple(faults)).drive()
-
-    @cached_property
-    def graph(self) -> RigGraph:
-        """As the rig was built."""
-        return graph_of(self.right, LIDAR)
-
-    @cached_property
-    def served(self) -> dict[str, Matrix4]:
-        """Served extrinsic (4, 4) of each pair: off the truth by as much as windows are (`WINDOW`)."""
-        rng = np.random.default_rng([FIRST_SEED, self.number, 1])
-        return {edge.name: se3.perturb(edge.T_a_b, WINDOW * rng.normal(size=6)) for edge in self.graph.edges}
-
-    def _config(self, faults: tuple[SensorFault, ...]) -> RigConfig:
-        seconds = self.at_s + AFTER_S
-        return RigConfig(
-            seed=FIRST_SEED + self.number, seconds=seconds, camera=self.camera, ego_hz=20.0, faults=faults, rows=ROWS
-        )  # fmt: skip
-
-
-def looked_at(drive: KnockedDrive) -> RigDriveRow:
-    """All looks of a drive; an error becomes the row's `failure`.
+def driven(drive: KnockedDrive) -> RigDriveRow:
+    """All looks and urgent windows of a drive; an error becomes the row's `failure`.
 
     Raises:
         UsageError: there is no such camera.
     """
     stops = instants(drive.right, LIDAR, TURN_S)
-    row = RigDriveRow(name=drive.name, seed=FIRST_SEED + drive.number, camera=drive.camera, looks=())
+    row = RigDriveRow(name=drive.name, seed=FIRST_SEED + drive.number, camera=drive.camera)
     try:
-        looks = tuple(_looks(drive, stops))
+        seen = [_seen(drive, instant) for instant in stops]
+        looks = tuple(_looks(drive, seen))
+        frames = {key: [of.frames for of in _of(seen, *key)] for key in _variants(drive)}
+        windows = tuple(urgent_windows(drive, frames, looks))
     except CoecError as error:
         return row.model_copy(update={"failure": f"{type(error).__name__}: {error}"})
-    return row.model_copy(update={"looks": looks})
+    return row.model_copy(update={"looks": looks, "windows": windows})
 
 
-def _looks(drive: KnockedDrive, stops: Sequence[Instant]) -> Iterator[RigLook]:
+def _variants(drive: KnockedDrive) -> Iterator[tuple[str, Mounts]]:
+    """Each camera as built, with the LiDAR moved, and moved itself if it is one of those that may be knocked."""
+    for camera in drive.right.cameras:
+        yield from ((camera, mounts) for mounts in Mounts if mounts is not Mounts.CAMERA or camera in drive.cameras)
+
+
+def _of(seen: Sequence[Seen], camera: str, mounts: Mounts) -> list[SeenPair]:
+    """The pairs of a camera, from the knock on with its sensors as `mounts` says."""
+    pairs = (one.get((camera, mounts)) or one.get((camera, Mounts.AS_BUILT)) for one in seen)
+    return [pair for pair in pairs if pair is not None]
+
+
+def _looks(drive: KnockedDrive, seen: Sequence[Seen]) -> Iterator[RigLook]:
     """In the order of their stamps."""
-    kept: deque[dict[tuple[str, Mounts], SeenPair]] = deque(maxlen=CHECK_PAIRS)
-    for number, instant in enumerate(stops):
-        kept.append(_seen(drive, instant))
-        for camera in due(number + 1, drive.right.cameras):
-            yield from _looks_of(drive, camera, list(kept))
+    for number in range(1, len(seen) + 1):
+        for camera in due(number, drive.right.cameras):
+            yield from _looks_of(drive, camera, seen[max(number - CHECK_PAIRS, 0) : number])
 
 
-def _looks_of(drive: KnockedDrive, camera: str, kept: list[dict[tuple[str, Mounts], SeenPair]]) -> Iterator[RigLook]:
+def _looks_of(drive: KnockedDrive, camera: str, latest: Sequence[Seen]) -> Iterator[RigLook]:
     """Looks at one pair: with all sensors as built, and with each sensor moved that has moved in its latest frames."""
     rig = drive.right.pair(camera, LIDAR).rig
     for mounts in Mounts:
-        if (camera, mounts) not in kept[-1] and mounts is not Mounts.AS_BUILT:
+        if (camera, mounts) not in latest[-1] and mounts is not Mounts.AS_BUILT:
             continue
-        seen = [one.get((camera, mounts)) or one.get((camera, Mounts.AS_BUILT)) for one in kept]
-        pairs = [pair for pair in seen if pair is not None]
-        told = look_at(rig, drive.served[rig.pair], pairs)
+        told = look_at(rig, drive.served[rig.pair], _of(latest, camera, mounts))
         yield RigLook(
             edge=rig.pair, mounts=mounts, pair_stamps_ns=told.pair_stamps_ns, offset=_six(told.offset),
             sigma=_six(told.sigma), noise=_six(told.noise), place=_six(told.place), dispersion=told.dispersion,

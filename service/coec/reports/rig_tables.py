@@ -70,7 +70,8 @@ def show_drives(report: RigDrivesReport) -> None:
             elif one.named_s is None:
                 console.show(f"  {one.name}, {row.fault}: {' and '.join(one.moved)} not named")
     of = f"{report.looks} looks on {report.drives} drives with {report.camera}"
-    console.show(f"{of}: {report.faint} faint, {report.blind} blind; {report.failed} drives failed")
+    windows = f"{report.windows} urgent windows: {report.accepted} accepted"
+    console.show(f"{of}: {report.faint} faint, {report.blind} blind; {windows}; {report.failed} drives failed")
 
 
 def _ratio(of_all: float, per_axis: Sequence[float]) -> str:

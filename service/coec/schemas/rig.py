@@ -8,7 +8,7 @@ from enum import StrEnum
 from pydantic import Field
 
 from coec.schemas.base import Message, Part
-from coec.schemas.replies import Count, Vector6
+from coec.schemas.replies import Count, Maybe6x6, Vector6
 
 
 class MovesRow(Part):
@@ -94,13 +94,30 @@ class RigLook(Part):
     causes: tuple[str, ...]
 
 
+class RigWindow(Part):
+    """One urgent window of one pair of a rendered rig: what `calibration.tracker.Measurement` takes. Radians and
+    metres."""
+
+    edge: str
+    mounts: Mounts
+    first_ns: int = Field(description="stamp of its first pair of frames")
+    last_ns: int = Field(description="stamp of its last pair of frames")
+    known_ns: int = Field(description="when its answer counts")
+    accepted: bool
+    reasons: tuple[str, ...] = Field(description="codes of the reasons for which it was refused")
+    offset: Vector6 = Field(description="from the extrinsic that the pair serves")
+    noise: Maybe6x6
+    systematic: dict[str, Vector6]
+
+
 class RigDriveRow(Message):
-    """All looks of one rendered drive of a rig, in the order of their stamps."""
+    """All looks at one rendered drive of a rig, in the order of their stamps, and its urgent windows."""
 
     name: str
     seed: Count
     camera: str = Field(description="lens of every camera of the rig, such as `fisheye350`")
-    looks: tuple[RigLook, ...]
+    looks: tuple[RigLook, ...] = ()
+    windows: tuple[RigWindow, ...] = ()
     failure: str | None = Field(default=None, description="why the drive has no result")
 
 
@@ -133,4 +150,6 @@ class RigDrivesReport(Message):
     looks: Count
     faint: Count = Field(description="looks with faint edges")
     blind: Count = Field(description="looks with something wrong in their data")
+    windows: Count = Field(description="urgent windows whose answers came before the end of their drive")
+    accepted: Count = Field(description="how many of these were accepted")
     moves: tuple[RigDrivesRow, ...]

@@ -28,9 +28,9 @@ def run(options: Options) -> int:
     """Measure on rendered drives how well the sensors of a rig that moved are named, and no others.
 
     A drive is a minute and a half of a street with four fisheyes and a LiDAR, drawn as the rig was built and with two
-    cameras and the LiDAR knocked by 1°; it takes some minutes of one core. Only the image rows that the LiDAR
-    sees are rendered. Finished drives are kept in DIR: call again, with more drives, to go on. A DIR holds results of
-    one state of the code.
+    cameras and the LiDAR knocked by 1°; it takes some minutes of one core. Pairs that suspect a move have a window, as
+    on the vehicle. Only the image rows that the LiDAR sees are rendered. Finished drives are kept in DIR: call again,
+    with more drives, to go on. A DIR holds results of one state of the code.
     """
     from coec.cli import sim_rig_drives as work
 
