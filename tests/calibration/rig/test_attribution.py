@@ -19,11 +19,12 @@ from coec.calibration.rig.attribution import (
     sensors,
     served,
 )
-from coec.calibration.rig.evidence import information_of
+from coec.calibration.rig.evidence import information_of, of_window
 from coec.calibration.rig.types import Edge, Kind, Link, RigGraph, Sensor
-from coec.calibration.types import Matrix4
+from coec.calibration.tracker import Measurement
+from coec.calibration.types import Matrix4, Uncertainty
 from coec.geometry import se3
-from rigs import PLACE, POSES, SIGMA, TURN, driven, graph, look, with_moved
+from rigs import NS, PLACE, POSES, SIGMA, TURN, driven, graph, look, with_moved
 
 STAR = (("front", "roof"), ("left", "roof"), ("rear", "roof"))
 MOVED = {SensorHealth.CAMERA_MOVED, SensorHealth.LIDAR_MOVED}
@@ -134,6 +135,50 @@ def test_a_camera_whose_only_pair_suspects_nothing_is_not_named() -> None:
 def test_a_camera_that_stepped_farther_than_streets_bend_is_named_though_its_pair_suspects_nothing() -> None:
     """What is served was a little off, and the knock went across it."""
     assert _looked_at(with_moved("front"), ()) == {"front"}
+
+
+FAINT = 40.0
+"""Information of faint looks: so many times less."""
+
+
+def _few_looks_before(offset: np.ndarray) -> RigState:
+    """A star whose served poses windows told. The front camera's pair was looked at faintly before it moved by an
+    offset, and clearly after it: not clearly enough against a bias of its looks."""
+    rig, rng = graph(STAR), np.random.default_rng(3)
+    state = begun(rig)
+    for edge in rig.edges:
+        state = served(state, edge.name, edge.T_a_b, SIGMA)
+    after = {**POSES, "front": se3.perturb(POSES["front"], offset)}
+    for turn in range(12):
+        for place, edge in enumerate(rig.edges):
+            poses = POSES if turn < 3 else after
+            seen = look(edge, poses, 5.0 * turn + 0.5 * place, SIGMA * rng.normal(size=6))
+            if turn < 3:
+                seen = replace(seen, information=seen.information / FAINT, weak=True)
+            state = after_look(state, rig, seen)
+    return state
+
+
+@pytest.mark.fault(
+    "a camera is knocked before a clear look at it, so its looks may be biased",
+    "undecided by looks; an accepted window of its pair, compared with the windows of before, names it",
+)
+def test_a_window_compared_with_earlier_windows_tells_what_biased_looks_cannot() -> None:
+    rig, offset = graph(STAR), 0.6 * TURN
+    state = _few_looks_before(offset)
+    assert _named(state, rig) == set()
+    edge = rig.edges[0]
+    after = {**POSES, "front": se3.perturb(POSES["front"], offset)}
+    measured = Measurement(after["front"] @ se3.inverse(POSES["roof"]), Uncertainty.independent(SIGMA), 40 * NS)
+    window = of_window(edge.name, measured)
+    assert window is not None
+    assert _named(after_window(state, rig, window), rig) == {"front"}
+    denies = of_window(edge.name, replace(measured, T_camera_lidar=edge.T_a_b))
+    assert denies is not None
+    denied = after_window(state, rig, denies)
+    assert _named(denied, rig) == set()
+    assert denied.posterior is not None
+    assert denied.posterior.sensors["front"] < 0.5
 
 
 def test_a_window_of_before_the_step_is_no_answer() -> None:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from coec.calibration.monitor.change_detector import Observation
-from coec.calibration.monitor.likelihood import WEAK_TIMES
+from coec.calibration.monitor.likelihood import BAD_SHARE, WEAK_TIMES
 from coec.calibration.monitor.sensor_faults import CAUSES
-from coec.calibration.rig.evidence import BIAS_TIMES, of_check, of_window
-from coec.calibration.rig.steps import MOST_LOOKS, History, steps_at
+from coec.calibration.rig.evidence import BIAS_TIMES, Look, of_check, of_window
+from coec.calibration.rig.steps import MOST_LOOKS, REACH, History, steps_at
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Uncertainty
 from coec.geometry import se3
@@ -102,3 +102,58 @@ def test_old_looks_are_counted_together_in_calm_and_forgotten_in_doubt() -> None
     assert len(calm.looks) == len(doubt.looks) == MOST_LOOKS
     np.testing.assert_allclose(calm.mean, PLACE, rtol=0.15)
     np.testing.assert_array_equal(doubt.mean, 0.0)
+
+
+def window(xi: np.ndarray, sigma: np.ndarray, at_s: float) -> Look:
+    """An accepted one that puts the edge at ξ from where it was."""
+    found = of_window(
+        EDGE.name, Measurement(se3.perturb(EDGE.T_a_b, xi), Uncertainty.independent(sigma), round(at_s * NS))
+    )
+    assert found is not None
+    return found
+
+
+def test_a_window_against_an_origin_that_windows_told_is_known_better_than_the_bias_of_looks() -> None:
+    known = History.served(EDGE.T_a_b, SIGMA)
+    steps = steps_at(known.after(window(TURN, SIGMA, 9.0), calm=True), [5 * NS])
+    np.testing.assert_allclose(steps.xi[0], TURN, atol=1e-3)
+    np.testing.assert_allclose(np.sqrt(steps.covariance[0].diagonal()), np.sqrt(2.0) * SIGMA, rtol=1e-2)
+    assert steps.looks[0] == 1.0
+    unknown = History.at(EDGE.T_a_b, SIGMA).after(window(TURN, SIGMA, 9.0), calm=True)
+    assert np.sqrt(steps_at(unknown, [5 * NS]).covariance[0, 1, 1]) > BIAS_TIMES * BIAS[1]
+
+
+def test_what_a_window_says_of_a_step_is_the_integral_over_all_steps() -> None:
+    """Of one axis, by the sum over a grid."""
+    sigma = np.array([SIGMA[0], *[np.nan] * 5])
+    known = History.served(EDGE.T_a_b, sigma)
+    looked = known
+    for turn in range(4):
+        looked = looked.after(look(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
+    for off in (0.0, 2.0 * SIGMA[0], 8.0 * TURN[1]):
+        seen = window(np.array([off, *[0.0] * 5]), sigma, 9.0)
+        before, after = (
+            (steps_at(looked, [20 * NS, 2 * NS])),
+            steps_at(looked.after(seen, calm=True), [20 * NS, 2 * NS]),
+        )
+        density = np.log(normal(off, 2.0 * SIGMA[0] ** 2) * (1.0 - BAD_SHARE) + normal(off, REACH[0] ** 2) * BAD_SHARE)
+        assert after.log_still - before.log_still == pytest.approx(density, abs=1e-6)
+        assert after.log_stepped[0] - before.log_stepped[0] == pytest.approx(density, abs=1e-6), "it begins before it"
+        x = np.linspace(-0.2, 0.2, 200_001)
+        step = normal(x - before.xi[1, 0], before.covariance[1, 0, 0])
+        good = np.sum(step * normal(x - off, 2.0 * SIGMA[0] ** 2)) * (x[1] - x[0])
+        density = np.log(good * (1.0 - BAD_SHARE) + normal(off, REACH[0] ** 2) * BAD_SHARE)
+        assert after.log_stepped[1] - before.log_stepped[1] == pytest.approx(density, abs=0.01)
+
+
+def normal(x: np.ndarray | float, variance: float) -> np.ndarray:
+    return np.asarray(np.exp(-0.5 * np.square(x) / variance) / np.sqrt(2.0 * np.pi * variance))
+
+
+def test_a_window_that_contradicts_all_looks_moves_no_step() -> None:
+    known = History.served(EDGE.T_a_b, SIGMA)
+    for turn in range(8):
+        known = known.after(look(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
+    steps = steps_at(known.after(window(10.0 * TURN, SIGMA, 9.0), calm=True), [4 * NS])
+    np.testing.assert_allclose(steps.xi[0], 0.0, atol=1e-6)
+    assert steps.looks[0] == pytest.approx(4.0, abs=0.2)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.quantiles import chi2_quantile
-from coec.calibration.rig.evidence import BIAS_TIMES, Look
+from coec.calibration.rig.evidence import Look
 from coec.calibration.rig.moves import SEEN, Moved, Posterior, who_moved
 from coec.calibration.rig.steps import History, steps_at
 from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
@@ -145,7 +145,7 @@ def served(state: RigState, edge: str, T_a_b: Matrix4, sigma: NDArray[np.float64
     """
     if edge not in state.histories:
         raise ValueError(f"{edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
-    return replace(state, histories={**state.histories, edge: History.at(T_a_b, sigma)})
+    return replace(state, histories={**state.histories, edge: History.served(T_a_b, sigma)})
 
 
 def settled(state: RigState) -> RigState:
@@ -157,7 +157,7 @@ def settled(state: RigState) -> RigState:
 def stepped(state: RigState) -> tuple[str, ...]:
     """The edges that lie elsewhere since `stepped_ns` than before, by more than chance."""
     return tuple(
-        name for name, history in state.histories.items() if history.looks and _stepped(history, state.stepped_ns)
+        name for name, history in state.histories.items() if history.told and _stepped(history, state.stepped_ns)
     )
 
 
@@ -190,11 +190,8 @@ def _with(state: RigState, look: Look) -> RigState:
     """The state with one more look, before anybody asks who moved."""
     if look.edge not in state.histories:
         raise ValueError(f"{look.edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
-    history = state.histories[look.edge]
-    if not history.looks:
-        # The estimator that looks has its own bias on this rig, however well the served pose is known.
-        history = History.at(history.origin, np.hypot(np.nan_to_num(history.sigma), BIAS_TIMES * look.rig))
-    return replace(state, histories={**state.histories, look.edge: history.after(look, state.calm)})
+    history = state.histories[look.edge].after(look, state.calm)
+    return replace(state, histories={**state.histories, look.edge: history})
 
 
 def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
@@ -288,12 +285,13 @@ def _times_ns(histories: Mapping[str, History], stepped_ns: int) -> list[int]:
     """The stamps to try, newest first: the looks from each on may lie after a step. Times with no look between them are
     one. The likeliest time of the last answer, `stepped_ns`, and the times since which pairs suspect themselves are
     included because, unlike ages, they do not drift as looks grow old."""
-    looked = [history.looks for history in histories.values() if history.looks]
-    last_ns = sorted({looks[-1].stamp_ns for looks in looked}, reverse=True)
+    told = [history.told for history in histories.values() if history.told]
+    last_ns = sorted({looks[-1].stamp_ns for looks in told}, reverse=True)
     aged_ns = [last_ns[0] - round(age_s * NS_PER_S) for age_s in AGES_S]
     just_after = (stamp_ns + 1 for stamp_ns in last_ns[1:NEWEST])
-    suspected = sorted({looks[-1].stepped_ns for looks in looked if looks[-1].stepped_ns is not None})[:MOST_SUSPECTED]
-    all_ns = sorted({look.stamp_ns for looks in looked for look in looks})
+    latest = [history.looks[-1].stepped_ns for history in histories.values() if history.looks]
+    suspected = sorted({stamp_ns for stamp_ns in latest if stamp_ns is not None})[:MOST_SUSPECTED]
+    all_ns = sorted({look.stamp_ns for looks in told for look in looks})
     first_after = (bisect_left(all_ns, at_ns) for at_ns in (*just_after, *aged_ns, stepped_ns, *suspected))
     # The stamp of the very first look is the same as before all looks.
     found = {all_ns[place] for place in first_after if 0 < place < len(all_ns)}

@@ -48,6 +48,8 @@ class Look:
         stepped_ns: stamp of the first frame since which the pair by itself suspects a step; None if it suspects none.
             It adds a time at which a step is looked for, and a sensor with one pair is named by looks only if it is
             set.
+        window: (6, 6) if the look is an accepted window, the covariance of its error without the bias of the estimator,
+            which windows have in common; NaN on axes that it does not determine.
     """
 
     edge: str
@@ -59,6 +61,7 @@ class Look:
     share: float = 1.0
     weak: bool = False
     stepped_ns: int | None = None
+    window: NDArray[np.float64] | None = None
 
     @property
     def log_bad(self) -> float:
@@ -139,7 +142,7 @@ def of_window(edge: str, window: Measurement) -> Look | None:
     """The look that an accepted window is; None if the window determines no axis.
 
     Its frames share a street, so the errors that they have in common count as noise here. So does the bias of the
-    estimator: checks have another bias, and the difference would look like a step.
+    estimator in `information`: checks have another bias, and the difference would look like a step.
 
     Raises:
         ValueError: the pose is not rigid, or the covariance is invalid.
@@ -147,10 +150,17 @@ def of_window(edge: str, window: Measurement) -> Look | None:
     _rigid(edge, window.T_camera_lidar)
     if not window.told_axes():
         return None
-    noise = window.uncertainty.noise
-    shared = window.uncertainty.covariance - noise + np.diag((BIAS_TIMES * UNCOMMISSIONED_BIAS) ** 2)
-    covariance = np.where(np.isfinite(noise), noise + np.nan_to_num(shared), np.nan)
-    return Look(edge, window.stamp_ns, window.T_camera_lidar, information_of(covariance), STREET, UNCOMMISSIONED_BIAS)
+    covariance = window.uncertainty.covariance
+    beside_checks = covariance + np.diag((BIAS_TIMES * UNCOMMISSIONED_BIAS) ** 2)
+    return Look(
+        edge=edge,
+        stamp_ns=window.stamp_ns,
+        T_a_b=window.T_camera_lidar,
+        information=information_of(beside_checks),
+        place=STREET,
+        rig=UNCOMMISSIONED_BIAS,
+        window=covariance,
+    )
 
 
 def _rigid(edge: str, pose: Matrix4) -> None:

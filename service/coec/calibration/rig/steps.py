@@ -1,23 +1,26 @@
 """What the looks at one edge say about a step at some time: where the edge was before, where it is since, and how well
 that is known.
 
-Each side is a robust mean. A good look is Student-distributed about the place of the edge; a bad look lies anywhere
-within reach. This is the model of `monitor.likelihood`, in all six axes at once. The mean is the mode of that mixture,
-found by expectation maximisation from several looks; the likeliest end is taken.
+An accepted window tells a step by itself if what was served rests on windows, too: both have the bias of the one
+estimator, which cancels, while the bias of checks is another and may be larger than a step.
+
+Of the looks, each side is a robust mean. A good look is Student-distributed about the place of the edge; a bad look
+lies anywhere within reach. This is the model of `monitor.likelihood`, in all six axes at once. The mean is the mode of
+that mixture, found by expectation maximisation from several looks; the likeliest end is taken.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import lgamma, log, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.monitor.change_detector import ROTATIONS, TRANSLATIONS
-from coec.calibration.monitor.likelihood import FREEDOM
-from coec.calibration.rig.evidence import MOST_SIGMA, Look
+from coec.calibration.monitor.likelihood import BAD_SHARE, FREEDOM
+from coec.calibration.rig.evidence import BIAS_TIMES, MOST_SIGMA, Look
 from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
 
@@ -32,6 +35,9 @@ MEMORY_LOOKS = 360.0
 
 REACH = np.array([*ROTATIONS.reach, *TRANSLATIONS.reach])
 """(6,) standard deviation of the offsets of bad looks (rad, m)."""
+
+MOST_WINDOWS = 4
+"""Most windows of an edge that are kept: three may be urgent in one suspicion (`monitor.urgency`)."""
 
 STARTS, TURNS = 3, 5
 """Looks from which a mean is sought, and rounds of the search: the means of drawn looks stand still after four."""
@@ -48,12 +54,16 @@ class History:
         origin: (4, 4) the pose from which offsets are counted.
         information, moment: (6, 6) and (6,) what is known of the offset from before the kept looks.
         looks: the kept looks in the order of their stamps, `MOST_LOOKS` at most.
+        origin_sigma: (6,) standard deviation of the origin as windows see it; NaN on axes where that is not known.
+        windows: the latest accepted windows, `MOST_WINDOWS` at most, if `origin_sigma` is known; else they are looks.
     """
 
     origin: Matrix4
     information: Array
     moment: Array
     looks: tuple[Look, ...] = ()
+    origin_sigma: Array = field(default_factory=lambda: np.full(6, np.nan))
+    windows: tuple[Look, ...] = ()
 
     @classmethod
     def at(cls, T_a_b: Matrix4, sigma: Array) -> History:
@@ -64,9 +74,24 @@ class History:
         variance = np.where(known, np.where(known, sigma, 1.0) ** 2, MOST_SIGMA**2)
         return cls(T_a_b, np.diag(1.0 / variance), np.zeros(6))
 
+    @classmethod
+    def served(cls, T_a_b: Matrix4, sigma: Array) -> History:
+        """A history without looks of an edge that serves T_a_b (4, 4), known to `sigma` (6,) without the bias of the
+        estimator; NaN or zero where that is not known."""
+        return replace(cls.at(T_a_b, sigma), origin_sigma=np.where(sigma > 0.0, sigma, np.nan))
+
+    @property
+    def told(self) -> tuple[Look, ...]:
+        """All that is kept one by one, looks and windows, in the order of their stamps."""
+        return tuple(sorted((*self.looks, *self.windows), key=lambda one: one.stamp_ns))
+
     def after(self, look: Look, calm: bool) -> History:
         """The history with one more look. The look that drops out is counted with the older ones if all is `calm`; else
         it is forgotten, because it may be from after the step in question."""
+        if look.window is not None and np.isfinite(self.step_covariance(look.window).diagonal()).any():
+            return replace(self, windows=(*self.windows, look)[-MOST_WINDOWS:])
+        if not self.looks:
+            return replace(self._biased(BIAS_TIMES * look.rig), looks=(look,))
         looks = sorted((*self.looks, look), key=lambda one: one.stamp_ns)
         if len(looks) <= MOST_LOOKS:
             return replace(self, looks=tuple(looks))
@@ -95,6 +120,16 @@ class History:
     def pose(self) -> Matrix4:
         """(4, 4) where the edge was before the kept looks."""
         return se3.perturb(self.origin, self.mean)
+
+    def step_covariance(self, window: Array) -> Array:
+        """(6, 6) covariance of the step from the origin to where a window is, given the covariance (6, 6) of the
+        window; its diagonal is NaN on axes that either does not determine."""
+        return np.asarray(window + np.diag(self.origin_sigma**2))
+
+    def _biased(self, sigma: Array) -> History:
+        """The origin as looks see it, which may all be biased by `sigma` (6,), however well it is known otherwise."""
+        known = History.at(self.origin, np.hypot(np.nan_to_num(self.sigma), sigma))
+        return replace(self, information=known.information, moment=known.moment)
 
     def counted(self) -> History:
         """The history with all kept looks counted together with the older ones, for a rig to which nothing happened."""
@@ -150,7 +185,7 @@ def steps_at(history: History, times_ns: Sequence[int], place_times: float = 1.0
     first = np.array([look.log_bad for look in history.looks]) - again
     # The first bad look is rarer than a bad one after it.
     log_transient = (good * again).sum(axis=1) + np.max(good, axis=1, initial=0.0) * np.max(first, initial=0.0)
-    return Steps(
+    steps = Steps(
         xi,
         covariance,
         looks,
@@ -158,6 +193,47 @@ def steps_at(history: History, times_ns: Sequence[int], place_times: float = 1.0
         before.log_evidence + since.log_evidence,
         float(still.log_evidence[0]),
     )
+    for window in history.windows:
+        steps = _seen_by(window, history, steps, window.stamp_ns >= np.asarray(times_ns, np.int64))
+    return steps
+
+
+def _seen_by(window: Look, history: History, steps: Steps, after: NDArray[np.bool_]) -> Steps:
+    """The steps with what a window says of them; it begins `after` (T,) the step. Like a look, it may be bad: it is if
+    that is likelier, of a step within reach."""
+    assert window.window is not None
+    covariance = history.step_covariance(window.window)
+    axes = np.flatnonzero(np.isfinite(covariance.diagonal()))
+    own = covariance[np.ix_(axes, axes)]
+    seen = se3.difference(window.T_a_b, history.origin)[axes]
+    reach = np.diag(REACH[axes] ** 2)
+    log_good, log_bad = np.log1p(-BAD_SHARE), log(BAD_SHARE) + _log_normal(reach, seen)
+    still = np.logaddexp(log_good + _log_normal(own, seen), log_bad)
+    told, xi = steps.covariance[:, axes[:, None], axes], steps.xi[:, axes]
+    within = dense.product(reach, dense.inverse(told + reach))  # how far the looks tell the step, against its reach
+    log_likely = _log_normal(dense.product(within, told) + own, seen - dense.applied(within, xi))
+    fits = after & (log_good + log_likely > log_bad)
+    # Kalman's gain.
+    gain = dense.product(steps.covariance[:, :, axes], dense.inverse(told + own))
+    less = dense.product(gain, np.swapaxes(steps.covariance[:, :, axes], -1, -2))
+    log_said = np.where(fits, log_good + _log_normal(told + own, seen - xi), log_bad)
+    return replace(
+        steps,
+        xi=steps.xi + np.where(fits[:, None], dense.applied(gain, seen - xi), 0.0),
+        covariance=steps.covariance - np.where(fits[:, None, None], 0.5 * (less + np.swapaxes(less, -1, -2)), 0.0),
+        looks=steps.looks + fits,
+        # Looks that are bad for a while have to have a bad window beside them.
+        log_transient=steps.log_transient + np.where(fits, log(BAD_SHARE), 0.0),
+        log_stepped=steps.log_stepped + np.where(after, log_said, still),
+        log_still=steps.log_still + float(still),
+    )
+
+
+def _log_normal(covariance: Array, x: Array) -> Array:
+    """(...) logarithm of the density of a normal distribution about 0 with the covariance (..., n, n) at x (..., n)."""
+    factor = dense.cholesky(covariance)
+    q = np.sum(x * dense.solved(factor, x[..., None])[..., 0], axis=-1)
+    return np.asarray(-0.5 * (q + dense.log_determinant(factor) + x.shape[-1] * log(2.0 * pi)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
