@@ -172,15 +172,15 @@ def _timeline(event: EvidenceEvent) -> Iterable[Block]:
         return
     first, last = points[0].stamp_ns, points[-1].stamp_ns
     states = " ".join(dict.fromkeys(point.state for point in points))
-    yield Text(
-        (f"{len(points)} checks, {second(first)} to {second(last)}; states: {states}. The dashed line is the event, "
-         "the ground the state of health.",),
-        quiet=True,
-    )  # fmt: skip
     names = sorted({name for point in points for name in point.metrics})
     grounds = tuple(_grounds(points, event))
     charts = [_chart(name, points, event, grounds) for name in names[:MAX_PLOTS]]
-    yield Charts(tuple(chart for chart in charts if chart is not None), small=True)
+    drawn = tuple(chart for chart in charts if chart is not None)
+    meaning = (
+        "The dashed line is the event, the ground the state of health." if drawn else "They hold no figures to draw."
+    )
+    yield Text((f"{len(points)} checks, {second(first)} to {second(last)}; states: {states}. {meaning}",), quiet=True)
+    yield Charts(drawn, small=True)
     if len(names) > MAX_PLOTS:
         yield Text((f"{len(names) - MAX_PLOTS} figures more are in event.json.",), quiet=True)
 
