@@ -157,3 +157,16 @@ def test_a_window_that_contradicts_all_looks_moves_no_step() -> None:
     steps = steps_at(known.after(window(10.0 * TURN, SIGMA, 9.0), calm=True), [4 * NS])
     np.testing.assert_allclose(steps.xi[0], 0.0, atol=1e-6)
     assert steps.looks[0] == pytest.approx(4.0, abs=0.2)
+
+
+def test_among_looks_that_all_contradict_each_other_a_window_tells_the_right_one() -> None:
+    rng, known = np.random.default_rng(4), History.served(EDGE.T_a_b, SIGMA)
+    for turn in range(4):
+        known = known.after(look(EDGE, POSES, float(turn), SIGMA * rng.normal(size=6)), calm=True)
+    for turn in range(4, 8):
+        error = TURN if turn == 6 else radians(3.0) * rng.normal(size=6)
+        known = known.after(look(EDGE, POSES, float(turn), error), calm=True)
+    steps = steps_at(known.after(window(TURN, SIGMA, 5.0), calm=True), [4 * NS])
+    np.testing.assert_allclose(steps.xi[0], TURN, atol=4.0 * SIGMA[3])
+    np.testing.assert_allclose(steps.xi[0, :3], TURN[:3], atol=2.0 * SIGMA[0])
+    assert steps.looks[0] == pytest.approx(2.0, abs=0.1)

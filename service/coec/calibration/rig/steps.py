@@ -11,7 +11,7 @@ that mixture, found by expectation maximisation from several looks; the likelies
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from math import lgamma, log, pi
 
@@ -41,6 +41,9 @@ MOST_WINDOWS = 4
 
 STARTS, TURNS = 3, 5
 """Looks from which a mean is sought, and rounds of the search: the means of drawn looks stand still after four."""
+
+Beside = Callable[[Array, Array], Array]
+"""Of offsets (T, S, 6) and their covariances (T, S, 6, 6), the log likelihood (T, S) of what else is known."""
 
 _NOTHING = np.eye(6) / MOST_SIGMA**2
 """Information about a side of which nothing is known."""
@@ -167,18 +170,25 @@ class Steps:
 def steps_at(history: History, times_ns: Sequence[int], place_times: float = 1.0) -> Steps:
     """What the looks say of a step at each of some times: looks from that stamp on lie after the step. Places scatter
     the looks by `place_times` their usual standard deviation."""
-    stamps = np.array([look.stamp_ns for look in history.looks], np.int64)
-    after = stamps[None, :] >= np.asarray(times_ns, np.int64)[:, None]
+    stamps, times = np.array([look.stamp_ns for look in history.looks], np.int64), np.asarray(times_ns, np.int64)
+    after = stamps[None, :] >= times[:, None]
     stack = _Stack.of(history.origin, history.looks)
+    windows = [_Window.of(window, history, times) for window in history.windows]
+    place = np.max(np.array([look.place for look in history.looks]).reshape(-1, 6), axis=0, initial=0.0)
+    places = np.diag(2.0 * (place_times * place) ** 2)  # one place before, one place since
     before = stack.mean(~after, history.information, history.moment)
-    since = stack.mean(after, _NOTHING, np.zeros(6))
+
+    def told_by_windows(offset: Array, covariance: Array) -> Array:
+        """(T, S) log likelihood of all windows if the edge is at an offset (T, S, 6) since."""
+        xi, around = offset - before.offset[:, None], covariance + (before.covariance + places)[:, None]
+        return np.asarray(sum(window.log_best(xi, around) for window in windows))
+
+    since = stack.mean(after, _NOTHING, np.zeros(6), told_by_windows if windows else None)
     still = stack.mean(np.ones((1, len(history.looks)), np.bool_), history.information, history.moment)
     xi = np.zeros_like(before.offset)
     for t, (was, is_now) in enumerate(zip(before.offset, since.offset, strict=True)):
         xi[t] = se3.difference(se3.perturb(history.origin, is_now), se3.perturb(history.origin, was))
-    place = np.max(np.array([look.place for look in history.looks]).reshape(-1, 6), axis=0, initial=0.0)
-    place = place_times * place
-    covariance = before.covariance + since.covariance + np.diag(2.0 * place**2)  # one place before, one place since
+    covariance = before.covariance + since.covariance + places
     good = since.good
     looks = good.sum(axis=1)
     again = np.array([look.log_bad_again for look in history.looks])
@@ -193,40 +203,72 @@ def steps_at(history: History, times_ns: Sequence[int], place_times: float = 1.0
         before.log_evidence + since.log_evidence,
         float(still.log_evidence[0]),
     )
-    for window in history.windows:
-        steps = _seen_by(window, history, steps, window.stamp_ns >= np.asarray(times_ns, np.int64))
+    for window in windows:
+        steps = window.beside(steps)
     return steps
 
 
-def _seen_by(window: Look, history: History, steps: Steps, after: NDArray[np.bool_]) -> Steps:
-    """The steps with what a window says of them; it begins `after` (T,) the step. Like a look, it may be bad: it is if
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    """What an accepted window says of the step of its edge, whatever looks say. Like a look, it may be bad: it is if
     that is likelier, of a step within reach."""
-    assert window.window is not None
-    covariance = history.step_covariance(window.window)
-    axes = np.flatnonzero(np.isfinite(covariance.diagonal()))
-    own = covariance[np.ix_(axes, axes)]
-    seen = se3.difference(window.T_a_b, history.origin)[axes]
-    reach = np.diag(REACH[axes] ** 2)
-    log_good, log_bad = np.log1p(-BAD_SHARE), log(BAD_SHARE) + _log_normal(reach, seen)
-    still = np.logaddexp(log_good + _log_normal(own, seen), log_bad)
-    told, xi = steps.covariance[:, axes[:, None], axes], steps.xi[:, axes]
-    within = dense.product(reach, dense.inverse(told + reach))  # how far the looks tell the step, against its reach
-    log_likely = _log_normal(dense.product(within, told) + own, seen - dense.applied(within, xi))
-    fits = after & (log_good + log_likely > log_bad)
-    # Kalman's gain.
-    gain = dense.product(steps.covariance[:, :, axes], dense.inverse(told + own))
-    less = dense.product(gain, np.swapaxes(steps.covariance[:, :, axes], -1, -2))
-    log_said = np.where(fits, log_good + _log_normal(told + own, seen - xi), log_bad)
-    return replace(
-        steps,
-        xi=steps.xi + np.where(fits[:, None], dense.applied(gain, seen - xi), 0.0),
-        covariance=steps.covariance - np.where(fits[:, None, None], 0.5 * (less + np.swapaxes(less, -1, -2)), 0.0),
-        looks=steps.looks + fits,
-        # Looks that are bad for a while have to have a bad window beside them.
-        log_transient=steps.log_transient + np.where(fits, log(BAD_SHARE), 0.0),
-        log_stepped=steps.log_stepped + np.where(after, log_said, still),
-        log_still=steps.log_still + float(still),
-    )
+
+    after: NDArray[np.bool_]  # (T,) whether it begins after the step
+    axes: NDArray[np.int64]  # (n,) the axes of the step that it determines
+    xi: Array  # (n,) the step on them, if it begins after the step
+    covariance: Array  # (n, n) of it
+
+    @classmethod
+    def of(cls, window: Look, history: History, times_ns: NDArray[np.int64]) -> _Window:
+        assert window.window is not None
+        covariance = history.step_covariance(window.window)
+        axes = np.flatnonzero(np.isfinite(covariance.diagonal()))
+        xi = se3.difference(window.T_a_b, history.origin)[axes]
+        return cls(window.stamp_ns >= times_ns, axes, xi, covariance[np.ix_(axes, axes)])
+
+    @property
+    def log_bad(self) -> float:
+        """Logarithm of the chance that it is bad, times the density of a bad one."""
+        return log(BAD_SHARE) + float(_log_normal(np.diag(REACH[self.axes] ** 2), self.xi))
+
+    @property
+    def log_still(self) -> float:
+        """Log likelihood of the window if there was no step before it."""
+        return float(np.logaddexp(_LOG_GOOD + _log_normal(self.covariance, self.xi), self.log_bad))
+
+    def log_best(self, xi: Array, covariance: Array) -> Array:
+        """(T, ...) log likelihood, by the likelier of good and bad, beside a step ξ (T, ..., 6) that looks tell so well
+        (T, ..., 6, 6)."""
+        after = self.after.reshape(-1, *[1] * (xi.ndim - 2))
+        return np.where(after, np.maximum(self._log_good(xi, covariance), self.log_bad), self.log_still)
+
+    def _log_good(self, xi: Array, covariance: Array) -> Array:
+        told, reach = covariance[..., self.axes[:, None], self.axes], np.diag(REACH[self.axes] ** 2)
+        within = dense.product(reach, dense.inverse(told + reach))  # what looks tell, against the reach of a step
+        apart = self.xi - dense.applied(within, xi[..., self.axes])
+        return np.asarray(_LOG_GOOD + _log_normal(dense.product(within, told) + self.covariance, apart))
+
+    def beside(self, steps: Steps) -> Steps:
+        """The steps with what the window says of them."""
+        told, apart = steps.covariance[:, self.axes[:, None], self.axes], self.xi - steps.xi[:, self.axes]
+        fits = self.after & (self._log_good(steps.xi, steps.covariance) > self.log_bad)
+        # Kalman's gain.
+        gain = dense.product(steps.covariance[:, :, self.axes], dense.inverse(told + self.covariance))
+        less = dense.product(gain, np.swapaxes(steps.covariance[:, :, self.axes], -1, -2))
+        log_told = np.where(fits, _LOG_GOOD + _log_normal(told + self.covariance, apart), self.log_bad)
+        return replace(
+            steps,
+            xi=steps.xi + np.where(fits[:, None], dense.applied(gain, apart), 0.0),
+            covariance=steps.covariance - np.where(fits[:, None, None], 0.5 * (less + np.swapaxes(less, -1, -2)), 0.0),
+            looks=steps.looks + fits,
+            # Looks that are bad for a while have to have a bad window beside them.
+            log_transient=steps.log_transient + np.where(fits, log(BAD_SHARE), 0.0),
+            log_stepped=steps.log_stepped + np.where(self.after, log_told, self.log_still),
+            log_still=steps.log_still + self.log_still,
+        )
+
+
+_LOG_GOOD = log(1.0 - BAD_SHARE)
 
 
 def _log_normal(covariance: Array, x: Array) -> Array:
@@ -283,8 +325,9 @@ class _Stack:
         good = self.share * np.exp(log_good - density)
         return self.share * density, good * np.minimum((FREEDOM + self.axes) / (FREEDOM + q), 1.0), good
 
-    def mean(self, mask: NDArray[np.bool_], information: Array, moment: Array) -> _Means:
-        """The means of the looks in each row of a mask (T, N), combined with what else is known."""
+    def mean(self, mask: NDArray[np.bool_], information: Array, moment: Array, beside: Beside | None = None) -> _Means:
+        """The means of the looks in each row of a mask (T, N), combined with what else is known. Of several, the one is
+        taken that is likeliest by the looks and by what is known `beside` them."""
         known = dense.solved(dense.cholesky(information), moment[:, None])[:, 0]
         if not len(self.offset):
             covariance = np.broadcast_to(dense.inverse(information), (len(mask), 6, 6))
@@ -299,7 +342,11 @@ class _Stack:
         density, weight, good = self.weights(mean)
         apart = mean - known
         likely = (density * mask[:, None, :]).sum(axis=-1) - 0.5 * dense.squared(information, apart)
-        rows, best = np.arange(len(mask)), np.argmax(likely, axis=1)
+        chosen = likely
+        if beside is not None:
+            precision, _ = self._sums(weight * mask[:, None, :], information, moment)
+            chosen = likely + beside(mean, dense.inverse(precision))
+        rows, best = np.arange(len(mask)), np.argmax(chosen, axis=1)
         precision, _ = self._sums(weight[rows, best] * mask, information, moment)
         covariance = dense.inverse(precision)
         log_evidence = likely[rows, best] + _volume(covariance)
