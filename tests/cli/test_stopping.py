@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import signal
 import threading
+from collections.abc import Iterator
 
 import pytest
 
@@ -14,7 +15,16 @@ from coec.cli.stopping import no_interrupt_lost
 DEADLINE_S = 60.0
 
 
+@pytest.fixture
+def _interruptible() -> Iterator[None]:
+    """A shell has its background jobs ignore Ctrl-C, and the whole suite may be one."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.fault("Ctrl-C while a library calls back from C (the compiler does)", "it ends the command all the same")
+@pytest.mark.usefixtures("_interruptible")
 def test_ctrl_c_inside_a_call_from_c_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
     # Long enough for a busy machine to return from the call before.
     monkeypatch.setattr(stopping, "LATER_S", 1.0)
