@@ -4,7 +4,7 @@ A held camera centre, trusted clocks and a lens taken from a sheet, if wrong, le
 pose removes. They are set free one after the other, the earlier ones staying free: the centre, then the clocks, then
 the lens (a nested likelihood ratio, Wilks 1938, on the sharpest edges). The gain is compared with the scatter of frames
 and sectors of the image. How far the pose moves meanwhile is how far the assumption led it astray, as far as the window
-is believed (`belief`).
+is believed (`belief`). Where climbs end at several lenses, the one is taken that would have led it farthest astray.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from coec.calibration.confidence.belief import in_centre, in_doubt
 from coec.calibration.confidence.landscape import certainty
-from coec.calibration.confidence.told import CLOCKS, LENS, SHIFTS, SIZE, Told, levels_told, moves
-from coec.calibration.confidence.ways import Ways, climbed
+from coec.calibration.confidence.told import CLOCKS, LENS, PRINCIPAL_POINT, SHIFTS, SIZE, Told, levels_told, moves
+from coec.calibration.confidence.ways import Ways, climbed, climbed_along
 from coec.calibration.objective.cells import COLUMNS, ROWS, sectors
 from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
@@ -70,6 +70,11 @@ class Loosened:
     believed: float
 
     @property
+    def astray_rad(self) -> float:
+        """By how much the pose turns, as far as that is believed."""
+        return self.believed * hypot(*self.shift[:3].tolist())
+
+    @property
     def matters(self) -> bool:
         """Whether it moves the edges by more than the error that calibrations leave."""
         return self.moved_px >= LEAST_PX
@@ -103,9 +108,12 @@ def loosen(
         found = []
         for name, places in free:
             ways = Ways.of(levels[-1], before, base, places)
-            after = climbed(levels, ways, before)
-            found.append(_judged(name, levels[-1], ways, before, after, known_m))
-            base, before = (*base, *places), after
+            ends = [climbed(levels, ways, before)]
+            if name == LENS_FREE:
+                ends += climbed_along(PRINCIPAL_POINT, levels[-1], ways, before)
+            judged = [_judged(name, levels[-1], ways, before, after, known_m) for after in ends]
+            found.append(max(judged, key=lambda one: one.astray_rad))
+            base, before = (*base, *places), found[-1].deviation
     except ValueError:
         return ()
     return tuple(found)

@@ -29,6 +29,8 @@ camera was exposed later than assumed, by how much more at the end of the window
 more in the last row than in the first. Lens: by how much the principal point lies further right and down, in focal
 lengths, and the share by which the focal length is longer."""
 
+PRINCIPAL_POINT = LENS[:2]
+
 SIZE = 12
 
 REACH = np.array([radians(3.0)] * 3 + [0.4] * 3 + [0.08, 0.08, 0.06] + [0.04, 0.04, 0.05])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from math import fsum, sqrt
 
 import numpy as np
@@ -29,6 +30,12 @@ POINTS = 5_000
 
 MAX_EVALUATIONS = 200
 """Bound on one climb; it takes 20 to 80."""
+
+LATTICE = (-1.0, -0.5, 0.0, 0.5, 1.0)
+"""Where further climbs may begin along a ridge, in halves of its reach."""
+
+MOST_BEGINS = 4
+"""Most climbs from such a lattice. Each costs as much as a tenth of the search."""
 
 SHARP_STEP_PX = 2.0 * SHARP_SIGMA_PX
 """First step on the sharpest edges, as wide as their hill."""
@@ -84,6 +91,16 @@ class Ways:
         squares = [normal[i][i] for i in range(count)] + [residual[k][k] for k in range(len(free))]
         return cls(directions, np.array([1.0 / sqrt(max(s, LEAST_SQUARE)) for s in squares]), free, np.array(residual))
 
+    @property
+    def widest(self) -> NDArray[np.float64]:
+        """(n,) half the reach of each direction."""
+        reach = REACH[:, None] / np.maximum(np.abs(self.directions), 1e-9)
+        return np.asarray(0.5 * reach.min(axis=0))
+
+    def combined(self, along: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(K, 12) the deviations of K moves (K, n) along the directions."""
+        return np.asarray(np.sum(self.directions * along[:, None, :], axis=2))
+
     def moved_px(self, deviation: NDArray[np.float64]) -> float:
         """By how many pixels the free places of a deviation (12,) still move the edges after their answers."""
         values = deviation[list(self.free)].tolist()
@@ -95,9 +112,7 @@ class Ways:
 def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> NDArray[np.float64]:
     """The deviation (12,) of the most significant alignment on the last level next to `start` (12,). The levels before
     it lead there."""
-    sharpest = levels[-1].frames.camera.width
-    reach = REACH[:, None] / np.maximum(np.abs(ways.directions), 1e-9)
-    widest = 0.5 * reach.min(axis=0)
+    sharpest, widest = levels[-1].frames.camera.width, ways.widest
     at = start
     for level in levels:
         last = level is levels[-1]
@@ -106,13 +121,33 @@ def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> N
         begin = at
 
         def scores(points: NDArray[np.float64], level: Told = level, begin: NDArray[np.float64] = begin) -> list[float]:
-            deviations = begin + np.sum(ways.directions * points[:, None, :], axis=2)
-            # Costs half a unit at the end of the reach, so that what the window does not show stays as assumed.
-            unlike = deviations[:, SHIFTS.stop :] / REACH[SHIFTS.stop :]
-            found: list[float] = (level.significances(deviations) - 0.5 * np.sum(unlike * unlike, axis=1)).tolist()
+            found: list[float] = _scores(level, begin + ways.combined(points)).tolist()
             return found
 
         box = Box(-2.0 * widest, 2.0 * widest, step, (SETTLING if last else LEADING) * step)
         found, _ = maximum_in(box, scores, np.zeros(len(step)), MAX_EVALUATIONS)
-        at = begin + np.sum(ways.directions * found, axis=1)
+        at = begin + ways.combined(found[None])[0]
     return at
+
+
+def climbed_along(
+    places: Sequence[int], level: Told, ways: Ways, start: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """The deviations (12,) at which further climbs on one level end, for `places` (free ones) that the pose answers
+    almost entirely: such a ridge is long, and its dents hold a climb. They begin at `start` (12,), and at the best
+    points of a lattice of `places` if they are better."""
+    columns = len(ways.steps) - len(ways.free) + np.array([ways.free.index(place) for place in places])
+    along = np.zeros((len(LATTICE) ** len(places), len(ways.steps)))
+    along[:, columns] = ways.widest[columns] * list(product(LATTICE, repeat=len(places)))
+    scores = _scores(level, start + ways.combined(along))
+    middle = len(along) // 2
+    better = [k for k in np.argsort(-scores, kind="stable")[:MOST_BEGINS] if scores[k] > scores[middle]]
+    begins = start + ways.combined(along[[middle, *better]])
+    return [climbed([level], ways, begin) for begin in begins]
+
+
+def _scores(level: Told, deviations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K,) what a climb makes large, at each of K deviations (K, 12). It costs half a unit at the end of the reach, so
+    that what the window does not show stays as assumed."""
+    unlike = deviations[:, SHIFTS.stop :] / REACH[SHIFTS.stop :]
+    return np.asarray(level.significances(deviations) - 0.5 * np.sum(unlike * unlike, axis=1))
