@@ -1,0 +1,61 @@
+"""Climbs along what an assumption and the pose that answers it leave: a ridge, which may have dents."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.calibration.confidence.told import PRINCIPAL_POINT, SIZE, Told
+from coec.calibration.confidence.ways import MOST_BEGINS, Ways, climbed, climbed_along
+
+SUMMIT = np.array([0.016, -0.012])
+"""Where the principal point is, in focal lengths from where it was assumed."""
+
+
+def ridge(dent: float) -> Told:
+    """A level on which significance falls from the summit as it does for a principal point that a turn answers, by a
+    few units, with dents of this depth every five thousandths of a focal length."""
+
+    def significances(deviations: NDArray[np.float64]) -> NDArray[np.float64]:
+        off = (deviations[:, list(PRINCIPAL_POINT)] - SUMMIT) / 0.01
+        dents = np.cos(2.0 * np.pi * deviations[:, list(PRINCIPAL_POINT)] / 0.005)
+        return np.asarray(60.0 - 0.4 * np.sum(off * off, axis=1) + dent * np.sum(dents, axis=1))
+
+    level: Any = SimpleNamespace(frames=SimpleNamespace(camera=SimpleNamespace(width=700)), significances=significances)
+    return cast(Told, level)
+
+
+def ways() -> Ways:
+    """The principal point, and nothing else, is set free; half a thousandth moves the edges by a pixel beyond the turn
+    that answers it."""
+    directions = np.zeros((SIZE, 2))
+    directions[list(PRINCIPAL_POINT), [0, 1]] = 1.0
+    return Ways(directions, np.full(2, 5e-4), tuple(PRINCIPAL_POINT), np.eye(2))
+
+
+def off(end: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(end[list(PRINCIPAL_POINT)] - SUMMIT))
+
+
+def test_a_dent_holds_one_climb_and_not_all_of_them() -> None:
+    dented, start = ridge(0.5), np.zeros(SIZE)
+    assert off(climbed([dented], ways(), start)) > 0.015
+    ends = climbed_along(PRINCIPAL_POINT, dented, ways(), start)
+    assert len(ends) == 1 + MOST_BEGINS
+    assert min(off(end) for end in ends) < 0.005
+
+
+def test_a_ridge_without_dents_has_one_end() -> None:
+    for end in climbed_along(PRINCIPAL_POINT, ridge(0.0), ways(), np.zeros(SIZE)):
+        assert off(end) == pytest.approx(0.0, abs=2e-3)
+
+
+def test_from_the_summit_no_lattice_point_is_better() -> None:
+    start = np.zeros(SIZE)
+    start[list(PRINCIPAL_POINT)] = SUMMIT
+    (end,) = climbed_along(PRINCIPAL_POINT, ridge(0.0), ways(), start)
+    assert off(end) == pytest.approx(0.0, abs=2e-3)
