@@ -4,7 +4,7 @@ A held camera centre, trusted clocks and a lens taken from a sheet, if wrong, le
 pose removes. They are set free one after the other, the earlier ones staying free: the centre, then the clocks, then
 the lens (a nested likelihood ratio, Wilks 1938, on the sharpest edges). The gain is compared with the scatter of frames
 and sectors of the image. How far the pose moves meanwhile is how far the assumption led it astray, as far as the window
-is believed (`belief`). Where climbs end at several lenses, the one is taken that would have led it farthest astray.
+is believed (`belief`). Where climbs have several ends, the one is taken that led it farthest.
 """
 
 from __future__ import annotations
@@ -18,8 +18,19 @@ from numpy.typing import NDArray
 
 from coec.calibration.confidence.belief import in_centre, in_doubt
 from coec.calibration.confidence.landscape import certainty
-from coec.calibration.confidence.told import CLOCKS, LENS, PRINCIPAL_POINT, SHIFTS, SIZE, Told, levels_told, moves
-from coec.calibration.confidence.ways import Ways, climbed, climbed_along
+from coec.calibration.confidence.told import (
+    CLOCKS,
+    LATE,
+    LENS,
+    PRINCIPAL_POINT,
+    REACH,
+    SHIFTS,
+    SIZE,
+    Told,
+    levels_told,
+    moves,
+)
+from coec.calibration.confidence.ways import Ways, climbed, ends_along
 from coec.calibration.objective.cells import COLUMNS, ROWS, sectors
 from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
@@ -70,9 +81,9 @@ class Loosened:
     believed: float
 
     @property
-    def astray_rad(self) -> float:
-        """By how much the pose turns, as far as that is believed."""
-        return self.believed * hypot(*self.shift[:3].tolist())
+    def astray(self) -> float:
+        """The largest share of its reach by which an axis of the pose moves, as far as that is believed."""
+        return self.believed * float(np.max(np.abs(self.shift) / REACH[: SHIFTS.stop]))
 
     @property
     def matters(self) -> bool:
@@ -98,21 +109,19 @@ def loosen(
         known_m: the standard deviation to which each of them is known.
     """
     levels = levels_told(edges, window, pose)
-    free = [(HELD_FREE, tuple(held))] if held else []
+    free: list[tuple[str, Sequence[int], Sequence[int]]] = [(HELD_FREE, held, ())] if held else []
     if moves(window):
-        free.append((CLOCKS_FREE, tuple(CLOCKS)))
-    free.append((LENS_FREE, tuple(LENS)))
+        free.append((CLOCKS_FREE, CLOCKS, LATE))
+    free.append((LENS_FREE, LENS, PRINCIPAL_POINT))
     base = tuple(axis for axis in range(SHIFTS.stop) if axis not in held)
     try:
         before = climbed(levels[-1:], Ways.of(levels[-1], np.zeros(SIZE), base, ()), np.zeros(SIZE))
         found = []
-        for name, places in free:
-            ways = Ways.of(levels[-1], before, base, places)
-            ends = [climbed(levels, ways, before)]
-            if name == LENS_FREE:
-                ends += climbed_along(PRINCIPAL_POINT, levels[-1], ways, before)
+        for name, places, along in free:
+            ways = Ways.of(levels[-1], before, base, tuple(places))
+            ends = ends_along(along, levels, ways, before)
             judged = [_judged(name, levels[-1], ways, before, after, known_m) for after in ends]
-            found.append(max(judged, key=lambda one: one.astray_rad))
+            found.append(max(judged, key=lambda one: one.astray))
             base, before = (*base, *places), found[-1].deviation
     except ValueError:
         return ()

@@ -29,7 +29,9 @@ camera was exposed later than assumed, by how much more at the end of the window
 more in the last row than in the first. Lens: by how much the principal point lies further right and down, in focal
 lengths, and the share by which the focal length is longer."""
 
-PRINCIPAL_POINT = LENS[:2]
+LATE, PRINCIPAL_POINT = CLOCKS[:2], LENS[:2]
+"""Places that a move of the pose answers almost entirely: on a straight way a late camera looks like one elsewhere on
+the way, and a principal point further right looks like a camera that is turned to the left."""
 
 SIZE = 12
 

@@ -34,9 +34,8 @@ MAX_EVALUATIONS = 200
 LATTICE = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Where further climbs may begin along a ridge, in halves of its reach."""
 
-MOST_BEGINS = 4
-"""Most climbs from such a lattice, of some 15 ms each. A right lens takes hardly any: the window fits best about where
-the lens was assumed."""
+BEGINS = 2
+"""Climbs from such a lattice, of some 15 ms each. Where what was assumed is right, one of them begins there."""
 
 SHARP_STEP_PX = 2.0 * SHARP_SIGMA_PX
 """First step on the sharpest edges, as wide as their hill."""
@@ -131,20 +130,21 @@ def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> N
     return at
 
 
-def climbed_along(
-    places: Sequence[int], level: Told, ways: Ways, start: NDArray[np.float64]
+def ends_along(
+    places: Sequence[int], levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """The deviations (12,) at which further climbs on one level end, for `places` (free ones) that the pose answers
-    almost entirely: such a ridge is long, and its dents hold a climb. They begin at `start` (12,), and at the best
-    points of a lattice of `places` if they are better."""
+    """The deviations (12,) at which climbs end. One is `climbed` from `start` (12,). If the pose answers some of the
+    free `places` almost entirely, the ridge is long and its dents hold a climb: others begin, on the last level, at the
+    best points of a lattice of these places."""
+    led = climbed(levels, ways, start)
+    if not places:
+        return [led]
     columns = len(ways.steps) - len(ways.free) + np.array([ways.free.index(place) for place in places])
     along = np.zeros((len(LATTICE) ** len(places), len(ways.steps)))
     along[:, columns] = ways.widest[columns] * list(product(LATTICE, repeat=len(places)))
-    scores = _scores(level, start + ways.combined(along))
-    middle = len(along) // 2
-    better = [k for k in np.argsort(-scores, kind="stable")[:MOST_BEGINS] if scores[k] > scores[middle]]
-    begins = start + ways.combined(along[[middle, *better]])
-    return [climbed([level], ways, begin) for begin in begins]
+    lattice = start + ways.combined(along)
+    best = np.argsort(-_scores(levels[-1], lattice), kind="stable")[:BEGINS]
+    return [led, *(climbed(levels[-1:], ways, lattice[k]) for k in best)]
 
 
 def _scores(level: Told, deviations: NDArray[np.float64]) -> NDArray[np.float64]:
