@@ -101,6 +101,14 @@ class Ways:
         """(K, 12) the deviations of K moves (K, n) along the directions."""
         return np.asarray(np.sum(self.directions * along[:, None, :], axis=2))
 
+    def lattice(self, places: Sequence[int], about: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(K, 12) the deviations at which some of the free places, with their answers, are off from `about` (12,) by
+        each combination of `LATTICE`."""
+        columns = len(self.steps) - len(self.free) + np.array([self.free.index(place) for place in places])
+        along = np.zeros((len(LATTICE) ** len(places), len(self.steps)))
+        along[:, columns] = self.widest[columns] * list(product(LATTICE, repeat=len(places)))
+        return about + self.combined(along)
+
     def moved_px(self, deviation: NDArray[np.float64]) -> float:
         """By how many pixels the free places of a deviation (12,) still move the edges after their answers."""
         values = deviation[list(self.free)].tolist()
@@ -133,16 +141,14 @@ def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> N
 def ends_along(
     places: Sequence[int], levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """The deviations (12,) at which climbs end. One is `climbed` from `start` (12,). If the pose answers some of the
-    free `places` almost entirely, the ridge is long and its dents hold a climb: others begin, on the last level, at the
-    best points of a lattice of these places."""
+    """The deviations (12,) at which climbs from about `start` (12,) end; `places` are those of the free ones that the
+    pose answers almost entirely. They make a long ridge, whose dents hold a climb: beside the one that the levels lead,
+    others begin on the last level, at the best points of a lattice of these places. Without such places there is one.
+    """
     led = climbed(levels, ways, start)
     if not places:
         return [led]
-    columns = len(ways.steps) - len(ways.free) + np.array([ways.free.index(place) for place in places])
-    along = np.zeros((len(LATTICE) ** len(places), len(ways.steps)))
-    along[:, columns] = ways.widest[columns] * list(product(LATTICE, repeat=len(places)))
-    lattice = start + ways.combined(along)
+    lattice = ways.lattice(places, start)
     best = np.argsort(-_scores(levels[-1], lattice), kind="stable")[:BEGINS]
     return [led, *(climbed(levels[-1:], ways, lattice[k]) for k in best)]
 
