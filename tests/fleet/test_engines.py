@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,9 +47,11 @@ def poisoned(tmp_path: Path) -> Iterator[str]:
 
 
 def _reads(child: psutil.Process, path: Path) -> bool:
-    """psutil tells of regular files only."""
+    """psutil tells of regular files only. A child that is just being started still holds this process's end of the
+    pipe, for writing."""
     try:
-        return any(file.readlink() == path for file in Path(f"/proc/{child.pid}/fd").iterdir())
+        files = [file for file in Path(f"/proc/{child.pid}/fd").iterdir() if file.readlink() == path]
+        return any(file.lstat().st_mode & stat.S_IRUSR for file in files)
     except OSError:
         return False
 
