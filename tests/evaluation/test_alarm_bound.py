@@ -18,8 +18,8 @@ PLACE_RAD = 0.001
 
 
 def displaced(sigmas: float) -> tuple[Judged, ...]:
-    """Two checks of a place, a little apart."""
-    return tuple(judged(float(np.degrees(PLACE_RAD * (sigmas + apart)))) for apart in (-0.1, 0.1))
+    """Three checks of a place, a little apart."""
+    return tuple(judged(float(np.degrees(PLACE_RAD * (sigmas + apart)))) for apart in (-0.1, 0.0, 0.1))
 
 
 def farther_than(sigmas: float, checks: Sequence[Judged]) -> bool:
@@ -33,12 +33,16 @@ def test_places_are_where_clear_checks_put_them() -> None:
         [displaced(3.0), (judged(9.0, faint=("looks",)),), (*displaced(-2.0), judged(9.0, causes=("dark",)))]
     )
     np.testing.assert_allclose(places.displacement, [3.0, 2.0])
-    assert [len(checks) for checks in places.checks] == [2, 2]
+    assert [len(checks) for checks in places.checks] == [3, 3]
 
 
 def test_a_check_that_is_off_alone_displaces_no_place() -> None:
     places = Places.of([(*displaced(1.0), *displaced(1.0), judged(9.0))])
-    np.testing.assert_allclose(places.displacement, [1.1])
+    np.testing.assert_allclose(places.displacement, [1.0])
+
+
+def test_few_checks_do_not_tell_a_place_that_is_off_from_a_bad_check() -> None:
+    assert Places.of([displaced(1.0)[:2], (judged(9.0),)]).checks == ()
 
 
 def test_a_check_just_after_a_faint_one_may_not_accuse_and_is_of_no_place() -> None:

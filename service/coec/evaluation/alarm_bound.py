@@ -29,6 +29,9 @@ every check sees."""
 DRAWS = 12
 """Places of each displacement."""
 
+MIN_CHECKS = 3
+"""Clear checks from which a place is known: fewer do not tell a place that is off from a bad check."""
+
 MIN_PLACES = 20
 """With fewer places no tail is fitted, because only half of them lie beyond the threshold."""
 
@@ -64,8 +67,8 @@ class Places:
 
     @classmethod
     def of(cls, drives: Sequence[Sequence[Judged]]) -> Places:
-        """Every drive is one place; drives without a clear check are left out."""
-        kept = tuple(checks for checks in map(_clear, drives) if checks)
+        """Every drive is one place; drives with fewer than `MIN_CHECKS` clear checks are left out."""
+        kept = tuple(checks for checks in map(_clear, drives) if len(checks) >= MIN_CHECKS)
         far = [float(np.max(np.abs(_centre(checks)) / _place(checks))) for checks in kept]
         return cls(kept, np.array(far))
 
@@ -145,8 +148,7 @@ def _accused(places: Places, displacement: float, stay_checks: int, alarms: Alar
 
 def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.Generator) -> list[Judged]:
     """Checks of a right mount, followed by checks of a place that is off about or along one axis."""
-    scattered = [checks for checks in places.checks if len(checks) > 1]
-    checks = scattered[int(rng.integers(len(scattered)))]
+    checks = places.checks[int(rng.integers(len(places.checks)))]
     offsets = _offsets(checks)
     # A few checks scatter less about their own centre than about the true displacement of their place.
     about = (offsets - _centre(checks)) * np.sqrt(len(checks) / (len(checks) - 1.0))

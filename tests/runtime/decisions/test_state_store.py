@@ -81,7 +81,7 @@ def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> N
     hold = Hold(7, "operator", "the mirror is being changed")
     state = held(after_estimate(initial_state(RIG), estimate(1), 0, NEVER), hold)
     belief = Belief((1 / 3, 0.1, -0.0), (1e-9, 0.2, 0.3), 0.7)
-    tests = Hypotheses(belief, (Hypothesis(1, 2.5, 1 / 7, belief, belief),), (0.1, 0.2, 0.3))
+    tests = Hypotheses(belief, (Hypothesis(1, 2.5, 1 / 7, belief, belief, belief),), (0.1, 0.2, 0.3))
     monitor = MonitorState(Finding.SUSPECT, tests, Hypotheses(), {"dark": 0.1}, {"40": 2.5}, 0.5, (5, 6), stood=True)
     state = replace(state, monitor=monitor, flagged_since_ns=4, changes=(Change(3, (0.1,) * 6),))
     saved(StateStore(tmp_path, "test"), RIG, state, {})

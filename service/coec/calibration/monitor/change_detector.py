@@ -282,6 +282,7 @@ def told_by(observation: Observation, axes: slice, before: Three | None) -> Told
         offset=three(offset),
         noise=three([(times * n) ** 2 + farther2 for n in noise]),
         place=three([(scene * p) ** 2 for p in place]),
+        street=three([p * p for p in place]),
         rig=three([max(s * s - n * n, p * p) for s, n, p in zip(sigma, noise, place, strict=True)]),
         before=before,
         weak=observation.weak,

@@ -50,6 +50,7 @@ class Told:
         offset: from the served pose.
         noise: variance of the error that is new at every check.
         place: variance of the error that neighbouring checks share and checks elsewhere do not.
+        street: that variance on a street, where checks tell more than in other scenes.
         rig: variance of the error that is the same everywhere: the unknown bias of the estimator on this rig.
         before: the offset of the check before, if there was one.
         weak: whether its edges are faint.
@@ -58,6 +59,7 @@ class Told:
     offset: Three
     noise: Three
     place: Three
+    street: Three
     rig: Three
     before: Three | None
     weak: bool
