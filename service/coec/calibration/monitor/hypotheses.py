@@ -140,7 +140,9 @@ def _continued(test: Hypothesis, told: Told, axes: Axes, share: float, most: flo
     if step > 0.0:
         evidence = min(evidence, max(most, test.evidence))
     age, moved = test.age + share, test.moved.after(told, of_move, share)
-    evidence = min(evidence, max(_worth(moved, test.rig.wider(_scatter(told.street, age)), axes.moves[test.kind]), 0.0))
+    worth = _worth(moved, test.rig.wider(_scatter(told.street, age)), axes.moves[test.kind])
+    # Not below 0: a test that began before the mount moved would be too far behind to tell a small move.
+    evidence = min(evidence, max(worth, 0.0))
     return Hypothesis(test.kind, age, evidence, moved, test.right.after(told, of_right, share), test.rig)
 
 
