@@ -221,10 +221,15 @@ def test_a_window_that_saw_a_knock_speaks_against_what_is_served_and_wants_the_n
     assert window_wanted_since(state) == (300 - 18) * S
 
 
-def test_without_a_check_that_objects_a_knock_within_a_window_is_no_witness() -> None:
-    assert solved(HEALTHY, moved_within(0.5, 3.0)).health is HealthState.HEALTHY
+def test_a_step_within_a_window_counts_unless_a_later_check_acquits_or_the_data_are_at_fault() -> None:
+    stepped = moved_within(0.5, 3.0)
+    assert stepped.moved is not None
+    assert solved(HEALTHY, stepped).health is HealthState.SUSPECT
+    after_s = stepped.moved.first_after_ns // S + 1
+    assert solved(watched(HEALTHY, check(after_s)), stepped).health is HealthState.HEALTHY
+    assert solved(watched(HEALTHY, check(after_s, flagged=True)), stepped).health is HealthState.SUSPECT
     dazzled = replace(OBJECTED, monitor=MonitorState(blind={"open_field": 2.0}))
-    assert solved(dazzled, moved_within(0.5, 3.0)).health is HealthState.HEALTHY
+    assert solved(dazzled, stepped).health is HealthState.HEALTHY
 
 
 def test_a_window_at_whose_end_the_camera_is_where_it_is_served_speaks_against_nothing() -> None:
@@ -383,7 +388,8 @@ def test_with_never_the_candidate_waits_and_nothing_else_changes() -> None:
     assert watched(state, *clear_from(270, 9)).health is HealthState.MISCALIBRATED
     applied = apply_pending(state, NEVER)
     np.testing.assert_array_equal(applied.T_camera_lidar, pose_of(estimate(1.0)))
-    assert (applied.health, applied.provenance, applied.pending) == (HealthState.HEALTHY, Provenance.ESTIMATED, None)
+    assert (applied.health, applied.provenance, applied.pending) == (HealthState.UNKNOWN, Provenance.ESTIMATED, None)
+    assert watched(applied, check(320)).health is HealthState.HEALTHY
 
 
 def test_red_fades_by_staying_clear_through_yellow_only() -> None:
@@ -521,7 +527,8 @@ def test_without_a_completed_check_green_turns_yellow_and_what_was_known_is_said
     red = watched(HEALTHY, *flagged_from(200, 3))
     assert overdue(red, WORKER) is red
     suspect = watched(HEALTHY, *flagged_from(200, 2))
-    assert "Last known: suspect. The latest pairs" in overdue(suspect, WORKER).reasons[1].text
+    assert overdue(suspect, WORKER) is suspect, "a window is being solved meanwhile"
+    assert "Last known: suspect. The latest pairs" in aged(suspect, DAY_S + 1.0, DAY_S).reasons[1].text
 
 
 def anything(rng: np.random.Generator, stamp_s: int) -> Callable[[PairState], PairState]:
@@ -562,8 +569,8 @@ def test_what_the_data_decide_does_not_hang_on_how_long_the_machine_took(seed: i
 
 def test_a_check_that_changes_nothing_ends_what_was_said_of_its_delay() -> None:
     suspect = replace(HEALTHY, health=HealthState.SUSPECT, reasons=(KNOCK,), proven=False)
-    late = overdue(suspect, WORKER)
-    assert late.health is HealthState.DEGRADED
+    late = aged(suspect, DAY_S + 1.0, DAY_S)
+    assert late.health is HealthState.STALE
     after = watched(late, check(300), check(305), check(310))
     assert (after.health, after.reasons) == (HealthState.SUSPECT, (KNOCK,))
 

@@ -12,6 +12,7 @@ U, H, S, M, D, A = HealthState
 EDGES: dict[Event, tuple[HealthState, ...]] = {
     # from:                   unknown, healthy, suspect, miscalibrated, degraded, stale
     Event.CONFIRMED_BY_WINDOW: (H, H, H, H, H, H),
+    Event.CONFIRMED_EARLIER: (U, U, U, U, U, U),
     Event.CONTRADICTED: (M, M, M, M, M, M),
     Event.STEP_SUSPECTED: (S, S, S, M, S, S),
     Event.REFUSED_ELSEWHERE: (S, S, S, M, S, S),
@@ -21,7 +22,8 @@ EDGES: dict[Event, tuple[HealthState, ...]] = {
     Event.MOUNT_MOVED: (M, M, M, M, M, M),
     Event.AT_ODDS: (D, D, S, M, D, D),
     Event.DATA_CAUSE: (D, D, D, M, D, D),
-    Event.OVERDUE: (U, D, D, M, D, A),
+    Event.NOT_ACQUITTED: (D, D, S, M, D, D),
+    Event.OVERDUE: (U, D, S, M, D, A),
     Event.AGED: (U, A, A, M, A, A),
     Event.REPLACED: (U, U, U, U, U, U),
     Event.TIME_STEPPED_BACK: (U, U, S, M, U, U),

@@ -223,8 +223,10 @@ def test_with_never_the_candidate_waits_until_a_person_applies_it(tmp_path: Path
     assert bench.entries("extrinsic") == []
     assert bench.do("apply") == "applied"
     np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
-    assert bench.health == "healthy"
+    assert bench.health == "unknown", "no check has acquitted it yet"
     assert bench.do("apply") == "nothing_pending"
+    bench.drive(END_S, END_S + 10)
+    assert bench.health == "healthy"
 
 
 def test_a_roll_back_returns_to_any_accepted_calibration(bench: Bench) -> None:

@@ -134,6 +134,12 @@ class EgoMotion:
         x, y, z = self.linear_mps
         return float(np.sqrt(x * x + y * y + z * z))
 
+    @property
+    def turn_radps(self) -> float:
+        """Magnitude of the angular velocity in radians per second."""
+        x, y, z = self.angular_radps
+        return float(np.sqrt(x * x + y * y + z * z))
+
     def reaches(self, speed_mps: float) -> bool:
         """Whether the vehicle is known to be at least so fast."""
         return self.speed_mps is not None and self.speed_mps >= speed_mps

@@ -165,18 +165,34 @@ def facts(stamp_ns: int = 0, **other: object) -> SceneFacts:
         thumbnail=np.random.default_rng(stamp_ns).normal(100, 40, (6, 8)).astype(np.float32),
         digest=stamp_ns,
     )
-    sweep = SweepFacts(np.full(BANDS, 400, np.int64), np.full(SECTORS, 400, np.int64), range_edges=1000)
-    return changed(SceneFacts(stamp_ns, picture, sweep, speed_mps=8.0), **other)
+    sweep = SweepFacts(np.full(BANDS, 400, np.int64), np.full(SECTORS, 400, np.int64), 1000, digest=stamp_ns)
+    return changed(SceneFacts(stamp_ns, picture, sweep, speed_mps=8.0, turn_radps=0.0), **other)
 
 
 def changed(scene: SceneFacts, **other: object) -> SceneFacts:
     """With other figures, of whichever part has them."""
+    of_sweep = {"digest": other.pop("sweep_digest")} if "sweep_digest" in other else {}
     of_picture = {name: value for name, value in other.items() if hasattr(scene.picture, name)}
-    of_sweep = {name: value for name, value in other.items() if hasattr(scene.sweep, name)}
+    of_sweep |= {name: value for name, value in other.items() if hasattr(scene.sweep, name) and name not in of_picture}
     of_scene = {name: value for name, value in other.items() if name not in of_picture | of_sweep}
     picture = replace(scene.picture, **of_picture)  # type: ignore[arg-type]
     sweep = replace(scene.sweep, **of_sweep)  # type: ignore[arg-type]
     return replace(scene, picture=picture, sweep=sweep, **of_scene)  # type: ignore[arg-type]
+
+
+STILL = np.random.default_rng(5).normal(100, 40, (40, 60)).astype(np.float32)
+
+
+def moving(second: int) -> NDArray[np.float32]:
+    """The thumbnail of a vehicle that drives: another place every second."""
+    return np.random.default_rng(100 + second).normal(100, 40, (40, 60)).astype(np.float32)
+
+
+def with_lorry(thumbnail: NDArray[np.float32], second: int) -> NDArray[np.float32]:
+    """With something grey in a third of the picture, elsewhere every second."""
+    covered = thumbnail.copy()
+    covered[:, 8 * second : 8 * second + 20] = 90.0
+    return covered
 
 
 def drive_of(**other: object) -> list[SceneFacts]:
@@ -192,12 +208,30 @@ class TestFacts:
         assert data_causes(drive_of(), usual()) == ()
         assert data_causes(drive_of(), None) == ()
 
-    def test_equal_pictures_of_a_standing_vehicle_are_no_fault(self) -> None:
-        assert data_causes(drive_of(digest=7, speed_mps=0.0), None) == ()
-        assert [cause.code for cause in data_causes(drive_of(digest=7), None)] == ["camera_frozen"]
+    @pytest.mark.fault("a driver repeats its last frame, and odometry says 0", "the sensor is named as frozen")
+    def test_a_sensor_that_repeats_itself_to_the_bit_is_frozen_whatever_the_vehicle_does(self) -> None:
+        for speed_mps in (0.0, 8.0, None):
+            same = drive_of(digest=7, speed_mps=speed_mps)
+            assert [cause.code for cause in data_causes(same, None)] == ["camera_frozen"]
+            same = drive_of(sweep_digest=7, speed_mps=speed_mps)
+            assert [cause.code for cause in data_causes(same, None)] == ["lidar_frozen"]
 
-    def test_equal_pictures_without_ego_motion_are_a_fault(self) -> None:
-        assert [cause.code for cause in data_causes(drive_of(digest=7, speed_mps=None), None)] == ["camera_frozen"]
+    def test_a_picture_of_one_grey_value_may_repeat_itself(self) -> None:
+        black = drive_of(digest=7, speed_mps=0.0, thumbnail=np.zeros((6, 8), np.float32))
+        assert data_causes(black, None) == ()
+
+    @pytest.mark.fault("odometry says 0 while the vehicle drives", "`ego_motion_wrong`; it is not taken for standing")
+    def test_pictures_that_change_while_odometry_says_0(self) -> None:
+        scenes = [facts(second * 1_000_000_000, speed_mps=0.0, thumbnail=moving(second)) for second in range(6)]
+        assert [cause.code for cause in data_causes(scenes, None)] == ["ego_motion_wrong"]
+        turning = [replace(scene, turn_radps=0.3) for scene in scenes]
+        assert data_causes(turning, None) == (), "a vehicle that turns on the spot sees something else, too"
+        brighter = [facts(n * 1_000_000_000, speed_mps=0.0, thumbnail=STILL + 5.0 * n) for n in range(6)]
+        rng = np.random.default_rng(0)
+        still = [changed(one, thumbnail=one.picture.thumbnail + rng.normal(0, 1, STILL.shape)) for one in brighter]
+        lorry = [with_lorry(one.picture.thumbnail, n) for n, one in enumerate(still)]
+        passing = [changed(one, thumbnail=thumbnail) for one, thumbnail in zip(still, lorry, strict=True)]
+        assert data_causes(passing, None) == (), "traffic passes a vehicle that stands"
 
     def test_one_blurred_picture_is_no_dirt(self) -> None:
         spot = np.full((BLOCK_ROWS, BLOCK_COLUMNS), 10.0)
@@ -225,4 +259,4 @@ class TestFacts:
 
     def test_every_cause_is_listed_under_its_code(self) -> None:
         assert all(code == cause.code == cause.as_reason().code for code, cause in CAUSES.items())
-        assert len(CAUSES) == 10
+        assert len(CAUSES) == 12

@@ -17,10 +17,16 @@ PERIOD_S = 5.0
 
 
 def report(
-    camera: int = 0, lidar: int = 0, refused: int = 0, pairs: int = 0, checks: int = 0, not_afforded: int = 0
+    camera: int = 0,
+    lidar: int = 0,
+    refused: int = 0,
+    pairs: int = 0,
+    checks: int = 0,
+    not_afforded: int = 0,
+    unanswered: int = 0,
 ) -> StreamStatistics:
     streams = {CAMERA: StreamCounts(camera, camera - refused), LIDAR: StreamCounts(lidar, lidar)}
-    chosen = Chosen(checks=checks, not_afforded=not_afforded, last_ns=1000 * S)
+    chosen = Chosen(checks=checks, not_afforded=not_afforded, unanswered=unanswered, last_ns=1000 * S)
     return StreamStatistics(streams=streams, pairs=pairs, chosen=chosen, pace=1.0)
 
 
@@ -30,36 +36,50 @@ ALL = report(camera=100, lidar=100, pairs=100, checks=3)
 
 def begun() -> Progress:
     progress = Progress(PERIOD_S, 0.0, BEGIN)
-    progress.completed(1000 * S, 100.0, BEGIN)
+    progress.completed(1000 * S, 100.0, BEGIN, acquits=True)
     return progress
 
 
 def test_three_periods_on_the_steady_clock() -> None:
     progress = begun()
-    assert progress.overdue(ALL, 115.0) is None
-    late = progress.overdue(ALL, 115.1)
+    assert progress.overdue(ALL, 115.0, at_rest=False) is None
+    late = progress.overdue(ALL, 115.1, at_rest=False)
     assert late is not None
     assert late.code == "overdue_worker"
-    progress.completed(1015 * S, 116.0, ALL)
-    assert progress.overdue(ALL, 117.0) is None
+    progress.completed(1015 * S, 116.0, ALL, acquits=True)
+    assert progress.overdue(ALL, 117.0, at_rest=False) is None
+
+
+@pytest.mark.fault("checks are completed, and none acquits the extrinsic", "after three periods the pair is not green")
+def test_checks_that_do_not_acquit_renew_nothing() -> None:
+    progress = begun()
+    for second in (105.0, 110.0, 114.0):
+        progress.completed(round((900.0 + second) * S), second, ALL, acquits=False)
+    assert progress.overdue(ALL, 115.0, at_rest=False) is None
+    late = progress.overdue(ALL, 115.1, at_rest=False)
+    assert late == Reason("not_acquitted", "Checks are completed, but none has acquitted the extrinsic for 15 s.")
+    assert progress.overdue(ALL, 115.1, at_rest=True) is None, "the acquitting check of this place still counts"
+    stopped = progress.overdue(ALL, 129.1, at_rest=True)
+    assert stopped is not None
+    assert stopped.text.startswith("No check has been completed for 15 s")
 
 
 def test_on_the_clock_of_the_sensors_a_replay_may_run_ahead_of_the_answers_by_a_period_more() -> None:
     progress = begun()
     ahead = replace(ALL, pace=10.0, chosen=replace(ALL.chosen, last_ns=1020 * S))
-    assert progress.overdue(ahead, 101.0) is None
+    assert progress.overdue(ahead, 101.0, at_rest=False) is None
     late = replace(ahead, chosen=replace(ahead.chosen, last_ns=1020 * S + 1))
-    assert progress.overdue(late, 101.0) is not None
+    assert progress.overdue(late, 101.0, at_rest=False) is not None
     progress.time_stepped_back()
-    assert progress.overdue(late, 101.0) is None, "stamps of before tell nothing any more"
+    assert progress.overdue(late, 101.0, at_rest=False) is None, "stamps of before tell nothing any more"
 
 
 def test_a_replay_slower_than_the_drive_has_as_much_longer() -> None:
     half = replace(ALL, pace=0.5)
-    assert begun().overdue(half, 130.0) is None
-    assert begun().overdue(half, 130.1) is not None
+    assert begun().overdue(half, 130.0, at_rest=False) is None
+    assert begun().overdue(half, 130.1, at_rest=False) is not None
     crawling = replace(ALL, pace=1e-6)
-    assert begun().overdue(crawling, 100.0 + 150.1) is not None, "slower than a tenth is standing still"
+    assert begun().overdue(crawling, 100.0 + 150.1, at_rest=False) is not None, "slower than a tenth is standing still"
 
 
 @pytest.mark.fault("a stream that stops", "health names the first thing that stands still")
@@ -71,12 +91,13 @@ def test_a_replay_slower_than_the_drive_has_as_much_longer() -> None:
         (report(camera=100, refused=100, lidar=100), "data", "every camera frame is refused"),
         (report(camera=100, lidar=100), "pairing", "none belong together"),
         (report(camera=100, lidar=100, pairs=2), "data", "too few pairs"),
+        (report(camera=100, lidar=100, pairs=100, unanswered=1), "worker", "a window is being solved"),
         (report(camera=100, lidar=100, pairs=100, not_afforded=3), "budget", "`budget.cores` does not suffice"),
         (ALL, "worker", "has not answered"),
     ],
 )
 def test_the_first_thing_that_stands_still_is_named(now: StreamStatistics, code: str, word: str) -> None:
-    late = begun().overdue(now, 116.0)
+    late = begun().overdue(now, 116.0, at_rest=False)
     assert late is not None
     assert late.code == f"overdue_{code}"
     assert word in late.text
@@ -95,7 +116,7 @@ def test_the_first_thing_that_stands_still_is_named(now: StreamStatistics, code:
 def test_a_failure_is_named_by_whose_it_is(failure: str, code: str) -> None:
     progress = begun()
     progress.failed(Reason(failure, "It went wrong."))
-    late = progress.overdue(ALL, 116.0)
+    late = progress.overdue(ALL, 116.0, at_rest=False)
     assert late is not None
     assert (late.code, late.text) == (f"overdue_{code}", "No check has been completed for 16 s: It went wrong.")
 

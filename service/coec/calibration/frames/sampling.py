@@ -16,7 +16,8 @@ NS_PER_S = 1_000_000_000
 
 SPAN_PERIODS = 6
 """Periods that the pairs of one check may span. The slowest useful stream, with a pair per period, fills the four pairs
-of a check in four periods; two more allow for losses. Pairs further apart do not belong to one check."""
+of a check in four periods; two more allow for losses. Pairs further apart do not belong to one check. From then on its
+checks share pairs, so that one is completed in every period."""
 
 
 MOVING_MPS = 1.0
@@ -40,6 +41,7 @@ class CheckSampler:
         self._config = config
         self._period_ns = round(config.period_s * NS_PER_S)
         self._pairs: list[FramePair] = []
+        self._new = 0
         self._period = self._cell = -1
         self._last_ns = -1
 
@@ -48,17 +50,21 @@ class CheckSampler:
         stamp_ns = pair.stamp_ns
         if stamp_ns < self._last_ns:  # sensor time stepped back
             self._pairs.clear()
+            self._new = 0
         self._last_ns = stamp_ns
         oldest_ns = stamp_ns - SPAN_PERIODS * self._period_ns
         self._pairs = [kept for kept in self._pairs if kept.stamp_ns >= oldest_ns]
         period, cell = stamp_ns // self._period_ns, stamp_ns * self._config.pairs // self._period_ns
         check = None
-        if period != self._period and len(self._pairs) >= self._config.min_pairs:
+        if period != self._period and self._new > 0 and len(self._pairs) >= self._config.min_pairs:
             check = tuple(self._pairs)
-            self._pairs.clear()
+            if self._new >= self._config.min_pairs:
+                self._pairs.clear()
+            self._new = 0
         self._period = period
         if cell != self._cell:
             self._cell = cell
             self._pairs.append(pair)
+            self._new += 1
             del self._pairs[: -self._config.pairs]
         return check

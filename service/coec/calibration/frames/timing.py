@@ -1,9 +1,10 @@
-"""Whether another clock or another ego-motion explains what looks like a bent mount.
+"""Whether another clock, ego-motion or focal length explains what looks like a bent mount.
 
 A bent mount moves every point the same way in every frame. A clock that is off moves each sweep along the motion of the
-vehicle at that instant, and a wrong ego-motion tears each sweep apart in proportion to the motion. So the sweeps are
-compensated anew under each hypothesis, with the extrinsic unchanged. A hypothesis that fits the images with a single
-number as well as a moved extrinsic does with six is the simpler explanation.
+vehicle at that instant, a wrong ego-motion tears each sweep apart in proportion to the motion, and another focal length
+moves every edge outwards wherever the vehicle goes. So the edges are placed anew under each hypothesis, with the
+extrinsic unchanged. A hypothesis that fits the images with a single number as well as a moved extrinsic does with six
+is the simpler explanation.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate, sensor_twist
-from coec.calibration.monitor.sensor_faults import EGO_MOTION_WRONG, TIME_OFFSET, Cause
+from coec.calibration.monitor.sensor_faults import EGO_MOTION_WRONG, INTRINSICS_WRONG, TIME_OFFSET, Cause
 from coec.calibration.types import EgoMotion, FramePair, Matrix4, Rig
 from coec.geometry import se3
 from coec.geometry.cameras import pixel_rad
@@ -27,6 +28,9 @@ OFFSETS_S = (-0.2, -0.15, -0.1, -0.075, -0.05, -0.03, 0.03, 0.05, 0.075, 0.1, 0.
 
 SCALES = (-1.0, 0.0, 0.33, 0.5, 2.0, 3.0)
 """Factors on the ego-motion that are tried: a wrong sign, a missing signal, wrong units and gains."""
+
+ZOOMS = (0.9, 0.95, 0.98, 1.02, 1.05, 1.1)
+"""Factors on the focal length that are tried."""
 
 AS_GOOD, BETTER = 0.97, 1.08
 """For a flagged check: a hypothesis must reach this share of the significance of the moved extrinsic without moving the
@@ -45,11 +49,11 @@ MIN_SPEED_MPS = 1.0
 """Below this speed neither a clock nor an ego-motion moves anything."""
 
 
-def explained_by_motion(
+def explained_by_nuisance(
     edges: Sequence[FramePair], rig: Rig, level: EdgeFrames, expected: Matrix4, found: Matrix4, min_significance: float
 ) -> Cause | None:
-    """The clock or ego-motion that explains the images better than the extrinsic alone; None if none does, or if there
-    is too little motion to try.
+    """The clock, ego-motion or focal length that explains the images better than the extrinsic alone; None if none
+    does. Clock and ego-motion are tried only if there is enough motion.
 
     Args:
         edges: the pairs of a check, their sweeps reduced to the range edges of `level`, as measured.
@@ -58,9 +62,6 @@ def explained_by_motion(
         found: (4, 4) where it is.
         min_significance: below this nothing is explained.
     """
-    moving = [pair for pair in edges if pair.motion is not None and pair.motion.reaches(MIN_SPEED_MPS)]
-    if 2 * len(moving) < len(edges):
-        return None
     null, at_found = frame_alignment(level, expected).significance, frame_alignment(level, found)
     to_beat = at_found.significance
     least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
@@ -82,12 +83,18 @@ def _hypotheses(
 ) -> Iterator[tuple[EdgeFrames, NDArray[np.float64], Cause]]:
     """For each hypothesis the range edges as it places them, the motions (F, 4, 4) that then move the edges of each
     pair, and the cause that it stands for."""
+    still = np.tile(np.eye(4), (len(edges), 1, 1))
+    for zoom in ZOOMS:
+        camera = level.camera._replace(fx=zoom * level.camera.fx, fy=zoom * level.camera.fy)
+        yield replace(level, camera=camera), still, INTRINSICS_WRONG
+    moving = [pair for pair in edges if pair.motion is not None and pair.motion.reaches(MIN_SPEED_MPS)]
+    if 2 * len(moving) < len(edges):
+        return
     xi = np.array([_twist(pair, rig) for pair in edges])
     placed = _placed(edges, rig, level)
     for seconds in OFFSETS_S:
         # Under a constant twist, a later time is one more motion, the same for all points of a sweep.
         yield placed, np.array([se3.exp(seconds * of_pair) for of_pair in xi]), TIME_OFFSET
-    still = np.tile(np.eye(4), (len(edges), 1, 1))
     for factor in SCALES:
         yield _placed([_scaled(pair, factor) for pair in edges], rig, level), still, EGO_MOTION_WRONG
 

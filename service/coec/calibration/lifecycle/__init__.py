@@ -7,6 +7,7 @@ docs/health.md shows the table.
 
 from coec.calibration.lifecycle.alarm_record import AlarmRecord
 from coec.calibration.lifecycle.pair_state import (
+    NOT_ACQUITTED,
     Candidate,
     CommandRefusedError,
     Health,
@@ -42,6 +43,7 @@ from coec.calibration.lifecycle.states import MEANING, TRANSITIONS, Event, Healt
 
 __all__ = [
     "MEANING",
+    "NOT_ACQUITTED",
     "TRANSITIONS",
     "AlarmRecord",
     "Candidate",

@@ -20,12 +20,16 @@ from coec.calibration.lifecycle.alarm_record import AlarmRecord
 from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
 from coec.calibration.monitor.change_detector import (
     ACCUSING,
+    ACQUITTAL_PERIODS,
     AlarmLevels,
     Finding,
     MonitorState,
     Observation,
+    after_window,
     alarm_levels,
     diagnose,
+    is_acquitted,
+    leading_cause,
 )
 from coec.calibration.monitor.change_detector import after_observation as check_taken
 from coec.calibration.monitor.sensor_faults import CAUSES, Cause
@@ -38,6 +42,9 @@ from coec.geometry import se3
 BENT_MOUNT = "bent_mount"
 """The one cause of `diagnose` that lies in the calibration; every other lies in the data."""
 
+NOT_ACQUITTED = "not_acquitted"
+"""Code of the reason that no check vouches for the served extrinsic."""
+
 LAST_KNOWN = "last_known"
 """Code of the reason that says what was last known before checks stopped."""
 
@@ -48,6 +55,13 @@ SETTLING_NS = 60_000_000_000
 that follow each other then count as one, and readers of health do not see two changes a minute."""
 
 SETTLING = Reason("settling", "The data can be judged again, after a stretch where they could not.")
+
+TRANSLATION_OPEN = Reason(
+    "translation_open",
+    "The checks see a displacement of the mount, and the latest window, with `search.dof: 3`, cannot judge it; "
+    "calibrate with 6 degrees of freedom, or see that the mount is where it was.",
+)
+"""A window that searches rotations alone is accepted while checks accuse the translation."""
 
 NOT_EVALUATED = Reason("not_evaluated", "No window has been evaluated yet.")
 
@@ -187,7 +201,9 @@ def restored(state: PairState) -> PairState:
     since, whatever the clock says. A suspicion or an alarm outlives the restart."""
     if state.provenance is Provenance.ESTIMATED:
         state = replace(state, provenance=Provenance.RESTORED)
-    return _unseen(state, Event.RESTARTED, RESTARTED)
+    # The mount may have moved since, and the vehicle too.
+    monitor = replace(state.monitor, acquitted_ns=None, unacquitted=0, stood=False, standstill=None)
+    return _unseen(replace(state, monitor=monitor), Event.RESTARTED, RESTARTED)
 
 
 def moved(estimate: Estimate, pose: Matrix4, rig: Rig) -> Estimate:
@@ -219,17 +235,24 @@ def before_estimate(state: PairState, estimate: Estimate, window_start_ns: int, 
     return _unless_red(state, Event.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
 
 
-def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules) -> PairState:
-    """The state after a window was solved. `window_start_ns` is the stamp of its first pair."""
+def after_estimate(
+    state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules, now_ns: int | None = None
+) -> PairState:
+    """The state after a window was solved.
+
+    Args:
+        window_start_ns: stamp of its first pair.
+        now_ns: sensor time now: a window whose data are older than three periods does not make a pair healthy. None:
+            the time of its last pair.
+    """
     state = replace(state, latest=estimate, failures=())
     if estimate.verdict.decision is Decision.FAILED:
         state = replace(state, status=Status.FAILED)
         moved = _well_told_move(estimate)
         if estimate.verdict.tells_another_lens:
             return _poor(state, Event.DATA_CAUSE, estimate.data_stamp_ns, CAUSES[INTRINSICS_OFF].as_reason())
-        # In a tunnel two poses fit as well as before and after a knock. Without a check that has something against the
-        # pairs, such a window is no witness.
-        if (moved is None and estimate.verdict.cannot_tell) or (moved is not None and not _objected(state)):
+        # In a tunnel two poses fit as well as before and after a step: checks that acquit later pairs outweigh that.
+        if (moved is None and estimate.verdict.cannot_tell) or (moved is not None and _is_outweighed(state, moved)):
             return state
         # If the camera moved within the window, the end of the window shows where it is now.
         latest = estimate.optimum.T_camera_lidar if moved is None else moved.T_after
@@ -248,12 +271,16 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
         return _unless_red(replace(state, pending=pending), Event.STEP_SUSPECTED, why)
     # A track of one window has that window's pose to the last bit.
     pose = estimate.optimum.T_camera_lidar if track.windows <= 1 else track.T_camera_lidar
-    return _applied_or_waiting(state, pose, estimate, rules.policy)
+    return _applied_or_waiting(state, pose, estimate, estimate.data_stamp_ns, rules, now_ns)
 
 
-def _objected(state: PairState) -> bool:
-    """Whether the monitor has something against the mount, and nothing against the data."""
-    return state.flagged_since_ns is not None and _data_cause(state.monitor) is None
+def _is_outweighed(state: PairState, moved: MovedWithin) -> bool:
+    """Whether a move that a window dates counts for nothing: something is wrong with the data, or a check acquits pairs
+    after it and none has anything against them."""
+    if _data_cause(state.monitor) is not None:
+        return True
+    acquitted_ns = state.monitor.acquitted_ns
+    return state.flagged_since_ns is None and acquitted_ns is not None and acquitted_ns > moved.first_after_ns
 
 
 def _data_cause(monitor: MonitorState) -> Cause | None:
@@ -299,7 +326,7 @@ def after_joint(state: PairState, joint: Estimate, stamp_ns: int, rules: Rules) 
     pose = joint.optimum.T_camera_lidar
     track = Track.initial(pose, prior_sigma(rules.tracker), stamp_ns)
     track = absorb(track, replace(Measurement.of(joint), stamp_ns=stamp_ns), rules.tracker)
-    return _applied_or_waiting(replace(state, track=track), pose, joint, rules.policy)
+    return _applied_or_waiting(replace(state, track=track), pose, joint, stamp_ns, rules)
 
 
 def after_failure(state: PairState, reason: Reason) -> PairState:
@@ -326,43 +353,59 @@ def _accused_elsewhere(state: PairState, estimate: Estimate, rules: Rules) -> bo
     return accused and not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
 
 
-def _applied_or_waiting(state: PairState, pose: Matrix4, estimate: Estimate, rules: PolicyConfig) -> PairState:
+def _applied_or_waiting(
+    state: PairState, pose: Matrix4, estimate: Estimate, stamp_ns: int, rules: Rules, now_ns: int | None = None
+) -> PairState:
+    """The state after an accepted pose (4, 4) that rests on data up to the sensor time `stamp_ns`; for `now_ns` see
+    `after_estimate`."""
     step = policy.step_between(state.T_camera_lidar, pose)
     if not step.any():
-        return _served(state, pose, estimate)
+        return _confirmed(_served(state, pose, estimate), estimate, stamp_ns, rules, now_ns)
     past = policy.remembered(state.changes, estimate.data_stamp_ns)
-    waits = policy.objection(step, past, estimate.data_stamp_ns, rules)
+    waits = policy.objection(step, past, estimate.data_stamp_ns, rules.policy)
     if state.hold is not None:
         waits = Reason("held", "The extrinsic is held by command: the candidate waits for its release.")
     if waits is None:
         change = policy.Change(estimate.data_stamp_ns, tuple(abs(float(value)) for value in step))
-        return replace(_served(state, pose, estimate), changes=(*past, change))
-    close = policy.agrees(step, rules)
+        served = replace(_served(state, pose, estimate), changes=(*past, change))
+        return _confirmed(served, estimate, stamp_ns, rules, now_ns)
+    close = policy.agrees(step, rules.policy)
     state = replace(state, pending=Candidate(pose, estimate, waits, contradicts=not close))
     if close:
-        return _confirmed(state, estimate.data_stamp_ns)
+        return _confirmed(state, estimate, stamp_ns, rules, now_ns)
     why = Reason("candidate_waits", f"An accepted window differs by {_told(step)} from what is served.")
     return happened(state, Event.CONTRADICTED, why, waits)
 
 
 def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
-    state = replace(
+    # A check, however recent, acquits only the extrinsic that it checked.
+    changed = not np.array_equal(pose, state.T_camera_lidar)
+    return replace(
         state,
+        monitor=replace(state.monitor, acquitted_ns=None, standstill=None) if changed else state.monitor,
         T_camera_lidar=pose,
         provenance=Provenance.ESTIMATED,
         valid_from_ns=estimate.data_stamp_ns,
         accepted=estimate,
         pending=None,
     )
-    return _confirmed(state, estimate.data_stamp_ns)
 
 
-def _confirmed(state: PairState, stamp_ns: int) -> PairState:
-    """The state after a window vouches for the served extrinsic. All that the monitor had against it is dropped; causes
-    in the data stay."""
-    fresh = MonitorState(blind=state.monitor.blind, dirt=state.monitor.dirt, vouched=True)
-    cause = _data_cause(fresh)
-    state = replace(state, proven=True, monitor=fresh, flagged_since_ns=None)
+def _confirmed(state: PairState, estimate: Estimate, stamp_ns: int, rules: Rules, now_ns: int | None) -> PairState:
+    """The state after a window with data up to the sensor time `stamp_ns` vouches for the served extrinsic. What the
+    monitor had against it is dropped, as far as the window could judge it; causes in the data stay."""
+    solved_translation = bool(estimate.solved[3:].all())
+    monitor = after_window(state.monitor, stamp_ns, rules.alarm, solved_translation=solved_translation)
+    accused = monitor.outcome in (Finding.SUSPECT, Finding.CONFIRMED)
+    since_ns = (state.flagged_since_ns or state.valid_from_ns) if accused else None
+    state = replace(state, proven=True, monitor=monitor, flagged_since_ns=since_ns)
+    if accused:
+        event = Event.MOUNT_MOVED if monitor.outcome is Finding.CONFIRMED else Event.SUSPECTED
+        return _unless_red(state, event, TRANSLATION_OPEN)
+    cause = _data_cause(monitor)
+    if not is_acquitted(monitor, stamp_ns if now_ns is None else now_ns, rules.monitor):
+        text = "A window confirms the extrinsic, but its last pairs are old; no check has acquitted it since."
+        return happened(state, Event.CONFIRMED_EARLIER, Reason(NOT_ACQUITTED, text))
     if cause is None:
         return _well_again(state, Event.CONFIRMED_BY_WINDOW, stamp_ns)
     after = happened(happened(state, Event.CONFIRMED_BY_WINDOW), Event.DATA_CAUSE, cause.as_reason())
@@ -399,13 +442,31 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
     if monitor.outcome is Finding.AT_ODDS:
         text = "The latest checks accuse the mount, but do not add up to a move; a window is being taken to decide."
         return _poor(state, Event.AT_ODDS, observation.stamp_ns, Reason("checks_at_odds", text))
+    if monitor.unacquitted > 0:
+        return _not_renewed(state, observation, rules)
     # A clear monitor does not outweigh an accepted window that contradicts the served extrinsic.
-    if monitor.outcome is Finding.CLEAR and (state.pending is None or not state.pending.contradicts):
+    if state.pending is None or not state.pending.contradicts:
         if state.proven:
             return _well_again(state, Event.CLEAR, observation.stamp_ns)
         after = _well_again(state, Event.NO_OBJECTION, observation.stamp_ns, NOT_EVALUATED)
         return after if after.health is not state.seen or after.reasons == (SETTLING,) else _seen_again(state)
     return state
+
+
+def _not_renewed(state: PairState, observation: Observation, rules: Rules) -> PairState:
+    """The state after a check that neither acquits nor makes the monitor accuse. Health stays as it is for three
+    periods from the last acquitting check; then the cause that explains most checks is the answer."""
+    monitor = state.monitor
+    lapsed = monitor.acquitted_ns is not None or monitor.unacquitted >= ACQUITTAL_PERIODS
+    if is_acquitted(monitor, observation.stamp_ns, rules.monitor) or not lapsed:
+        return state
+    cause = leading_cause(monitor.blind)
+    if cause is not None and cause.code == BENT_MOUNT:
+        text = "The latest checks accuse the mount, and none acquits it."
+        return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
+    text = "No check of the latest pairs can confirm the extrinsic: their edges are faint, or do not fit well enough."
+    why = cause.as_reason() if cause is not None else Reason(NOT_ACQUITTED, text)
+    return _poor(state, Event.NOT_ACQUITTED, observation.stamp_ns, why)
 
 
 def _poor(state: PairState, event: Event, stamp_ns: int, why: Reason) -> PairState:
@@ -467,7 +528,10 @@ def time_stepped_back(state: PairState, stamp_ns: int) -> PairState:
     were suspected, every pair of the new clock is."""
     since_ns = None if state.flagged_since_ns is None else stamp_ns
     state = replace(
-        state, flagged_since_ns=since_ns, poor_since_ns=None, monitor=replace(state.monitor, last_stamps_ns=())
+        state,
+        flagged_since_ns=since_ns,
+        poor_since_ns=None,
+        monitor=replace(state.monitor, last_stamps_ns=(), acquitted_ns=None, unacquitted=0, standstill=None),
     )
     why = Reason("time_stepped_back", "The clock of the sensors stepped back; nothing has been looked at since.")
     return _unseen(state, Event.TIME_STEPPED_BACK, why)
@@ -477,7 +541,8 @@ def time_stepped_back(state: PairState, stamp_ns: int) -> PairState:
 
 
 def apply_pending(state: PairState, rules: Rules) -> PairState:
-    """The state after a person accepts the candidate; the limits of the policy do not bind people.
+    """The state after a person accepts the candidate; the limits of the policy do not bind people. It has to be checked
+    before it counts as healthy: the window that found it may be hours old.
 
     Raises:
         CommandRefusedError: nothing waits, or the extrinsic is held.
@@ -488,7 +553,8 @@ def apply_pending(state: PairState, rules: Rules) -> PairState:
     pose, estimate, track = state.pending.T_camera_lidar, state.pending.estimate, state.track
     if track is None or not np.array_equal(track.T_camera_lidar, pose):
         track = Track.initial(pose, prior_sigma(rules.tracker), estimate.data_stamp_ns)
-    return replace(_served(state, pose, estimate), track=track)
+    state = _served(_replaced(state, pose, "Applied by command; not checked since."), pose, estimate)
+    return replace(state, proven=True, track=track)
 
 
 def rolled_back(state: PairState, pose: Matrix4, estimate: Estimate, rules: Rules) -> PairState:
@@ -534,11 +600,11 @@ def released(state: PairState) -> PairState:
 
 def after_commissioning(state: PairState, T_commissioned: Matrix4) -> PairState:
     """The state after the rig was commissioned: if the commissioned pose is the served one, it is the baseline of this
-    rig and counts as confirmed."""
+    rig. Health stays: the windows that it was learned from may be old, and a check has to acquit it."""
     if not np.array_equal(T_commissioned, state.T_camera_lidar):
         return state
-    state = replace(state, provenance=Provenance.COMMISSIONED, proven=True, monitor=MonitorState(vouched=True))
-    return happened(state, Event.CONFIRMED_BY_WINDOW)
+    monitor = MonitorState(vouched=True, acquitted_ns=state.monitor.acquitted_ns, standstill=state.monitor.standstill)
+    return replace(state, provenance=Provenance.COMMISSIONED, proven=True, monitor=monitor)
 
 
 def _replaced(state: PairState, pose: Matrix4, text: str) -> PairState:

@@ -38,6 +38,7 @@ class Event(StrEnum):
     """What can happen to the health of a pair."""
 
     CONFIRMED_BY_WINDOW = "window_agrees"
+    CONFIRMED_EARLIER = "window_agreed_earlier"
     CONTRADICTED = "window_contradicts"
     STEP_SUSPECTED = "window_differs"
     REFUSED_ELSEWHERE = "window_refused_elsewhere"
@@ -47,6 +48,7 @@ class Event(StrEnum):
     MOUNT_MOVED = "monitor_confirms"
     AT_ODDS = "monitor_at_odds"
     DATA_CAUSE = "data_cause"
+    NOT_ACQUITTED = "not_acquitted"
     OVERDUE = "check_overdue"
     AGED = "aged"
     REPLACED = "replaced"
@@ -57,18 +59,21 @@ class Event(StrEnum):
 MEANING: Mapping[Event, str] = MappingProxyType(
     {
         Event.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
+        Event.CONFIRMED_EARLIER: "an accepted window is served, or agrees, but its data are older than three periods",
         Event.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
         Event.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
         Event.REFUSED_ELSEWHERE: "a window was refused, but it, or its end, shows a pose other than what is served",
-        Event.CLEAR: "the monitor sees nothing wrong with an extrinsic that a window has confirmed",
-        Event.NO_OBJECTION: "the monitor sees nothing wrong with an extrinsic that no window has confirmed",
-        Event.SUSPECTED: "the monitor suspects that the mount has moved",
+        Event.CLEAR: "a check acquits an extrinsic that a window has confirmed",
+        Event.NO_OBJECTION: "a check acquits an extrinsic that no window has confirmed",
+        Event.SUSPECTED: "the monitor suspects that the mount has moved, or checks accuse it and none acquits it "
+        "for three periods",
         Event.MOUNT_MOVED: "the monitor is certain that the mount has moved",
         Event.AT_ODDS: "checks accuse the mount, but do not add up to a move",
         Event.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
+        Event.NOT_ACQUITTED: "three periods passed in which checks were completed, and none acquits the extrinsic",
         Event.OVERDUE: "no check has been completed for three periods of the monitor",
         Event.AGED: "no check has been completed for `stale_after_s`",
-        Event.REPLACED: "a person replaced the extrinsic (rollback, reset)",
+        Event.REPLACED: "a person replaced the extrinsic (apply, rollback, reset)",
         Event.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing has been checked in the new time",
         Event.RESTARTED: "the service was started again: nothing has been checked since",
     }
@@ -77,12 +82,14 @@ MEANING: Mapping[Event, str] = MappingProxyType(
 _U, _H, _S, _M, _D, _A = HealthState
 
 # Rows: what happens. Columns: the state in which it happens, in the order of `HealthState`.
-#   Green (healthy) is reached and kept only by looking (CONFIRMED_BY_WINDOW, CLEAR). Red (miscalibrated) ends only by
+#   Green (healthy) is reached and renewed only by a check that acquits (CLEAR) or a window that agrees
+#   (CONFIRMED_BY_WINDOW), and ends after three periods without one. Red (miscalibrated) ends only by
 #   a window that agrees, by a person, or step by step by a monitor that stays clear; neither silence nor bad data hides
 #   it. A window that cannot tell or failed is no event, because it says nothing of the mount.
 _ROWS: Mapping[Event, tuple[HealthState, ...]] = {
     #                            unknown healthy suspect miscal. degraded stale
     Event.CONFIRMED_BY_WINDOW: (_H, _H, _H, _H, _H, _H),
+    Event.CONFIRMED_EARLIER: (_U, _U, _U, _U, _U, _U),
     Event.CONTRADICTED: (_M, _M, _M, _M, _M, _M),
     Event.STEP_SUSPECTED: (_S, _S, _S, _M, _S, _S),
     Event.REFUSED_ELSEWHERE: (_S, _S, _S, _M, _S, _S),
@@ -92,7 +99,8 @@ _ROWS: Mapping[Event, tuple[HealthState, ...]] = {
     Event.MOUNT_MOVED: (_M, _M, _M, _M, _M, _M),
     Event.AT_ODDS: (_D, _D, _S, _M, _D, _D),
     Event.DATA_CAUSE: (_D, _D, _D, _M, _D, _D),
-    Event.OVERDUE: (_U, _D, _D, _M, _D, _A),
+    Event.NOT_ACQUITTED: (_D, _D, _S, _M, _D, _D),
+    Event.OVERDUE: (_U, _D, _S, _M, _D, _A),
     Event.AGED: (_U, _A, _A, _M, _A, _A),
     Event.REPLACED: (_U, _U, _U, _U, _U, _U),
     Event.TIME_STEPPED_BACK: (_U, _U, _S, _M, _U, _U),

@@ -6,19 +6,35 @@ that were not counted yet. The thresholds follow from how often a right mount ma
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from math import isfinite, log, radians
+from math import fsum, isfinite, log, radians
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.baseline import Drift
 from coec.calibration.commissioning.quantiles import chi2_quantile
-from coec.calibration.monitor.hypotheses import MOST_STEP, Axes, Hypotheses, after_check, learnt_distance2
-from coec.calibration.monitor.likelihood import AXES, FARTHER, WEAK_TIMES, Three, Told, three
-from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, DIRTY_CHECKS, DIRTY_SHARE, LENS_DIRTY, Cause
+from coec.calibration.monitor.hypotheses import (
+    MOST_STEP,
+    PLACE_TIMES,
+    Axes,
+    Hypotheses,
+    after_check,
+    learnt_distance2,
+)
+from coec.calibration.monitor.likelihood import AXES, FARTHER, WEAK_TIMES, Three, Told, plus, three
+from coec.calibration.monitor.mount_scatter import LOOSE_AT, MountScatter
+from coec.calibration.monitor.sensor_faults import (
+    BENT_MOUNT,
+    CAUSES,
+    DIRTY_CHECKS,
+    DIRTY_SHARE,
+    LENS_DIRTY,
+    MOUNT_LOOSE,
+    Cause,
+)
 from coec.calibration.types import Metric
 from coec.config import MonitorConfig
 
@@ -55,10 +71,27 @@ pose itself is doubted, until a window has vouched for that pose. Of right rigs 
 twenty lies above."""
 
 BLIND_AT, MOST_BLIND = 1.2, 3.5
-"""Independent checks that show a cause in the data before it is believed (more than one), and the most that are
+"""Independent checks that show causes in the data before one is believed (more than one), and the most that are
 counted, so that a cause that went away is forgotten after three."""
 
+ACQUITTAL_PERIODS = 3
+"""Periods of the monitor after which an acquitting check no longer vouches for the served extrinsic (ARCHITECTURE)."""
+
+LEARNED2 = chi2_quantile(0.95, AXES)
+"""Squared distance, in standard deviations, from where the mount has been so far, beyond which a check does not acquit,
+even if its optimum is no farther off than on rigs about which nothing is known: one in twenty of a right mount."""
+
+CONTRADICTION2 = chi2_quantile(1.0 - 1e-4, AXES)
+"""Squared distance, in standard deviations of their difference, beyond which two checks of one place contradict each
+other. The scene of a standing vehicle stays, so that only what is new at every check separates them."""
+
 S_PER_H = 3600.0
+NS_PER_S = 1_000_000_000
+
+ROTATION_AXES, TRANSLATION_AXES = slice(0, 3), slice(3, 6)
+
+_OF_THE_MOUNT = frozenset({BENT_MOUNT.code, MOUNT_LOOSE.code})
+"""Causes that a window can clear."""
 
 
 def _unknown() -> NDArray[np.float64]:
@@ -109,7 +142,9 @@ class Observation:
         dirty: blocks of the image, by number, that have no contrast in any pair; for commissioned rigs in daylight.
         textured: number of blocks that could be dirty; 0 if unknown.
         standing_stamps_ns: of the pairs that were taken while the vehicle stood.
-        undecided: the check by itself neither accuses the pose nor acquits it.
+        undecided: the optimum lies too far off for a right pose, but the edges do not insist on it.
+        has_power: the edges at the local optimum are significant and stand out from other poses, so that the check
+            would hardly miss a displacement of a degree.
     """
 
     stamp_ns: int
@@ -132,6 +167,13 @@ class Observation:
     textured: int = 0
     standing_stamps_ns: tuple[int, ...] = ()
     undecided: bool = False
+    has_power: bool = True
+
+    @property
+    def acquits(self) -> bool:
+        """Whether the check by itself vouches for the pose: it would have noticed a wrong one, its edges lie where they
+        should, and nothing is wrong with its data."""
+        return self.has_power and not (self.flagged or self.undecided or self.causes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,13 +207,67 @@ def alarm_levels(config: MonitorConfig) -> AlarmLevels:
 
 
 @dataclass(frozen=True, slots=True)
+class Offset:
+    """Where a check puts the mount from the served extrinsic on three axes (rad or m), and per axis the variance of
+    what separates it from other checks of the same place."""
+
+    mean: Three
+    variance: Three
+
+
+@dataclass(frozen=True, slots=True)
+class Standstill:
+    """The check that counts for the place where the vehicle stands.
+
+    Attributes:
+        acquits: whether it vouches for the served extrinsic.
+        rotation, translation: where it puts the mount; None if undetermined.
+        contradicted: whether a later check of the place contradicts it. Then all further ones count.
+    """
+
+    acquits: bool
+    rotation: Offset | None
+    translation: Offset | None
+    contradicted: bool = False
+
+    @classmethod
+    def of(cls, observation: Observation) -> Standstill:
+        """The record of a check."""
+        return cls(observation.acquits, _offset(observation, ROTATION_AXES), _offset(observation, TRANSLATION_AXES))
+
+    def contradicts(self, observation: Observation) -> bool:
+        """Whether a later check of the same place says something else of the mount."""
+        other = Standstill.of(observation)
+        if other.acquits != self.acquits and (observation.flagged or other.acquits):
+            return True
+        return _are_apart(self.rotation, other.rotation) or _are_apart(self.translation, other.translation)
+
+
+def _offset(observation: Observation, axes: slice) -> Offset | None:
+    told = told_by(observation, axes, None)
+    if told is None:
+        return None
+    # Pairs that were taken before the vehicle stood have the error of another place.
+    stands = set(observation.standing_stamps_ns).issuperset(observation.pair_stamps_ns)
+    return Offset(told.offset, told.noise if stands else plus(told.noise, told.place))
+
+
+def _are_apart(one: Offset | None, other: Offset | None) -> bool:
+    if one is None or other is None:
+        return False
+    rows = zip(one.mean, other.mean, one.variance, other.variance, strict=True)
+    return fsum((a - b) ** 2 / (v + w) for a, b, v, w in rows) > CONTRADICTION2
+
+
+@dataclass(frozen=True, slots=True)
 class MonitorState:
     """What the checks so far add up to: plain values that go through JSON as they are.
 
     Attributes:
         outcome: what the checks so far say.
         turned, shifted: the hypotheses about the rotations and about the translations.
-        blind: evidence of every cause in the data, in independent checks, by code.
+        blind: number of recent independent checks that each cause explains, by code; `bent_mount` explains those that
+            accuse the mount. Causes compete: together they explain at most `MOST_BLIND` checks.
         dirt: by number, every block of the image that was dirty in the last checks, and in how many in a row.
         at_odds: number of flagged checks in a row.
         last_stamps_ns: stamps of the pairs of the last check.
@@ -180,6 +276,12 @@ class MonitorState:
         counted: number of checks that counted, partial ones by their part; at most `AT_ODDS_AT`.
         vouched: whether a window has found the served pose to be right.
         doubtful: number of checks to come that count as faint, however clear they are.
+        acquitted_ns: sensor time of the last check, or accepted window, that acquits the served extrinsic; None if none
+            does.
+        unacquitted: number of completed checks since then.
+        standstill: the check that counts for the place where the vehicle stands; None while it drives, or if no check
+            there could judge.
+        scatter: how far the mount moves from one check to the next.
     """
 
     outcome: Finding = Finding.UNKNOWN
@@ -194,6 +296,10 @@ class MonitorState:
     counted: float = 0.0
     vouched: bool = False
     doubtful: float = 0.0
+    acquitted_ns: int | None = None
+    unacquitted: int = 0
+    standstill: Standstill | None = None
+    scatter: MountScatter = field(default_factory=MountScatter)
 
     @property
     def evidence(self) -> float:
@@ -203,28 +309,75 @@ class MonitorState:
 
 
 def after_observation(state: MonitorState, observation: Observation, levels: AlarmLevels) -> MonitorState:
-    """The state after one more check. The check counts by the share of its pairs that the last check did not hold.
-    While the vehicle stands, only the first check says something new of the mount."""
-    fresh, told_before = _fresh(state, observation)
+    """The state after one more check. The check counts by the share of its pairs that the last check did not hold. At a
+    standstill only the first check of the place says something new of the mount, until another contradicts it."""
+    fresh, repeated = _novelty(state, observation)
     stands = observation.pair_stamps_ns[-1] in set(observation.standing_stamps_ns)
     dirt = _dirt_after(state.dirt, observation, fresh)
     codes = {cause.code for cause in observation.causes}
     if sum(run >= DIRTY_CHECKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
         codes.add(LENS_DIRTY.code)
-    blind = {
-        code: min(max(state.blind.get(code, 0.0) + (fresh if code in codes else -fresh), 0.0), MOST_BLIND)
-        for code in {*state.blind, *codes}
-    }
-    blind = {code: blind[code] for code in sorted(blind) if blind[code] > 0.0}
-    doubtful = doubtful_after(state.doubtful, observation.weak, fresh)
+    scatter = state.scatter
+    if not codes and fresh > 0.0:
+        scatter = scatter.after(told_by(observation, ROTATION_AXES, None), ROTATIONS.reach, fresh)
+        if scatter.evidence >= LOOSE_AT:
+            codes.add(MOUNT_LOOSE.code)
+    acquits = observation.acquits and not codes and _agrees_with_earlier(state, observation)
     after = replace(
-        state, blind=blind, dirt=dirt, last_stamps_ns=observation.pair_stamps_ns, stood=stands, doubtful=doubtful
+        state,
+        blind=_explained(state.blind, codes or ({BENT_MOUNT.code} if observation.flagged else ()), fresh),
+        dirt=dirt,
+        last_stamps_ns=observation.pair_stamps_ns,
+        stood=stands,
+        doubtful=doubtful_after(state.doubtful, observation.weak, fresh),
+        acquitted_ns=observation.stamp_ns if acquits else state.acquitted_ns,
+        unacquitted=0 if acquits else state.unacquitted + 1,
+        standstill=_standstill_after(state, observation, judged=not codes) if stands else None,
+        scatter=scatter,
     )
-    if codes or told_before or fresh == 0.0:
+    if codes or repeated or fresh == 0.0:
         # Neither for nor against: the data cannot tell, or were counted before.
         return after
     after = _weighed(after, replace(observation, weak=observation.weak or state.doubtful > 0.0), fresh, levels)
-    return replace(after, outcome=_outcome(state.outcome, after, levels))
+    after = replace(after, outcome=_outcome(state.outcome, after, levels))
+    place = after.standstill
+    if place is not None and place.contradicted and acquits and after.outcome is Finding.CLEAR:
+        return replace(after, standstill=Standstill.of(observation))
+    return after
+
+
+def after_window(state: MonitorState, stamp_ns: int, levels: AlarmLevels, *, solved_translation: bool) -> MonitorState:
+    """The state after a window with data up to the sensor time `stamp_ns` vouches for the served extrinsic. Causes in
+    the data stay. So does what is known of the translation, if the window searched none: it cannot clear what it cannot
+    see."""
+    after = MonitorState(
+        blind={code: weight for code, weight in state.blind.items() if code not in _OF_THE_MOUNT},
+        dirt=state.dirt,
+        vouched=True,
+        acquitted_ns=max(stamp_ns, stamp_ns if state.acquitted_ns is None else state.acquitted_ns),
+        standstill=state.standstill,
+        stood=state.stood,
+        last_stamps_ns=state.last_stamps_ns,
+    )
+    if solved_translation:
+        return after
+    after = replace(after, shifted=state.shifted)
+    outcome = _outcome(state.outcome, after, levels)
+    return replace(after, outcome=outcome if outcome is not Finding.CLEAR else Finding.UNKNOWN)
+
+
+def is_acquitted(state: MonitorState, now_ns: int, config: MonitorConfig) -> bool:
+    """Whether a check still vouches for the served extrinsic at a sensor time: an acquitting one of the last
+    `ACQUITTAL_PERIODS` periods, or of the place where the vehicle stands, if nothing has contradicted it since."""
+    if state.acquitted_ns is None:
+        return False
+    return holds_at_rest(state) or now_ns - state.acquitted_ns <= round(ACQUITTAL_PERIODS * config.period_s * NS_PER_S)
+
+
+def holds_at_rest(state: MonitorState) -> bool:
+    """Whether the vehicle stands where a check acquitted the served extrinsic, and nothing has contradicted that."""
+    place = state.standstill
+    return state.acquitted_ns is not None and place is not None and place.acquits and not place.contradicted
 
 
 def doubtful_after(doubtful: float, weak: bool, fresh: float) -> float:
@@ -234,28 +387,72 @@ def doubtful_after(doubtful: float, weak: bool, fresh: float) -> float:
 
 def share_told(state: MonitorState, observation: Observation) -> float:
     """The share of a check that is new compared with the checks before it, 0 to 1; see `after_observation`."""
-    fresh, told_before = _fresh(state, observation)
-    return 0.0 if told_before else fresh
+    fresh, repeated = _novelty(state, observation)
+    return 0.0 if repeated else fresh
 
 
-def _fresh(state: MonitorState, observation: Observation) -> tuple[float, bool]:
-    """The share of the pairs that the last check did not hold, and whether the vehicle has stood in one place since
-    that check. One place gives one independent check, however long the vehicle stands there."""
-    counted, standing = set(state.last_stamps_ns), set(observation.standing_stamps_ns)
+def _novelty(state: MonitorState, observation: Observation) -> tuple[float, bool]:
+    """The share of the pairs that the last check did not hold, and whether the check only repeats one that counted. One
+    place gives one independent check, however long the vehicle stands there, until a check contradicts that one."""
+    counted = set(state.last_stamps_ns)
     fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
-    return fresh, state.stood and standing.issuperset(observation.pair_stamps_ns)
+    place = _same_place(state, observation)
+    return fresh, place is not None and not place.contradicted and not place.contradicts(observation)
+
+
+def _same_place(state: MonitorState, observation: Observation) -> Standstill | None:
+    """The check that counts for the place where all pairs of another were taken; None if that is a new place."""
+    standing = set(observation.standing_stamps_ns)
+    return state.standstill if state.stood and standing.issuperset(observation.pair_stamps_ns) else None
+
+
+def _standstill_after(state: MonitorState, observation: Observation, *, judged: bool) -> Standstill | None:
+    """The check that counts for the place where the vehicle stands at the end of another; `judged`: whether that one
+    says anything of the mount."""
+    place = _same_place(state, observation)
+    if not judged:
+        return place
+    if place is None:
+        return Standstill.of(observation)
+    return replace(place, contradicted=place.contradicted or place.contradicts(observation))
+
+
+def _explained(weights: Mapping[str, float], codes: Collection[str], fresh: float) -> dict[str, float]:
+    """How many recent checks each cause explains, after one more that counts by `fresh` and shows `codes`. Several
+    causes share a check. A check that shows none lowers all alike."""
+    after = {
+        code: weights.get(code, 0.0) + (fresh / len(codes) if code in codes else 0.0) for code in {*weights, *codes}
+    }
+    total = fsum(after.values())
+    most = MOST_BLIND if codes else total - fresh
+    if total > most:
+        after = {code: weight * max(most, 0.0) / total for code, weight in after.items()}
+    return {code: after[code] for code in sorted(after) if after[code] > 0.0}
+
+
+def _agrees_with_earlier(state: MonitorState, observation: Observation) -> bool:
+    """Whether a check puts the mount where earlier ones did, as far as streets differ."""
+    for axes, tests in ((ROTATION_AXES, state.turned), (TRANSLATION_AXES, state.shifted)):
+        told = told_by(observation, axes, None)
+        if told is not None and tests.right is not None:
+            street = tests.right.wider(three([PLACE_TIMES**2 * variance for variance in told.place]))
+            if street.distance2(told) > LEARNED2:
+                return False
+    return True
 
 
 def _weighed(state: MonitorState, observation: Observation, fresh: float, levels: AlarmLevels) -> MonitorState:
-    """The state with its hypotheses after a check that counts by `fresh`. A check with faint edges may make the mount
-    suspect but does not confirm a move: a full solve has to."""
-    most = levels.suspect if observation.weak else levels.most
+    """The state with its hypotheses after a check that counts by `fresh`. A check with faint edges, or of a place where
+    the vehicle stands, may make the mount suspect but does not confirm a move: a lorry that parks in front of the
+    camera stays, too."""
+    stands = set(observation.standing_stamps_ns).issuperset(observation.pair_stamps_ns)
+    most = levels.suspect if observation.weak or stands else levels.most
     turned, shifted, astray2 = state.turned, state.shifted, state.astray2
-    told = told_by(observation, slice(0, 3), turned.before)
+    told = told_by(observation, ROTATION_AXES, turned.before)
     if told is not None:
         turned = after_check(turned, told, ROTATIONS, fresh, most)
         astray2 = learnt_distance2(turned, told.rig)
-    told = told_by(observation, slice(3, 6), shifted.before)
+    told = told_by(observation, TRANSLATION_AXES, shifted.before)
     if told is not None:
         shifted = after_check(shifted, told, TRANSLATIONS, fresh, most)
     step = fresh * (WEAK_SHARE if observation.weak else 1.0)
@@ -291,10 +488,21 @@ def told_by(observation: Observation, axes: slice, before: Three | None) -> Told
 
 def diagnose(state: MonitorState) -> Cause | None:
     """What is wrong, if anything is certain enough: first a cause in the data; a bent mount only once confirmed."""
-    for code, cause in CAUSES.items():
-        if state.blind.get(code, 0.0) >= BLIND_AT:
-            return cause
+    of_data = {code: weight for code, weight in state.blind.items() if code != BENT_MOUNT.code}
+    total = fsum(of_data.values())
+    # Against a mount that moved, causes in the data have to explain as many checks as it does.
+    if total >= BLIND_AT and total >= state.blind.get(BENT_MOUNT.code, 0.0):
+        return leading_cause(of_data)
     return BENT_MOUNT if state.outcome is Finding.CONFIRMED else None
+
+
+def leading_cause(weights: Mapping[str, float]) -> Cause | None:
+    """The cause that explains most checks; of equals the one that hides others. None if nothing needs one."""
+    return max(
+        (cause for code, cause in CAUSES.items() if weights.get(code, 0.0) > 0.0),
+        key=lambda cause: weights[cause.code],
+        default=None,
+    )
 
 
 def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: float) -> dict[str, float]:

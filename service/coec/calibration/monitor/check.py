@@ -141,7 +141,13 @@ def join(sight: Sight, sweeps: Sequence[PreparedSweep], images: PreparedImages, 
     pose = window.T_camera_lidar_start
     edges = lay(window.rig, window.pairs, sweeps, images, pose, reach_rad, compensated=sight.compensated)
     scenes = tuple(
-        SceneFacts(pair.stamp_ns, picture, sweep.facts, None if pair.motion is None else pair.motion.speed_mps)
+        SceneFacts(
+            pair.stamp_ns,
+            picture,
+            sweep.facts,
+            None if pair.motion is None else pair.motion.speed_mps,
+            None if pair.motion is None else pair.motion.turn_radps,
+        )
         for pair, picture, sweep in zip(window.pairs, images.facts, sweeps, strict=True)
     )
     features = cache(lambda: tuple(depth_features(sight, pose, DEPTH_POINTS)))

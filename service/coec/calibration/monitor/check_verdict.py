@@ -25,7 +25,7 @@ from coec.calibration.commissioning.baseline import (
 from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.sampling import drives
-from coec.calibration.frames.timing import explained_by_motion
+from coec.calibration.frames.timing import explained_by_nuisance
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import AT_POSE, Check, CheckInput, Expected, check_at, gather
 from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
@@ -176,7 +176,7 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
     dirty, textured = ((), 0) if baseline is None or causes else dirty_blocks(evidence.scenes, baseline.scene)
     if not causes and not faint & {Faint.EDGES_IN_VIEW, Faint.LOOKS}:
         # Few edges fit another clock as well as they fit another mount.
-        explained = explained_by_motion(
+        explained = explained_by_nuisance(
             evidence.edges.measured,
             evidence.rig,
             evidence.edges.whole.frames,
@@ -199,6 +199,7 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
         flagged=said is Opinion.FLAGGED,
         undecided=said is Opinion.UNDECIDED,
         weak=bool(faint),
+        has_power=not faint & {Faint.SIGNIFICANCE, Faint.CONTRAST},
         flagged_by_paper=None,
         causes=causes,
         drift=None if baseline is None else _drift(seen, baseline),

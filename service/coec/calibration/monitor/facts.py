@@ -43,8 +43,8 @@ def picture_facts(grey: NDArray[np.uint8]) -> PictureFacts:
     )
 
 
-def sweep_facts(seen: Bearings, range_edges: int) -> SweepFacts:
-    """The facts of a sweep, from the bearings of its points and the number of its range edges."""
+def sweep_facts(xyz_m: NDArray[np.float32], seen: Bearings, range_edges: int) -> SweepFacts:
+    """The facts of a sweep, from its points (N, 3), their bearings and the number of its range edges."""
     low, high = BAND_RANGE_RAD
     bands, sectors = grid_counts(seen.elevation, seen.azimuth, low, high, BANDS, SECTORS)
-    return SweepFacts(bands, sectors, range_edges)
+    return SweepFacts(bands, sectors, range_edges, zlib.crc32(np.ascontiguousarray(xyz_m).data))

@@ -7,7 +7,7 @@ vehicle. A cause has to show in most pairs of a check, so that one bad frame is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -48,6 +48,18 @@ values, is below this: a frozen image that was compressed anew has that much noi
 MOVED_M = 1.0
 """A vehicle that drove so far, in metres, must see another picture."""
 
+STOOD_M, STOOD_RAD = 0.2, 0.01
+"""A vehicle that moved and turned by less between two exposures must see the same things in the same places."""
+
+CHANGED = 0.5
+"""Two pictures are of different places if the median change of their textured cells exceeds this share of the local
+contrast. Simulated vehicles that stand are at 0.01 to 0.12 by day, 0.35 by night, 0.28 among people in a room; those
+that drive through streets and garages at 8 m/s are at 0.6 to 0.9, on highways and open roads at 0.1 to 0.4, which tells
+nothing. In the recorded garage, which stands, it is 0.07 to 0.15 (docs/measured.md)."""
+
+CHANGED_CONTRAST, CHANGED_CELLS = 4.0, 50
+"""Least difference between neighbouring cells of a textured one, grey values, and the least number of these."""
+
 BANDS, BAND_RANGE_RAD = 40, (-0.45, -0.05)
 """Bands of elevation in which points are counted: 0.57° each, from -26° to -3°. Each holds a beam of a 64-beam sensor,
 and each of these beams hits the ground. Beams above may hit nothing."""
@@ -85,6 +97,11 @@ BENT_MOUNT = Cause(
     "The camera and the LiDAR have moved against each other.",
     "See that the mount is tight; the next accepted window corrects the extrinsic, or `coec calibrate` does.",
 )
+MOUNT_LOOSE = Cause(
+    "mount_loose",
+    "The pose of the camera relative to the LiDAR changes from one check to the next by more than checks scatter.",
+    "Tighten the mount: no single extrinsic is right while it swings.",
+)
 LENS_DIRTY = Cause(
     "lens_dirty",
     "Parts of the image have lost their contrast in every exposure.",
@@ -99,6 +116,11 @@ CAMERA_FROZEN = Cause(
     "camera_frozen",
     "The camera repeats the same picture while the vehicle drives.",
     "Restart the camera or its driver.",
+)
+LIDAR_FROZEN = Cause(
+    "lidar_frozen",
+    "The LiDAR repeats the same sweep.",
+    "Restart the LiDAR or its driver.",
 )
 BEAMS_LOST = Cause(
     "lidar_beams_lost",
@@ -138,12 +160,14 @@ CAUSES = {
         LENS_COVERED,
         DARK,
         CAMERA_FROZEN,
+        LIDAR_FROZEN,
         LENS_DIRTY,
         BEAMS_LOST,
         OPEN_FIELD,
         EGO_MOTION_WRONG,
         TIME_OFFSET,
         INTRINSICS_WRONG,
+        MOUNT_LOOSE,
     )
 }
 """By code, causes that hide others first."""
@@ -174,21 +198,25 @@ class SweepFacts:
         bands: (BANDS,) points by elevation.
         sectors: (SECTORS,) the same points by azimuth.
         range_edges: range edges of the sweep.
+        digest: of all its points.
     """
 
     bands: NDArray[np.int64]
     sectors: NDArray[np.int64]
     range_edges: int
+    digest: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneFacts:
-    """What one pair shows of the sensors themselves; `speed_mps` is the speed of the vehicle, None if unknown."""
+    """What one pair shows of the sensors themselves; `speed_mps` and `turn_radps` are speed and rate of turn of the
+    vehicle by its odometry, None if unknown."""
 
     stamp_ns: int
     picture: PictureFacts
     sweep: SweepFacts
     speed_mps: float | None
+    turn_radps: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,6 +251,10 @@ def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) ->
         causes.append(LENS_COVERED)
     if _is_frozen(scenes):
         causes.append(CAMERA_FROZEN)
+    if _most(a.sweep.digest == b.sweep.digest for a, b in pairwise(scenes)):
+        causes.append(LIDAR_FROZEN)
+    if _moves_unnoticed(scenes):
+        causes.append(EGO_MOTION_WRONG)
     if (
         baseline is not None
         and max(
@@ -255,11 +287,49 @@ def _lost(counts: NDArray[np.int64], usual: NDArray[np.float64]) -> float:
     return float((counts.max(axis=0) < LOST_RATIO * usual)[counted].mean())
 
 
+def _most(facts: Iterable[bool]) -> bool:
+    values = list(facts)
+    return 2 * sum(values) > len(values)
+
+
 def _is_frozen(scenes: Sequence[SceneFacts]) -> bool:
-    """Whether most pairs of successive frames between which the vehicle drove show the same picture."""
-    pairs = [(a, b) for a, b in pairwise(scenes) if _moved(a, b)]
-    same = sum(_same_picture(a, b) for a, b in pairs)
-    return len(pairs) > 0 and 2 * same > len(pairs)
+    """Whether most successive pictures are identical, whatever the vehicle does, or the same while it drove."""
+    successive = list(pairwise(scenes))
+    # A picture of one grey value, as of darkness, may repeat itself. Any other has noise.
+    if _most(a.picture.digest == b.picture.digest and a.picture.thumbnail.std() > 0.0 for a, b in successive):
+        return True
+    return _most(_same_picture(a, b) for a, b in successive if _moved(a, b))
+
+
+def _moves_unnoticed(scenes: Sequence[SceneFacts]) -> bool:
+    """Whether the odometry says that the vehicle stands, and most successive pictures are of different places."""
+    successive = list(pairwise(scenes))
+    return all(_stood(a, b) for a, b in successive) and _most(
+        picture_change(a.picture.thumbnail, b.picture.thumbnail) > CHANGED for a, b in successive
+    )
+
+
+def _stood(a: SceneFacts, b: SceneFacts) -> bool:
+    """Whether the vehicle hardly moved between two exposures by its odometry."""
+    if a.speed_mps is None or b.speed_mps is None or a.turn_radps is None or b.turn_radps is None:
+        return False
+    elapsed_s = (b.stamp_ns - a.stamp_ns) * 1e-9
+    moved_m, turned_rad = max(a.speed_mps, b.speed_mps) * elapsed_s, max(a.turn_radps, b.turn_radps) * elapsed_s
+    return moved_m < STOOD_M and turned_rad < STOOD_RAD
+
+
+def picture_change(before: NDArray[np.float32], after: NDArray[np.float32]) -> float:
+    """How far the cells of two thumbnails (rows, columns) differ where the first has texture: the median change, in
+    units of the difference between neighbouring cells. 0 if too few cells have texture, or the shapes differ."""
+    if before.shape != after.shape or min(before.shape) < 2:
+        return 0.0
+    contrast = np.maximum(np.abs(np.diff(before, axis=0))[:, :-1], np.abs(np.diff(before, axis=1))[:-1])
+    textured = contrast > max(CHANGED_CONTRAST, float(np.median(contrast)))
+    if np.count_nonzero(textured) < CHANGED_CELLS:
+        return 0.0
+    change = (after - before)[:-1, :-1][textured]
+    # Another exposure makes all cells brighter alike.
+    return float(np.median(np.abs(change - np.median(change)) / contrast[textured]))
 
 
 def _moved(a: SceneFacts, b: SceneFacts) -> bool:

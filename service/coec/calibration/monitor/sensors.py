@@ -98,7 +98,7 @@ def prepare_sweep(sweep: LidarFrame) -> PreparedSweep:
     # The shift may come before motion compensation, which turns this tenth of a degree by two degrees at most.
     xyz_m = sweep.xyz_m[found.index] + found.shift_m
     edges = LidarFrame(sweep.stamp_ns, sweep.frame_id, xyz_m, time_offset_s=offsets_s)
-    return PreparedSweep(edges, found.weight, sweep_facts(seen, len(found.index)))
+    return PreparedSweep(edges, found.weight, sweep_facts(sweep.xyz_m, seen, len(found.index)))
 
 
 def outline(camera: Camera, edges: Sequence[LidarFrame], pose: Matrix4, reach_rad: float) -> Rectangle | None:

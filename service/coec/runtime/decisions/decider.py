@@ -23,6 +23,7 @@ from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Drift
 from coec.calibration.frames.window import KeptPairs
 from coec.calibration.lifecycle import HealthState, PairState, Rules
+from coec.calibration.monitor.change_detector import holds_at_rest
 from coec.calibration.types import Decision, Matrix4, Reason
 from coec.config import CalibrationConfig, PairConfig
 from coec.reports.holds import hold_text
@@ -224,7 +225,8 @@ class Decider:
         lost = self._queue.expire(monotonic_s, self._lost_question)
         if lost:
             self._losses.add("monitor", "unanswered", lost)
-        self._overdue = self._progress.overdue(self._stream.report, monotonic_s)
+        at_rest = holds_at_rest(self._store.state.monitor)
+        self._overdue = self._progress.overdue(self._stream.report, monotonic_s, at_rest=at_rest)
         self._store.age(self._overdue, self._progress.silent_s(monotonic_s), self._stale_after_s)
         # As long as the disk is only busy, nothing is reported that a restart would not know.
         self._untold = not self._store.may_be_told()
@@ -382,6 +384,7 @@ class Decider:
 
     def _judge(self, question: Question | None, result: CalibrationResult) -> Effect | None:
         estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)
+        now_ns = self._stream.report.chosen.last_ns
         told = estimate.verdict.decision is not Decision.FAILED
         if told:
             self._rig.accepted(_due_ns(question), estimate)
@@ -393,7 +396,7 @@ class Decider:
         )
         self._add_window_after(result)
         effect = self._step(
-            lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules),
+            lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules, now_ns),
             result.data_stamp_ns,
             completed=told,
             question=question,
@@ -463,9 +466,10 @@ class Decider:
         taken = self._store.update(step, stamp_ns, completed=completed, epoch=epoch)
         if taken is None:
             return None
-        if completed:
-            self._progress.completed(stamp_ns, time.monotonic(), self._stream.report)
         before, after = taken.before, taken.after
+        if completed:
+            acquits = after.monitor.acquitted_ns is not None and after.monitor.unacquitted == 0
+            self._progress.completed(stamp_ns, time.monotonic(), self._stream.report, acquits=acquits)
         if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
             self._latest_check = None
             self._rig.serves(_due_ns(question), after)

@@ -1,13 +1,16 @@
-"""Proof of progress: when a check was last completed, on both clocks, and why none has been completed since.
+"""Proof of progress: when a check was last completed, and when one last acquitted the served extrinsic, on both clocks;
+and why none has since.
 
-Health is green only because something was checked, never because no fault was reported. Any fault that keeps checks
-from being completed, known or not, shows here in the same way: no completed check comes.
+Health is green only because something was checked and found right, never because no fault was reported. Any fault that
+keeps checks from being completed, known or not, shows here in the same way: no completed check comes.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from coec.calibration.lifecycle import NOT_ACQUITTED
+from coec.calibration.monitor.change_detector import ACQUITTAL_PERIODS
 from coec.calibration.types import Reason
 from coec.errors import ModelError
 from coec.runtime.decisions.questions import ANSWER_PERIODS
@@ -16,9 +19,6 @@ from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.worker.jobs import Fate
 from coec.runtime.worker.queue import BUSY, SUPERSEDED, WORKER_FAILED
-
-PERIODS = 3
-"""After so many periods of the monitor without a completed check a pair is not green any more (ARCHITECTURE)."""
 
 SLOWEST_PACE = 0.1
 """Slowest replay, in seconds of sensor time per second. A slower one counts as standing still."""
@@ -72,12 +72,15 @@ class Progress:
 
     def __init__(self, period_s: float, monotonic_s: float, report: StreamStatistics) -> None:
         self._period_s = period_s
-        self._last = _Last(monotonic_s, None, report)
+        self._last = self._acquitted = _Last(monotonic_s, None, report)
         self._failure: Reason | None = None
 
-    def completed(self, stamp_ns: int | None, monotonic_s: float, report: StreamStatistics) -> None:
-        """A check of pairs up to this sensor time was completed; or a window, which says even more."""
+    def completed(self, stamp_ns: int | None, monotonic_s: float, report: StreamStatistics, *, acquits: bool) -> None:
+        """A check of pairs up to this sensor time was completed; or a window, which says even more. `acquits`: whether
+        it acquits the served extrinsic."""
         self._last = _Last(monotonic_s, stamp_ns, report)
+        if acquits:
+            self._acquitted = self._last
         self._failure = None
 
     def failed(self, reason: Reason) -> None:
@@ -86,27 +89,35 @@ class Progress:
 
     def time_stepped_back(self) -> None:
         """Sensor time has stepped back, so earlier stamps say nothing any more."""
-        self._last.stamp_ns = None
+        self._last.stamp_ns = self._acquitted.stamp_ns = None
 
     def silent_s(self, monotonic_s: float) -> float:
         """Time since the last completed check, or since the start, s."""
         return monotonic_s - self._last.monotonic_s
 
-    def overdue(self, report: StreamStatistics, monotonic_s: float) -> Reason | None:
-        """Why no check was completed for `PERIODS` periods, by the steady clock or by sensor time; None if one was. For
-        a replay that is slower than the drive the limit is longer in proportion."""
-        pace = 1.0 if report.pace is None else min(max(report.pace, SLOWEST_PACE), 1.0)
-        silent_s = self.silent_s(monotonic_s)
-        unseen_s = 0.0
-        if self._last.stamp_ns is not None and report.chosen.last_ns is not None:
-            unseen_s = (report.chosen.last_ns - self._last.stamp_ns) / NS_PER_S
-        late = silent_s > PERIODS * self._period_s / pace
-        # The stream may run ahead of an answer by `ANSWER_PERIODS`.
-        late |= unseen_s > (PERIODS + ANSWER_PERIODS) * self._period_s
-        if not late:
+    def overdue(self, report: StreamStatistics, monotonic_s: float, *, at_rest: bool) -> Reason | None:
+        """Why no check was completed, or none acquitted the extrinsic, for `ACQUITTAL_PERIODS` periods, by the steady
+        clock or by sensor time; None if one did. `at_rest`: the acquitting check of the place where the vehicle stands
+        still counts. For a replay that is slower than the drive the limit is longer in proportion."""
+        late_s = self._late_s(self._last, report, monotonic_s)
+        if late_s is not None:
+            code, why = self._cause(report)
+            return Reason(f"overdue_{code}", f"No check has been completed for {late_s:.0f} s: {why}")
+        late_s = None if at_rest else self._late_s(self._acquitted, report, monotonic_s)
+        if late_s is None:
             return None
-        code, why = self._cause(report)
-        return Reason(f"overdue_{code}", f"No check has been completed for {max(silent_s, unseen_s):.0f} s: {why}")
+        return Reason(NOT_ACQUITTED, f"Checks are completed, but none has acquitted the extrinsic for {late_s:.0f} s.")
+
+    def _late_s(self, last: _Last, report: StreamStatistics, monotonic_s: float) -> float | None:
+        """Time since `last`, s, if it is longer than allowed."""
+        pace = 1.0 if report.pace is None else min(max(report.pace, SLOWEST_PACE), 1.0)
+        silent_s, unseen_s = monotonic_s - last.monotonic_s, 0.0
+        if last.stamp_ns is not None and report.chosen.last_ns is not None:
+            unseen_s = (report.chosen.last_ns - last.stamp_ns) / NS_PER_S
+        late = silent_s > ACQUITTAL_PERIODS * self._period_s / pace
+        # The stream may run ahead of an answer by `ANSWER_PERIODS`.
+        late |= unseen_s > (ACQUITTAL_PERIODS + ANSWER_PERIODS) * self._period_s
+        return max(silent_s, unseen_s) if late else None
 
     def _cause(self, now: StreamStatistics) -> tuple[str, str]:
         """What has stood still since the last completed check: the first such stage on a frame's way."""
@@ -125,6 +136,8 @@ class Progress:
             return self._kind_of(self._failure), self._failure.text
         if now.chosen.checks == then.chosen.checks and now.chosen.not_afforded > then.chosen.not_afforded:
             return "budget", "`budget.cores` does not suffice; `budget` of status says for what."
+        if now.chosen.checks == then.chosen.checks and now.chosen.unanswered > 0:
+            return "worker", "a window is being solved, and checks wait for its result."
         if now.chosen.checks == then.chosen.checks:
             return "data", "too few pairs come, or they are too far apart, for a check."
         return "worker", "the worker has not answered."
