@@ -384,7 +384,8 @@ class Decider:
 
     def _judge(self, question: Question | None, result: CalibrationResult) -> Effect | None:
         estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)
-        now_ns = self._stream.report.chosen.last_ns
+        # When the answer counts, whenever it came: a replay decides alike.
+        now_ns = self._stream.report.chosen.last_ns if question is None else question.due_ns
         told = estimate.verdict.decision is not Decision.FAILED
         if told:
             self._rig.accepted(_due_ns(question), estimate)
