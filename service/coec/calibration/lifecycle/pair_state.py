@@ -360,7 +360,7 @@ def _applied_or_waiting(
     `after_estimate`."""
     step = policy.step_between(state.T_camera_lidar, pose)
     if not step.any():
-        return _confirmed(_served(state, pose, estimate), estimate, stamp_ns, rules, now_ns)
+        return _confirmed(_served(state, pose, estimate), pose, estimate, stamp_ns, rules, now_ns)
     past = policy.remembered(state.changes, estimate.data_stamp_ns)
     waits = policy.objection(step, past, estimate.data_stamp_ns, rules.policy)
     if state.hold is not None:
@@ -368,11 +368,11 @@ def _applied_or_waiting(
     if waits is None:
         change = policy.Change(estimate.data_stamp_ns, tuple(abs(float(value)) for value in step))
         served = replace(_served(state, pose, estimate), changes=(*past, change))
-        return _confirmed(served, estimate, stamp_ns, rules, now_ns)
+        return _confirmed(served, state.T_camera_lidar, estimate, stamp_ns, rules, now_ns)
     close = policy.agrees(step, rules.policy)
     state = replace(state, pending=Candidate(pose, estimate, waits, contradicts=not close))
     if close:
-        return _confirmed(state, estimate, stamp_ns, rules, now_ns)
+        return _confirmed(state, state.T_camera_lidar, estimate, stamp_ns, rules, now_ns)
     why = Reason("candidate_waits", f"An accepted window differs by {_told(step)} from what is served.")
     return happened(state, Event.CONTRADICTED, why, waits)
 
@@ -391,11 +391,19 @@ def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
     )
 
 
-def _confirmed(state: PairState, estimate: Estimate, stamp_ns: int, rules: Rules, now_ns: int | None) -> PairState:
-    """The state after a window with data up to the sensor time `stamp_ns` vouches for the served extrinsic. What the
-    monitor had against it is dropped, as far as the window could judge it; causes in the data stay."""
-    solved_translation = bool(estimate.solved[3:].all())
-    monitor = after_window(state.monitor, stamp_ns, rules.alarm, solved_translation=solved_translation)
+def _confirmed(
+    state: PairState, T_before: Matrix4, estimate: Estimate, stamp_ns: int, rules: Rules, now_ns: int | None
+) -> PairState:
+    """The state after a window with data up to the sensor time `stamp_ns` vouches for the served extrinsic, which was
+    `T_before` (4, 4) before. What the monitor had against it is dropped, as far as the window could judge it; causes in
+    the data stay."""
+    monitor = after_window(
+        state.monitor,
+        stamp_ns,
+        rules.alarm,
+        solved_translation=bool(estimate.solved[3:].all()),
+        agrees=agrees(T_before, state.T_camera_lidar, rules.policy),
+    )
     accused = monitor.outcome in (Finding.SUSPECT, Finding.CONFIRMED)
     since_ns = (state.flagged_since_ns or state.valid_from_ns) if accused else None
     state = replace(state, proven=True, monitor=monitor, flagged_since_ns=since_ns)

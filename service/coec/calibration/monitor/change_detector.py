@@ -18,7 +18,6 @@ from coec.calibration.commissioning.baseline import Drift
 from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.monitor.hypotheses import (
     MOST_STEP,
-    PLACE_TIMES,
     Axes,
     Hypotheses,
     after_check,
@@ -317,8 +316,9 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
     codes = {cause.code for cause in observation.causes}
     if sum(run >= DIRTY_CHECKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
         codes.add(LENS_DIRTY.code)
+    judges = not codes
     scatter = state.scatter
-    if not codes and fresh > 0.0:
+    if judges and fresh > 0.0:
         scatter = scatter.after(told_by(observation, ROTATION_AXES, None), ROTATIONS.reach, fresh)
         if scatter.evidence >= LOOSE_AT:
             codes.add(MOUNT_LOOSE.code)
@@ -332,10 +332,10 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
         doubtful=doubtful_after(state.doubtful, observation.weak, fresh),
         acquitted_ns=observation.stamp_ns if acquits else state.acquitted_ns,
         unacquitted=0 if acquits else state.unacquitted + 1,
-        standstill=_standstill_after(state, observation, judged=not codes) if stands else None,
+        standstill=_standstill_after(state, observation, judged=judges) if stands else None,
         scatter=scatter,
     )
-    if codes or repeated or fresh == 0.0:
+    if not judges or repeated or fresh == 0.0:
         # Neither for nor against: the data cannot tell, or were counted before.
         return after
     after = _weighed(after, replace(observation, weak=observation.weak or state.doubtful > 0.0), fresh, levels)
@@ -346,11 +346,18 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
     return after
 
 
-def after_window(state: MonitorState, stamp_ns: int, levels: AlarmLevels, *, solved_translation: bool) -> MonitorState:
+def after_window(
+    state: MonitorState, stamp_ns: int, levels: AlarmLevels, *, solved_translation: bool, agrees: bool
+) -> MonitorState:
     """The state after a window with data up to the sensor time `stamp_ns` vouches for the served extrinsic. Causes in
     the data stay. So does what is known of the translation, if the window searched none: it cannot clear what it cannot
-    see."""
+    see. What is known of the bias of the rig stays if the window `agrees` with what was served before, as an earlier
+    one did: small steps that lag behind a drift show as an offset from it."""
+    learned = agrees and state.vouched
+    shifted = Hypotheses(state.shifted.right if learned else None) if solved_translation else state.shifted
     after = MonitorState(
+        turned=Hypotheses(state.turned.right if learned else None),
+        shifted=shifted,
         blind={code: weight for code, weight in state.blind.items() if code not in _OF_THE_MOUNT},
         dirt=state.dirt,
         vouched=True,
@@ -359,19 +366,19 @@ def after_window(state: MonitorState, stamp_ns: int, levels: AlarmLevels, *, sol
         stood=state.stood,
         last_stamps_ns=state.last_stamps_ns,
     )
-    if solved_translation:
-        return after
-    after = replace(after, shifted=state.shifted)
     outcome = _outcome(state.outcome, after, levels)
     return replace(after, outcome=outcome if outcome is not Finding.CLEAR else Finding.UNKNOWN)
 
 
 def is_acquitted(state: MonitorState, now_ns: int, config: MonitorConfig) -> bool:
     """Whether a check still vouches for the served extrinsic at a sensor time: an acquitting one of the last
-    `ACQUITTAL_PERIODS` periods, or of the place where the vehicle stands, if nothing has contradicted it since."""
+    `ACQUITTAL_PERIODS` periods with fewer checks since that did not acquit; or that of the place where the vehicle
+    stands, if nothing has contradicted it."""
     if state.acquitted_ns is None:
         return False
-    return holds_at_rest(state) or now_ns - state.acquitted_ns <= round(ACQUITTAL_PERIODS * config.period_s * NS_PER_S)
+    lasts_ns = round(ACQUITTAL_PERIODS * config.period_s * NS_PER_S)
+    recent = now_ns - state.acquitted_ns <= lasts_ns and state.unacquitted < ACQUITTAL_PERIODS
+    return recent or holds_at_rest(state)
 
 
 def holds_at_rest(state: MonitorState) -> bool:
@@ -434,10 +441,10 @@ def _agrees_with_earlier(state: MonitorState, observation: Observation) -> bool:
     """Whether a check puts the mount where earlier ones did, as far as streets differ."""
     for axes, tests in ((ROTATION_AXES, state.turned), (TRANSLATION_AXES, state.shifted)):
         told = told_by(observation, axes, None)
-        if told is not None and tests.right is not None:
-            street = tests.right.wider(three([PLACE_TIMES**2 * variance for variance in told.place]))
-            if street.distance2(told) > LEARNED2:
-                return False
+        if told is None or tests.right is None:
+            continue
+        if tests.right.wider(told.place).distance2(told) > LEARNED2:
+            return False
     return True
 
 

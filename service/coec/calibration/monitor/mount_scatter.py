@@ -3,8 +3,8 @@
 A loose mount swings about some pose. No check can say where it is, because it is elsewhere at the next, and a test of a
 step finds no place to which it moved. What shows is that neighbouring checks lie farther apart than their noise allows:
 the successive differences of von Neumann (1941). They cancel what neighbouring checks share, which is the bias of the
-rig and most of the error of a street. The evidence is a cumulative sum of log-likelihood ratios (Page 1954) of
-differences widened by a swing against those of a mount at rest.
+rig and most of the error of a street. For every axis of rotation the evidence is a cumulative sum of log-likelihood
+ratios (Page 1954) of differences widened by a swing against those of a mount at rest.
 """
 
 from __future__ import annotations
@@ -12,23 +12,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import exp, log, radians
 
-from coec.calibration.monitor.likelihood import (
-    BAD_SHARE,
-    Three,
-    Told,
-    log_density,
-    plus,
-    three,
-)
+from coec.calibration.monitor.likelihood import BAD_SHARE, FREEDOM, Three, Told, plus, three
 
 SWING_RAD = radians(0.3)
-"""Standard deviation of the pose of a loose mount that is looked for, per axis."""
+"""Standard deviation of the pose of a loose mount that is looked for."""
 
-LOOSE_AT = 9.0
-"""Evidence, nats, from which a mount is loose: at a check every five seconds a mount at rest reaches it once in eleven
-hours at most, by the logarithm of the number of checks, as the other levels do."""
+LOOSE_AT = 10.0
+"""Evidence, nats, from which a mount is loose. At a check every five seconds a mount at rest reaches it on one of three
+axes once in ten hours at most, by the logarithm of the number of checks, as the other levels do."""
 
-LEAST_STEP, MOST_STEP, MOST = -2.0, 3.0, 12.0
+LEAST_STEP, MOST_STEP, MOST = -2.0, 3.0, 13.0
 """Bounds of one difference, and of the sum, nats: no pair of bad checks decides, and a mount that was tightened is
 forgotten after three or four checks."""
 
@@ -38,14 +31,19 @@ class MountScatter:
     """What the differences between neighbouring checks add up to.
 
     Attributes:
-        evidence: log-likelihood ratio, nats, at least 0.
+        of_axes: log-likelihood ratio per axis of rotation, nats, at least 0.
         before, variance: offset of the last check with clear edges (rad), and variance of its noise and place; None
             before the first.
     """
 
-    evidence: float = 0.0
+    of_axes: Three = (0.0, 0.0, 0.0)
     before: Three | None = None
     variance: Three | None = None
+
+    @property
+    def evidence(self) -> float:
+        """The evidence on the axis that scatters most, nats."""
+        return max(self.of_axes)
 
     def after(self, told: Told | None, reach: Three, share: float) -> MountScatter:
         """The sum after one more check that counts by `share`, 0 to 1. `told` is what the check says of the rotations,
@@ -55,20 +53,26 @@ class MountScatter:
             return self
         variance = plus(told.noise, told.place)
         if self.before is None or self.variance is None:
-            return MountScatter(self.evidence, told.offset, variance)
-        apart = three([a - b for a, b in zip(told.offset, self.before, strict=True)])
-        at_rest = plus(variance, self.variance)
-        step = _log_density(apart, plus(at_rest, (2.0 * SWING_RAD**2,) * 3), reach) - _log_density(
-            apart, at_rest, reach
-        )
-        evidence = self.evidence + share * min(max(step, LEAST_STEP), MOST_STEP)
-        return MountScatter(min(max(evidence, 0.0), MOST), told.offset, variance)
+            return MountScatter(self.of_axes, told.offset, variance)
+        rows = zip(self.of_axes, told.offset, self.before, plus(variance, self.variance), reach, strict=True)
+        sums = [sum_ + share * _step(one - other, at_rest, far) for sum_, one, other, at_rest, far in rows]
+        return MountScatter(three([min(max(value, 0.0), MOST) for value in sums]), told.offset, variance)
 
 
-def _log_density(apart: Three, variance: Three, reach: Three) -> float:
-    """Of a difference of two checks, each of which may be a bad one."""
+def _step(apart: float, at_rest: float, reach: float) -> float:
+    """Log-likelihood ratio of a difference (rad) whose variance is `at_rest` if the mount does not move. Either of the
+    two checks may be a bad one, whose standard deviation is `reach`."""
+    loose, still = (_log_density(apart, variance, reach) for variance in (at_rest + 2.0 * SWING_RAD**2, at_rest))
+    return min(max(loose - still, LEAST_STEP), MOST_STEP)
+
+
+def _log_density(apart: float, variance: float, reach: float) -> float:
+    """Up to the same constant for every variance."""
     bad = 2.0 * BAD_SHARE
-    good = log(1.0 - bad) + log_density(apart, (0.0, 0.0, 0.0), variance)
-    astray = log(bad) + log_density(apart, (0.0, 0.0, 0.0), three([r * r for r in reach]))
+    good, astray = log(1.0 - bad) + _student(apart, variance), log(bad) + _student(apart, reach * reach)
     most = max(good, astray)
     return most + log(exp(good - most) + exp(astray - most))
+
+
+def _student(apart: float, variance: float) -> float:
+    return -0.5 * log(variance) - 0.5 * (FREEDOM + 1.0) * log(1.0 + apart * apart / variance / FREEDOM)
