@@ -58,8 +58,10 @@ TROUBLES: Mapping[str, Trouble] = {
         "Install the extra `lidars`, or set `lidar_edges.period_s: 0`; all else goes on without it.",
     ),
     "rig_state_damaged": Trouble(
-        "About `rig`: what was known of it before the restart cannot be read; it is kept aside and learnt anew.",
-        "Check the disk of `state.directory`. Only its pairs report a sensor that was knocked meanwhile.",
+        "About `rig`: something that was known of it before the restart cannot be read; it is kept aside, and learnt "
+        "anew.",
+        "Nothing after an update of the software, else check the disk of `state.directory`. Only its pairs report a "
+        "sensor that was knocked meanwhile.",
     ),
     "insecure": Trouble(
         "The service listens where anyone is let in without a certificate.",
