@@ -82,6 +82,9 @@ class _Reader:
         unreadable = {
             field for name, part in PARTS.items() if self._written_by(name) == "newer" for field in part.fields
         } | {"versions"}
+        monitor = self._document.get("monitor")
+        if isinstance(monitor, dict) and "turned" not in monitor:  # the first versions counted votes
+            unreadable.add("monitor")
         readable = {name: value for name, value in self._document.items() if name not in unreadable}
         try:
             return StoredPair.model_validate(readable), frozenset(unreadable)
@@ -140,8 +143,10 @@ class _Reader:
             changes=tuple(Change(change.stamp_ns, change.step) for change in stored.changes),
             record=AlarmRecord(**stored.record.model_dump()),
         )
-        state = self._with_latest(state)
-        state = self._with_health(state)
+        state = self._with_health(self._with_latest(state))
+        if "monitor" in self._lost and (state.seen in _RED or state.monitor.outcome in ACCUSING):
+            # A monitor that has forgotten what it had against the extrinsic may not acquit it: only a window may.
+            state = replace(state, proven=False)
         clocks = Clocks(stored.completed_wall_ns, stored.completed_stamp_ns, stored.since_wall_ns)
         return Remembered(state, clocks, self._heads(), stored.commissioned_from, tuple(self._lost.values()))
 
