@@ -29,10 +29,10 @@ def state_of(remembered: Any) -> PairState:
 
 
 def books_of(folder: Path, pair: str, remembered: Any) -> Any:
-    heads = getattr(remembered, "history_heads", None)
+    history: Any = History
     if "pair" in inspect.signature(History).parameters:
-        return History(folder, pair, 1000, heads or {})
-    return History(folder / f"history-{pair}.jsonl", 1000, getattr(remembered, "history_head", None))
+        return history(folder, pair, 1000, getattr(remembered, "history_heads", {}))
+    return history(folder / f"history-{pair}.jsonl", 1000, getattr(remembered, "history_head", None))
 
 
 def pair_read(store: StateStore, folder: Path, name: str, rig_document: Any) -> dict[str, Any]:

@@ -94,7 +94,8 @@ def front_state() -> tuple[PairState, list[Observation]]:
         state, one = checked(state, number, 0.0)
         made.append(one)
     hold = getattr(lifecycle, "Hold", None)
-    state = lifecycle.held(state) if hold is None else lifecycle.held(state, hold(7 * S, SENDER, WHY))
+    held: Any = lifecycle.held
+    state = held(state) if hold is None else held(state, hold(7 * S, SENDER, WHY))
     record = getattr(lifecycle, "AlarmRecord", None)
     return (state if record is None else replace(state, record=record(3600 * S, 1, 2, False))), made
 
@@ -111,10 +112,11 @@ def rear_state() -> tuple[PairState, list[Observation]]:
 
 def write_history(folder: Path, rig: Rig, state: PairState) -> tuple[Any, list[str]]:
     """Entries of all books; returns the books, and the texts of the entries."""
+    history: Any = History
     if "pair" in inspect.signature(History).parameters:
-        books = History(folder, rig.pair, 1000, {})
+        books = history(folder, rig.pair, 1000, {})
     else:
-        books = History(folder / f"history-{rig.pair}.jsonl", 1000)
+        books = history(folder / f"history-{rig.pair}.jsonl", 1000)
     assert state.accepted is not None
 
     def append(kind: str, code: str, text: str, result: Any = None, **more: Any) -> None:
