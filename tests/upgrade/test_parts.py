@@ -343,6 +343,22 @@ def test_two_pairs_that_lose_parts_set_one_file_aside(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == [STATE_FILE, f"{STATE_FILE}.broken"]
 
 
+@pytest.mark.fault(
+    "a step back from a version that knows more of a pair", "all else is read, and its file is kept aside"
+)
+def test_a_file_with_fields_of_a_newer_version_is_kept_aside(tmp_path: Path) -> None:
+    seed = SEEDS["held and healthy"]
+    written(tmp_path, {"front": seed.document | {"towed": {"by": "a lorry"}}})
+    before = (tmp_path / STATE_FILE).read_bytes()
+    store = StateStore(tmp_path, "test")
+    remembered = store.recall(FRONT)
+    assert remembered is not None
+    assert (remembered.lost, plain(remembered.state)) == ((), seed.plain)
+    store.remember(FRONT, remembered.state, remembered.clocks, dict)
+    store.flush()
+    assert (tmp_path / f"{STATE_FILE}.newer").read_bytes() == before
+
+
 def test_programs_beside_the_service_read_the_pairs_that_can_be_read(tmp_path: Path) -> None:
     front, rear = SEEDS["held and healthy"].document, SEEDS["miscalibrated"].document
     written(tmp_path, {"front": front | {"monitor": 3}, "rear": rear | {"T_camera_lidar": 3}, "": 3})

@@ -15,7 +15,7 @@ from coec.calibration.lifecycle import PairState, Provenance, Status, initial_st
 from coec.calibration.types import Rig
 from coec.errors import NotFoundError, StateError
 from coec.runtime.decisions.pair_reader import AnotherRigError, pair_from_json
-from coec.runtime.decisions.stored_pair import Clocks, Remembered, StoredPair, pair_to_json
+from coec.runtime.decisions.stored_pair import OF_FIRST_VERSIONS, Clocks, Remembered, StoredPair, pair_to_json
 
 _log = logging.getLogger(__name__)
 
@@ -69,6 +69,10 @@ class StateStore:
             self._file.distrust(_ASIDE[lost.written_by])
             fields = {"pair": rig.pair, "part": lost.part, "why": lost.why}
             _log.warning("a part of the state on the disk cannot be read", extra={"fields": fields})
+        if document.keys() - StoredPair.model_fields - OF_FIRST_VERSIONS:
+            self._file.distrust(NEWER)
+            text = "a newer version wrote fields of the state that this one does not know: the file is kept aside"
+            _log.info(text, extra={"fields": {"pair": rig.pair}})
         return remembered
 
     def remember(

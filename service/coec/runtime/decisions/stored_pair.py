@@ -111,6 +111,10 @@ class StoredPair(Part):
     record: StoredRecord = StoredRecord()
 
 
+OF_FIRST_VERSIONS: Final = frozenset({"history_head"})
+"""Fields that only the first versions wrote."""
+
+
 @dataclass(frozen=True, slots=True)
 class PartForm:
     """A part of the state: the version of its form, its fields in `StoredPair`, and what follows if it is lost."""
