@@ -16,7 +16,8 @@ from coec.calibration.types import Decision, Reason, Verdict
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.geometry import se3
 from coec.runtime.api.extrinsic import extrinsic_of
-from coec.runtime.decisions.state_store import Clocks, StateStore
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.decisions.stored_pair import Clocks
 from coec.schemas.base import to_json
 from estimates import RIG, estimate
 

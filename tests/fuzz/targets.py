@@ -58,7 +58,8 @@ from coec.geometry.cameras import build, project_point
 from coec.runtime.api import payloads
 from coec.runtime.api.extrinsic import extrinsic_of
 from coec.runtime.decisions.pair_store import PairStore
-from coec.runtime.decisions.state_store import Clocks, StateStore
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.decisions.stored_pair import Clocks
 from coec.runtime.nominal.findings import Found
 from coec.runtime.nominal.kept import NOMINAL_FILE, KeptNominals
 from coec.runtime.recording.window_store import WindowStore

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from coec.adapters.files.durable import MAX_ASIDE
-from coec.adapters.files.state_file import MAX_BYTES, StateFile
+from coec.adapters.files.state_file import BROKEN, MAX_BYTES, OLDER, StateFile
 from coec.errors import StateError
 from disks import EVERYTHING, Disk
 
@@ -75,25 +76,56 @@ def test_a_damaged_copy_never_replaces_the_good_previous_one(tmp_path: Path) -> 
     assert StateFile(path).load().body == FIRST
 
 
-def test_another_schema_version_is_named(tmp_path: Path) -> None:
-    path = saved(tmp_path, FIRST)
-    path.write_bytes(path.read_bytes().replace(b'"schema_version":1', b'"schema_version":2'))
-    loaded = StateFile(path).load()
-    assert loaded.body is None
-    assert "schema version" in loaded.damage[0]
+def by_newer_service(path: Path, body: dict[str, object], checksum: str = "") -> bytes:
+    """Writes a file of a later schema version, whose checksum covers that version, too."""
+
+    def canonical(value: object) -> bytes:
+        return json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
+
+    checksum = checksum or hashlib.sha256(canonical({"body": body, "schema_version": 7})).hexdigest()
+    data = canonical({"body": body, "checksum": checksum, "schema_version": 7})
+    path.write_bytes(data)
+    return data
 
 
-@pytest.mark.fault("a state that a newer version of the service wrote", "it is kept aside, not overwritten")
-def test_a_state_of_a_newer_service_is_kept_aside_and_not_overwritten(tmp_path: Path) -> None:
+@pytest.mark.fault(
+    "a state file of a newer schema version", "it is read if its checksum is right, and kept aside, not overwritten"
+)
+def test_a_file_of_a_newer_schema_version_is_read_and_kept_aside(tmp_path: Path) -> None:
     path = saved(tmp_path, FIRST)
-    newer = path.read_bytes().replace(b'"schema_version":1', b'"schema_version":2')
-    path.write_bytes(newer)
+    newer = by_newer_service(path, SECOND)
     file = StateFile(path)
-    assert "newer schema version" in file.load().damage[0]
+    loaded = file.load()
+    assert loaded.body == SECOND
+    assert loaded.damage == ()
     for body in (FIRST, SECOND, FIRST):
         file.save(body)
     assert (tmp_path / "state.json.newer").read_bytes() == newer
     assert StateFile(path).load().body == FIRST
+
+
+def test_a_file_of_a_newer_schema_version_with_a_wrong_checksum_is_not_read(tmp_path: Path) -> None:
+    path = saved(tmp_path, FIRST)
+    newer = by_newer_service(path, SECOND, hashlib.sha256(b"").hexdigest())
+    file = StateFile(path)
+    loaded = file.load()
+    assert loaded.body is None
+    assert "newer schema version" in loaded.damage[0]
+    file.save(FIRST)
+    assert (tmp_path / "state.json.newer").read_bytes() == newer
+
+
+def test_a_copy_that_is_distrusted_twice_does_not_cost_the_other_copy(tmp_path: Path) -> None:
+    path = saved(tmp_path, FIRST, SECOND)
+    unusable = path.read_bytes()
+    file = StateFile(path)
+    file.load()
+    file.distrust(OLDER)
+    file.distrust(BROKEN)
+    file.distrust(OLDER)
+    file.save(FIRST)
+    assert {entry.name for entry in tmp_path.iterdir()} == {"state.json", "state.json.previous", "state.json.broken"}
+    assert (tmp_path / "state.json.broken").read_bytes() == unusable
 
 
 def test_what_is_kept_aside_is_bounded_and_the_first_ones_stay(tmp_path: Path) -> None:

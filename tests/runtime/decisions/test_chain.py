@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from coec.adapters.files.conversions import result_of
 from coec.adapters.files.state_file import StateFile
 from coec.errors import StateError
 from coec.runtime.decisions.chain import GENESIS, Chain
-from coec.schemas.base import to_json
+from coec.schemas.base import SCHEMA_VERSION, to_json
 from coec.schemas.replies import CalibrationResult, HistoryEntry
 from disks import EVERYTHING, Disk
 from estimates import RIG, estimate
@@ -140,6 +141,80 @@ def test_another_entry_at_the_place_of_the_head_is_noticed(tmp_path: Path) -> No
         history.append(entry(f"forged {number}"))
         history.flush()
     assert Chain(tmp_path / "h", 100, head).damage is not None
+
+
+# --- entries of other versions --------------------------------------------------------------------------------------
+
+
+def append_line(path: Path, entry_fields: dict[str, object], result_fields: dict[str, object] | None = None) -> bytes:
+    """Appends an entry as another version of the software would."""
+    last = path.read_bytes().splitlines()[-1]
+    told = b"null" if result_fields is None else json.dumps(result_fields).encode()
+    fields: dict[str, object] = {
+        "sequence": json.loads(last.partition(b" ")[2].partition(b"\t")[0])["sequence"] + 1,
+        "previous_sha256": last.partition(b" ")[0].decode(),
+        "result_sha256": None if result_fields is None else hashlib.sha256(told).hexdigest(),
+    }
+    document = json.dumps(fields | entry_fields).encode()
+    line = hashlib.sha256(document).hexdigest().encode() + b" " + document + b"\t" + told
+    with path.open("ab") as stream:
+        stream.write(line + b"\n")
+    return line
+
+
+NEWER = {"schema_version": SCHEMA_VERSION + 1, "kind": "towed", "code": {"by": "a lorry"}, "lorry": 7}
+
+
+@pytest.mark.fault(
+    "an entry of an unknown kind in the history, written by a newer version",
+    "the chain holds, the entry stays in its place, and the history goes on",
+)
+def test_an_entry_that_a_newer_version_wrote_stays_in_its_place(tmp_path: Path) -> None:
+    path = tmp_path / "h"
+    written(path, 3, limit=6)
+    line = append_line(path, NEWER)
+    again = Chain(path, 6)
+    assert again.damage is None
+    assert again.entries()[-1].line == line
+    assert again.entries()[-1].entry.sequence == 3
+    assert again.append(entry("after it")).entry.previous_sha256 == line.partition(b" ")[0].decode()
+    for number in range(12):  # so that the file is written anew at least once
+        again.append(entry(str(number)))
+        again.flush()
+        if number == 3:
+            assert line in path.read_bytes().splitlines()
+    assert Chain(path, 6, again.durable_head).damage is None
+
+
+def test_a_result_that_another_version_wrote_does_not_break_the_chain(tmp_path: Path) -> None:
+    path = tmp_path / "h"
+    written(path, 2)
+    of_window = {"kind": "estimate", "code": "accepted", "text": "", "wall_ns": 1, "window_id": "front-9"}
+    line = append_line(path, of_window, {"schema_version": 3, "sigma_rad_m": [0.1]})
+    again = Chain(path, 100)
+    assert again.damage is None
+    assert (again.entries()[-1].entry.window_id, again.entries()[-1].result) == ("front-9", None)
+    assert again.entries()[-1].line == line
+
+
+@pytest.mark.fault("an entry that this version cannot read and did write, by its own account", "it is called damage")
+def test_an_entry_that_this_version_cannot_have_written_breaks_the_chain(tmp_path: Path) -> None:
+    path = tmp_path / "h"
+    written(path, 2)
+    append_line(path, NEWER | {"schema_version": SCHEMA_VERSION})
+    assert Chain(path, 100).damage is not None
+
+
+@pytest.mark.parametrize(
+    "fields", [{"sequence": "x"}, {"previous_sha256": None}, {"result_sha256": 3}, {"sequence": -1}]
+)
+def test_an_entry_of_another_version_without_its_place_breaks_the_chain(
+    tmp_path: Path, fields: dict[str, object]
+) -> None:
+    path = tmp_path / "h"
+    written(path, 2)
+    append_line(path, NEWER | fields)
+    assert Chain(path, 100).damage is not None
 
 
 # --- disks ----------------------------------------------------------------------------------------------------------

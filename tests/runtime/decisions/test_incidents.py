@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -174,3 +175,18 @@ def test_a_power_cut_at_any_byte_takes_no_evidence_that_was_written(
             assert first.resolution == "healthy" or done < 4
         assert len(found) <= 2
     assert count > 1000
+
+
+@pytest.mark.fault("an event file that another version wrote", "it stays on the disk, and its windows stay protected")
+def test_the_windows_of_an_event_that_cannot_be_read_stay_protected(tmp_path: Path) -> None:
+    evidence = Incidents(tmp_path, "front", 3)
+    evidence.begin(event(1000))
+    evidence.begin(event(2000, "front-7"))
+    evidence.flush()
+    path = tmp_path / "front-1000" / "event.json"
+    fields = json.loads(path.read_bytes())
+    path.write_text(json.dumps(fields | {"wall_ns": {"utc": 7}}))
+    again = Incidents(tmp_path, "front", 3)
+    assert [one.event_id for one in again.events()] == ["front-2000"]
+    assert again.window_ids == {"front-1", "front-7"}
+    assert path.exists()

@@ -31,7 +31,8 @@ from coec.calibration.monitor.likelihood import Belief
 from coec.calibration.types import Decision, Reason, Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import StateError
-from coec.runtime.decisions.state_store import Clocks, StateStore
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.decisions.stored_pair import Clocks
 from estimates import RIG, estimate
 
 RULES = Rules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
@@ -125,10 +126,19 @@ def test_the_state_of_another_rig_is_not_used(tmp_path: Path) -> None:
     assert restarted(tmp_path, replace(RIG, pair="other")) is None
 
 
-def test_an_intact_file_of_another_form_is_an_error(tmp_path: Path) -> None:
+def test_a_pair_without_a_single_known_field_is_as_at_a_first_start(tmp_path: Path) -> None:
     store = StateStore(tmp_path, "test")
     store._file.save({"pairs": {"front": {"matrix": 1}}})
-    with pytest.raises(StateError, match="another form"):
+    remembered = StateStore(tmp_path, "test").recall(RIG)
+    assert remembered is not None
+    assert {lost.part for lost in remembered.lost} == {"rig", "extrinsic"}
+    assert np.array_equal(remembered.state.T_camera_lidar, RIG.T_camera_lidar_nominal)
+    assert remembered.state.health is HealthState.UNKNOWN
+
+
+def test_a_pair_that_is_no_object_is_an_error(tmp_path: Path) -> None:
+    StateStore(tmp_path, "test")._file.save({"pairs": {"front": 3}})
+    with pytest.raises(StateError, match="no JSON object"):
         StateStore(tmp_path, "test").recall(RIG)
 
 
@@ -150,13 +160,16 @@ ZERO = [[0.0] * 4] * 4
 SHEARED = [[1.0, 0.1, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-@pytest.mark.fault("a state with a matrix that is no pose, checksum right", "it is not used")
+LOST = {"T_camera_lidar": "extrinsic", "pending": "candidate", "accepted": "accepted estimate", "track": "track"}
+
+
+@pytest.mark.fault("a state with a matrix that is no pose, checksum right", "it is not used; everything else is")
 @pytest.mark.parametrize("rows", [ZERO, SHEARED], ids=["zero", "sheared"])
-@pytest.mark.parametrize("where", ["T_camera_lidar", "pending", "accepted", "track"])
+@pytest.mark.parametrize("where", LOST)
 def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: str, rows: list[list[float]]) -> None:
     served = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
     waiting = after_estimate(initial_state(RIG), estimate(1), 0, NEVER)
-    saved(StateStore(tmp_path, "test"), RIG, waiting if where == "pending" else served, {})
+    saved(StateStore(tmp_path, "test"), RIG, waiting if where == "pending" else served, HEADS)
     file = StateFile(tmp_path / "state.json")
     body = file.load().body
     assert body is not None
@@ -173,39 +186,52 @@ def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: 
     file.save(body)
     forged = (tmp_path / "state.json").read_bytes()
     store = StateStore(tmp_path, "test")
-    with pytest.raises(StateError, match="no rigid transform"):
-        store.recall(RIG)
+    remembered = store.recall(RIG)
+    assert remembered is not None
+    (lost,) = remembered.lost
+    assert (lost.part, lost.written_by) == (LOST[where], None)
+    assert "no rigid transform" in lost.why
+    back = remembered.state
+    expected = RIG.T_camera_lidar_nominal if where in ("T_camera_lidar", "pending") else served.T_camera_lidar
+    assert np.array_equal(back.T_camera_lidar, expected)
+    assert (back.pending, back.latest is None) == (None, False)
+    assert back.health is not HealthState.HEALTHY
+    assert remembered.history_heads == HEADS
     saved(store, RIG, initial_state(RIG), {})
     assert (tmp_path / "state.json.broken").read_bytes() == forged
     assert restarted(tmp_path) is not None
 
 
-@pytest.mark.fault("a forged state with invalid numbers and shapes", "an error of ours, and nominal is served")
+@pytest.mark.fault("a forged state with invalid numbers and shapes", "the part of the state is lost, and no other")
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("name", "value", "part"),
     [
-        ("completed_wall_ns", -(10**4000)),
-        ("since_wall_ns", 10**400),
-        ("T_camera_lidar", [[10**400] * 4] * 4),
-        ("track", {"slow": []}),
-        ("monitor", 3),
-        ("changes", [{"stamp_ns": 1, "step": "x"}]),
+        ("completed_wall_ns", -(10**4000), "clocks"),
+        ("since_wall_ns", 10**400, "clocks"),
+        ("T_camera_lidar", [[10**400] * 4] * 4, "extrinsic"),
+        ("track", {"slow": []}, "track"),
+        ("monitor", 3, "monitor"),
+        ("changes", [{"stamp_ns": 1, "step": "x"}], "changes"),
     ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_numbers_and_shapes_that_nobody_wrote_are_an_error_of_ours(tmp_path: Path, name: str, value: object) -> None:
+def test_numbers_and_shapes_that_nobody_wrote_cost_their_part_alone(
+    tmp_path: Path, name: str, value: object, part: str
+) -> None:
     saved(StateStore(tmp_path, "test"), RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), {})
     file = StateFile(tmp_path / "state.json")
     body = file.load().body
     assert body is not None
     body["pairs"][RIG.pair][name] = value
     file.save(body)
-    with pytest.raises(StateError):
-        StateStore(tmp_path, "test").recall(RIG)
+    remembered = StateStore(tmp_path, "test").recall(RIG)
+    assert remembered is not None
+    assert [lost.part for lost in remembered.lost] == [part]
 
 
-@pytest.mark.fault("a forged state with corrections beyond all measure", "an error of ours, and nominal is served")
+@pytest.mark.fault("a forged state with corrections beyond all measure", "the estimate is not used; everything else is")
 @pytest.mark.parametrize("name", ["correction_rad_m", "noise", "systematic"])
-def test_a_result_that_could_not_be_told_again_is_an_error_of_ours(tmp_path: Path, name: str) -> None:
+def test_a_result_beyond_all_measure_is_not_used(tmp_path: Path, name: str) -> None:
     saved(StateStore(tmp_path, "test"), RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), {})
     file = StateFile(tmp_path / "state.json")
     body = file.load().body
@@ -214,5 +240,8 @@ def test_a_result_that_could_not_be_told_again_is_an_error_of_ours(tmp_path: Pat
     beyond = {"correction_rad_m": huge, "noise": [huge] * 6, "systematic": {"stamps": huge}}
     body["pairs"][RIG.pair]["latest"][name] = beyond[name]
     file.save(body)
-    with pytest.raises(StateError):
-        StateStore(tmp_path, "test").recall(RIG)
+    remembered = StateStore(tmp_path, "test").recall(RIG)
+    assert remembered is not None
+    assert [lost.part for lost in remembered.lost] == ["latest estimate"]
+    assert remembered.state.latest is None
+    assert np.array_equal(remembered.state.T_camera_lidar, estimate(1).optimum.T_camera_lidar)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from coec.adapters.files.state_file import StateFile
 from coec.config import Config, PairConfig
 from coec.runtime.nominal.findings import Found
 from coec.runtime.nominal.kept import NOMINAL_FILE, KeptNominals, completed
@@ -76,3 +77,21 @@ def test_what_is_damaged_is_searched_anew(tmp_path: Path, damage: bytes) -> None
     kept.keep(found(), config.awaited[0], config, 5)
     kept.flush()
     assert KeptNominals(tmp_path).found(config)["front"].pair == found().pair
+
+
+@pytest.mark.fault("a kept nominal calibration with settings that only another version has", "it is used all the same")
+def test_settings_of_another_version_beside_what_was_found_are_ignored(tmp_path: Path) -> None:
+    config = configured()
+    keep(tmp_path, config)
+    file = StateFile(tmp_path / NOMINAL_FILE)
+    body = file.load().body
+    assert body is not None
+    pair = body["pairs"]["front"]["pair"]
+    pair["stereo"] = {"baseline_m": 0.2}
+    pair["camera"]["shutter"] = "rolling"
+    del pair["monitor"]
+    file.save(body)
+    kept = KeptNominals(tmp_path)
+    assert kept.found(config)["front"].pair == found().pair
+    kept.flush()
+    assert StateFile(tmp_path / NOMINAL_FILE).load().body == body

@@ -14,7 +14,7 @@ from coec.adapters.files.state_file import StateFile
 from coec.runtime.api.rig import RigAnswers, reply_of
 from coec.runtime.api.rig_troubles import INCONSISTENT, troubles_of
 from coec.runtime.rig.keeper import LAG_NS, QUIET_TICKS
-from coec.runtime.rig.rig_file import FILE
+from coec.runtime.rig.rig_file import FILE, RigFile
 from coec.schemas.base import from_json, to_json
 from coec.schemas.keys import Keys
 from coec.schemas.rig_state import RigReply
@@ -211,6 +211,32 @@ def test_a_hostile_file_is_refused(tmp_path: Path, body: dict[str, object]) -> N
     said.scribe.write_due()
     assert (tmp_path / f"{FILE}.broken").exists()
     assert SaidRig(tmp_path).known.why == ()
+
+
+@pytest.mark.fault("an edge, or a move, in the file of the rig that cannot be read", "the other edges are kept")
+@pytest.mark.parametrize(
+    ("name", "value", "kept"),
+    [
+        ("edges", {"front-roof": GOOD_EDGE, "rear-roof": BAD_EDGE}, {"front-roof"}),
+        ("edges", {"front-roof": 3, "rear-roof": GOOD_EDGE}, {"rear-roof"}),
+        ("event", "roof moved", {"front-roof", "rear-roof"}),
+    ],
+)
+def test_an_edge_that_cannot_be_read_falls_back_alone(tmp_path: Path, name: str, value: object, kept: set[str]) -> None:
+    body: dict[str, object] = {"edges": {"front-roof": GOOD_EDGE, "rear-roof": GOOD_EDGE}, "event": GOOD_EVENT}
+    StateFile(tmp_path / FILE).save(body | {name: value})
+    file = RigFile(tmp_path)
+    assert [reason.code for reason in file.damage] == ["rig_state_damaged"]
+    assert set(file._edges) == kept
+    assert (file._event is None) == (name == "event")
+
+
+def test_fields_that_a_newer_version_added_to_the_file_of_the_rig_are_ignored(tmp_path: Path) -> None:
+    edges = {"front-roof": {**GOOD_EDGE, "trust": 3}}
+    StateFile(tmp_path / FILE).save({"edges": edges, "event": {**GOOD_EVENT, "who": {}}, "links": []})
+    file = RigFile(tmp_path)
+    assert file.damage == ()
+    assert set(file._edges) == {"front-roof"}
 
 
 @pytest.mark.fault(

@@ -1,6 +1,7 @@
 """`rig.json`: the baselines of a vehicle's commissioned pairs, with a checksum and the previous good copy beside it.
 
-History and reports refer to a baseline by the sha256 of its content.
+History and reports refer to a baseline by the sha256 of its content. A field that is added later needs a default, and
+versions before it refuse the whole document, because the first ones accept no field that they do not know.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ BASELINES = "rig.json"
 
 
 class _Document(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    # A later version may have added fields: older ones read the rest.
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class AccuracyDocument(_Document):
@@ -52,12 +54,12 @@ class AccuracyDocument(_Document):
 
 
 class LimitsDocument(_Document):
-    """`MonitorLimits`; null: no limit."""
+    """`MonitorLimits`; null: no limit. A limit that a file of an earlier version lacks refuses nothing."""
 
     max_distance2_rotation: float
     max_farthest2_pose: float
     min_edges_per_pair: float
-    insisted_share: float
+    insisted_share: float = 1.0
     max_agreement_rad: float | None
     min_overlap: float
     min_mi: float | None
@@ -207,7 +209,7 @@ def baseline_from_json(values: object) -> Baseline:
         T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
     except (ValidationError, ConfigError) as error:
         what = describe(error) if isinstance(error, ValidationError) else str(error)
-        raise StateError(f"the baseline is damaged: {what}; commission again") from error
+        raise StateError(f"the baseline cannot be read: {what}; commission again") from error
     limits = document.monitor
     return Baseline(
         pair=document.pair,

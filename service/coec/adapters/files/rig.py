@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +28,13 @@ from coec.config import (
 )
 from coec.errors import ConfigError, DecodeError, WindowError
 from coec.geometry import cameras, se3
+
+NOT_ALWAYS_THERE = ("sweep", "cloud")
+"""Entries of `rig_identity` that a rig has only if they are configured."""
+
+ROUNDING = 1e-9
+"""Relative and absolute difference up to which two numbers of an identity count as equal: far below what any mount is
+known to, far above the rounding of a double."""
 
 
 class SweepDocument(BaseModel):
@@ -186,6 +196,58 @@ def rig_to_json(rig: Rig) -> dict[str, Any]:
         else CloudDocument(frame_id=rig.cloud.frame_id, T_cloud_lidar=matrix_rows(rig.cloud.T_cloud_lidar)),
     )
     return document.model_dump(mode="json", exclude_none=True)
+
+
+def rig_identity(rig: Rig) -> dict[str, Any]:
+    """What makes a calibration belong to this rig, as JSON values: names, frames, intrinsics, nominal pose, and how
+    points are placed. What is not configured has no entry.
+
+    The form is fixed, whatever `rig_to_json` becomes, because `identity_sha256` of it is in the state directories of
+    all versions. A later version may add an entry for something that it newly knows, if it leaves that entry out where
+    the rig is as earlier versions took it to be.
+    """
+    identity: dict[str, Any] = {
+        "pair": rig.pair,
+        "camera": {"model": cameras.name_of(rig.camera), **intrinsics_config(rig.camera).parameters()},
+        "camera_frame": rig.camera_frame,
+        "lidar_frame": rig.lidar_frame,
+        "T_camera_lidar_nominal": rig.T_camera_lidar_nominal.tolist(),
+        "T_lidar_ego": rig.T_lidar_ego.tolist(),
+    }
+    if rig.sweep is not None:
+        identity["sweep"] = {
+            "period_s": float(rig.sweep.period_s),
+            "sign": 1 if rig.sweep.sign > 0 else -1,
+            "stamp_azimuth_rad": float(rig.sweep.stamp_azimuth_rad),
+        }
+    if rig.cloud is not None:
+        identity["cloud"] = {"frame_id": rig.cloud.frame_id, "T_cloud_lidar": rig.cloud.T_cloud_lidar.tolist()}
+    return identity
+
+
+def identity_sha256(identity: dict[str, Any]) -> str:
+    """The sha256 (hexadecimal) by which versions without `rig_identity` in their state know the rig."""
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+
+
+def is_same_rig(rig: Rig, stored: Mapping[str, Any]) -> bool:
+    """Whether a stored `rig_identity`, of this version or another one, is that of a rig. Entries that only the other
+    version knows are ignored, and numbers may differ by rounding."""
+    identity = rig_identity(rig)
+    return all(_is_equal(identity.get(name), stored.get(name)) for name in identity.keys() | NOT_ALWAYS_THERE)
+
+
+def _is_equal(value: Any, stored: Any) -> bool:
+    match value:
+        case dict():
+            return isinstance(stored, dict) and all(_is_equal(value[name], stored.get(name)) for name in value)
+        case list():
+            same_length = isinstance(stored, list) and len(value) == len(stored)
+            return same_length and all(_is_equal(one, other) for one, other in zip(value, stored, strict=True))
+        case float():
+            return isinstance(stored, float) and math.isclose(value, stored, rel_tol=ROUNDING, abs_tol=ROUNDING)
+        case _:
+            return bool(value == stored)
 
 
 def rig_from_json(document: object, mask_png: bytes | None) -> Rig:

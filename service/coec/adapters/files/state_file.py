@@ -3,7 +3,11 @@
 The file is the canonical JSON (sorted keys, no spaces) of `{"body": …, "checksum": sha256 of the canonical body,
 "schema_version": 1}`. A file counts as damaged unless it is byte for byte what this module would write for its body, so
 that no flipped bit can be read as a calibration. An unusable file is kept beside the file that replaces it, as
-`.broken`, or as `.newer` if a later version of the service wrote it.
+`.broken`, or as `.newer` or `.older` if another version of the service wrote it.
+
+All versions of the service so far write `schema_version` 1, so that each can read what the others wrote; what stands in
+the body carries versions of its own. A file of a later schema version, whose checksum covers the version, too, is read
+all the same, and is kept aside when it is replaced.
 """
 
 from __future__ import annotations
@@ -22,8 +26,8 @@ SCHEMA_VERSION = 1
 MAX_BYTES = 64 * 2**20
 """Largest file that is read. 32 pairs with everything that their state can hold take less than 1 MB."""
 
-BROKEN, NEWER = ".broken", ".newer"
-"""Suffixes of files kept aside."""
+BROKEN, NEWER, OLDER = ".broken", ".newer", ".older"
+"""Suffixes of files kept aside: damaged, or written by a newer or an older version of the service."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +49,7 @@ class StateFile:
         self._path = path
         self._previous = path.with_name(path.name + ".previous")
         self._current_is_good = False
+        self._loaded: Path | None = None
         self._aside: dict[Path, str] = {}
 
     def load(self) -> LoadedState:
@@ -52,7 +57,7 @@ class StateFile:
         damage = []
         for path in (self._path, self._previous):
             try:
-                body = _decode(_read(path))
+                body, version = _decode(_read(path))
             except FileNotFoundError:
                 continue
             except OSError as error:
@@ -61,14 +66,19 @@ class StateFile:
                 damage.append(f"{path.name}: {error}")
                 self._aside[path] = NEWER if isinstance(error, _NewerError) else BROKEN
             else:
-                self._current_is_good = path == self._path
+                self._current_is_good, self._loaded = path == self._path, path
+                if version > SCHEMA_VERSION:
+                    self._aside[path] = NEWER
                 return LoadedState(body, tuple(damage))
         return LoadedState(None, tuple(damage))
 
-    def distrust(self) -> None:
-        """Call this if the loaded body turns out to be unusable: it is kept aside and does not become the previous
-        copy."""
-        self._aside[self._path if self._current_is_good else self._previous] = BROKEN
+    def distrust(self, suffix: str = BROKEN) -> None:
+        """Call this if the loaded body, or a part of it, turns out to be unusable: the copy that it came from is kept
+        aside under `suffix` and does not become the previous copy. `BROKEN` outweighs the other suffixes."""
+        if self._loaded is None:
+            return
+        if self._aside.get(self._loaded) != BROKEN:
+            self._aside[self._loaded] = suffix
         self._current_is_good = False
 
     def save(self, body: dict[str, Any]) -> None:
@@ -85,16 +95,18 @@ class StateFile:
             durable.replace(self._path, _encode(body), self._previous if self._current_is_good else None)
         except OSError as error:
             raise StateError(f"cannot write {self._path}: {error.strerror}; it needs space and permission") from error
-        self._current_is_good = True
+        self._current_is_good, self._loaded = True, self._path
 
 
 def _canonical(value: Any) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _encode(body: dict[str, Any]) -> bytes:
-    checksum = hashlib.sha256(_canonical(body)).hexdigest()
-    return _canonical({"body": body, "checksum": checksum, "schema_version": SCHEMA_VERSION})
+def _encode(body: dict[str, Any], version: int = SCHEMA_VERSION) -> bytes:
+    # The checksum of later versions covers the version: else one flipped bit would turn version 1 into a later one.
+    covered = body if version == 1 else {"body": body, "schema_version": version}
+    checksum = hashlib.sha256(_canonical(covered)).hexdigest()
+    return _canonical({"body": body, "checksum": checksum, "schema_version": version})
 
 
 def _read(path: Path) -> bytes:
@@ -105,7 +117,8 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _decode(data: bytes) -> dict[str, Any]:
+def _decode(data: bytes) -> tuple[dict[str, Any], int]:
+    """The body, and the schema version of the envelope."""
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -114,14 +127,16 @@ def _decode(data: bytes) -> dict[str, Any]:
     if not isinstance(body, dict):
         raise StateError("has no body")
     version = document.get("schema_version")
-    if isinstance(version, int) and version > SCHEMA_VERSION:
-        raise _NewerError(f"is of a newer schema version than {SCHEMA_VERSION}")
-    if version != SCHEMA_VERSION:
+    if type(version) is not int or version < SCHEMA_VERSION:
         raise StateError(f"is not of schema version {SCHEMA_VERSION}")
     try:
-        expected = _encode(body)
+        expected = _encode(body, version)
     except (ValueError, RecursionError) as error:  # nesting that can be read may be too deep to write
         raise StateError("holds values that were never written") from error
-    if expected != data:
-        raise StateError("does not match its checksum")
-    return body
+    if expected == data:
+        return body, version
+    if version > SCHEMA_VERSION:
+        raise _NewerError(
+            f"is of a newer schema version than {SCHEMA_VERSION}, with a checksum that cannot be verified"
+        )
+    raise StateError("does not match its checksum")

@@ -1,4 +1,5 @@
-"""The pages on a running service: its metrics; its exit codes, its troubles, and what a reload takes."""
+"""The pages on a running service: its metrics; its exit codes, its troubles, what a reload takes, and what an update
+and a step back keep."""
 
 from __future__ import annotations
 
@@ -42,7 +43,59 @@ whole and changes nothing. These values hold from then on; all others wait for a
 under `configuration` which were taken, which wait, or why the file was refused. The history of each pair whose values
 changed has an entry with the hashes before and after, and windows carry theirs (`settings_hash`).
 
-{reloaded}"""
+{reloaded}
+## What an update and a step back keep
+
+Stop the service, replace the software, start it. Nothing in `state.directory` has to be converted: each version reads
+what the others wrote, part by part. A part that it cannot read starts anew, and nothing else does. `health` then gives
+the reason `state_other_version` with the parts and what follows, the loss counters `state_older` and `state_newer` of
+`storage` count them, the history has an entry, and the file is kept aside as `state.json.older` or `.newer`.
+
+{kept}
+What an update or a step back loses never makes a pair `healthy`: it is `unknown` until it is checked again. A pair that
+was `suspect` or `miscalibrated` stays so; if the evidence for that is lost, only a window that agrees with the
+calibration, or a person, ends it. Keep a copy of `state.directory` before a step back over several versions.
+"""
+
+KEPT = (
+    (
+        "calibration, its provenance and uncertainty; candidate; `hold`; alarm counts (`state.json`)",
+        "kept; of states before 22 November 2026, 10:56 UTC, without the uncertainty",
+        "kept, to versions since 22 November 2026, 10:56 UTC; who holds since when and why: since 23 November",
+    ),
+    (
+        "evidence of the monitor (`state.json`)",
+        "kept since 26 November 2026, 16:30 UTC; earlier evidence starts anew, but what it accused stays accused",
+        "kept",
+    ),
+    (
+        "history (`*.jsonl`)",
+        "kept and verified; an entry that cannot be read stays in its place",
+        "kept; to versions before this one, an entry that they cannot read is damage (`history_damaged`)",
+    ),
+    (
+        "baselines (`rig.json`)",
+        "kept; not used if figures, network or settings have changed since (`baseline_mismatch`)",
+        "kept, to versions since 23 November 2026, 02:49 UTC",
+    ),
+    ("poses of the rig, a move that is not over (`sensors.json`)", "kept", "kept"),
+    (
+        "nominal calibrations found on the bus (`nominal.json`)",
+        "kept",
+        "kept; to versions before this one, found again if the newer configuration had other keys",
+    ),
+    (
+        "windows, snippets, evidence of incidents, log of checks",
+        "kept; a check that cannot be read is left out",
+        "kept likewise; windows of an incident that cannot be read stay protected from this version on",
+    ),
+    (
+        "configuration",
+        "kept",
+        "take out keys that the earlier version does not know: it refuses the file (exit code 78)",
+    ),
+)
+"""What is in the state directory; what an update keeps of it; what a step back keeps of it."""
 
 
 def metrics_page() -> str:
@@ -56,7 +109,7 @@ def metrics_page() -> str:
 
 
 def operations_page() -> str:
-    """Markdown: exit codes, troubles, values that are reloaded."""
+    """Markdown: exit codes, troubles, values that are reloaded, what an update keeps."""
     return OPERATIONS.format(
         written=WRITTEN,
         codes=table(("code", "meaning"), [(str(code), meaning) for code, meaning in EXIT_CODES.items()]),
@@ -65,6 +118,7 @@ def operations_page() -> str:
             [(f"`{code}`", trouble.meaning, trouble.advice) for code, trouble in TROUBLES.items()],
         ),
         reloaded=table(("value", "holds"), [(f"`{place}`", when) for place, when in RELOADED.items()]),
+        kept=table(("what", "an update", "a step back"), KEPT),
     )
 
 

@@ -58,8 +58,10 @@ TROUBLES: Mapping[str, Trouble] = {
         "Install the extra `lidars`, or set `lidar_edges.period_s: 0`; all else goes on without it.",
     ),
     "rig_state_damaged": Trouble(
-        "About `rig`: what was known of it before the restart cannot be read; it is kept aside and learnt anew.",
-        "Check the disk of `state.directory`. Only its pairs report a sensor that was knocked meanwhile.",
+        "About `rig`: something that was known of it before the restart cannot be read; it is kept aside, and learnt "
+        "anew.",
+        "Nothing after an update of the software, else check the disk of `state.directory`. Only its pairs report a "
+        "sensor that was knocked meanwhile.",
     ),
     "insecure": Trouble(
         "The service listens where anyone is let in without a certificate.",
@@ -102,8 +104,15 @@ TROUBLES: Mapping[str, Trouble] = {
         "Make room; nothing has to be restarted.",
     ),
     "state_damaged": Trouble(
-        "What was remembered cannot be used and is kept aside; the nominal calibration is served.",
-        "Calibrate, or restore the file from a backup; check the disk.",
+        "What was remembered, or a part of it, cannot be used and is kept aside; the text says what is lost and what "
+        "is served.",
+        "Restore the file from a backup, or calibrate if the nominal calibration is served; check the disk.",
+    ),
+    "state_other_version": Trouble(
+        "Another version of the software wrote parts of the state in a form that this one cannot read. Only these "
+        "parts start anew; the text names them, and the file is kept aside.",
+        "Nothing, unless the text says that the nominal calibration is served: then calibrate, or return to the "
+        "version that wrote the file.",
     ),
     "history_damaged": Trouble(
         "The chain of the history is broken; what there was is kept aside.",

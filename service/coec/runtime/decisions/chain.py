@@ -2,7 +2,8 @@
 the one before, so that tampering shows.
 
 A line is `<sha256 of the entry> <entry, JSON><tab><result, JSON or null>`; the entry names the sha256 of its result.
-Hashes are over the bytes of the line, so that a later version with more fields can still verify it. Only the newest
+Hashes are over the bytes of the line, so that a version with other fields can still verify it. An entry of another
+schema version that this one cannot read stays in its place, byte for byte, with a stand-in to be shown. Only the newest
 `limit` entries are kept; the first line's `previous_sha256` is then the hash of a dropped entry. The state file also
 holds place and hash of the last entry on the disk, so that a missing end is noticed. If a chain is broken, its file is
 kept aside as it is, and the chain goes on from the part that is sound.
@@ -12,10 +13,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
 
 from coec.adapters.files import durable
 from coec.adapters.files.conversions import matrix_of
@@ -23,7 +28,7 @@ from coec.adapters.files.ledger import Ledger
 from coec.adapters.files.state_file import BROKEN
 from coec.errors import DecodeError, StateError
 from coec.geometry.se3 import is_rigid
-from coec.schemas.base import from_json, to_json
+from coec.schemas.base import SCHEMA_VERSION, from_json, to_json
 from coec.schemas.replies import CalibrationResult, ChainedEntry, HistoryEntry
 
 GENESIS = 64 * "0"
@@ -36,7 +41,8 @@ MAX_DIGITS = 19
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """An entry with its hash, its line in the file, and the result if it is the entry of a window's result."""
+    """An entry with its hash, its line in the file, and the result if it is the entry of a window's result and this
+    version can read it."""
 
     sha256: str
     entry: HistoryEntry
@@ -148,16 +154,54 @@ def _parsed(line: bytes) -> Kept | None:
     document, _, result = body.partition(b"\t")
     try:
         entry = from_json(HistoryEntry, document)
-        told = None if entry.result_sha256 is None else from_json(CalibrationResult, result)
     except DecodeError:
-        return None
+        unread = _stand_in(document)
+        if unread is None:
+            return None
+        entry = unread
+    told = None
+    if entry.result_sha256 is not None:
+        try:
+            told = from_json(CalibrationResult, result)
+        except DecodeError:
+            if _other_version(result) is None:
+                return None
     if entry.camera_from_lidar is not None and not is_rigid(matrix_of(entry.camera_from_lidar)):
         return None
     if told is not None and not is_rigid(matrix_of(told.camera_from_lidar)):
         return None
-    if _sha256(document).encode() != sha256 or (_sha256(result) if told else None) != entry.result_sha256:
+    result_sha256 = None if entry.result_sha256 is None else _sha256(result)
+    if _sha256(document).encode() != sha256 or result_sha256 != entry.result_sha256:
         return None
     return Kept(sha256.decode(), entry, told, line)
+
+
+def _stand_in(document: bytes) -> HistoryEntry | None:
+    """What this version can show of an entry that another version wrote, in a form that this one does not read; None if
+    it cannot be placed in the chain, or if this version wrote it."""
+    other = _other_version(document)
+    if other is None:
+        return None
+    placed = {name: other.get(name) for name in ("schema_version", "sequence", "previous_sha256", "result_sha256")}
+    kind = other.get("kind")
+    text = (
+        f"Entry {kind if isinstance(kind, str) else ''} of another version of the software, which this one cannot read."
+    )
+    try:
+        return HistoryEntry.model_validate({**placed, "kind": "chain", "code": "unread", "text": text, "wall_ns": 0})
+    except ValidationError:
+        return None
+
+
+def _other_version(document: bytes) -> dict[str, Any] | None:
+    """The fields of a message that a version with another schema wrote; None if this version wrote it, or if it is no
+    JSON object."""
+    try:
+        fields = json.loads(document)
+    except (ValueError, RecursionError):
+        return None
+    version = fields.get("schema_version") if isinstance(fields, dict) else None
+    return fields if isinstance(version, int) and version != SCHEMA_VERSION else None
 
 
 def _reaches(chain: Sequence[Kept], head: str | None) -> bool:

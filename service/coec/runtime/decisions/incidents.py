@@ -7,6 +7,7 @@ are protected from removal. If there are too many events, the oldest is dropped,
 from __future__ import annotations
 
 import contextlib
+import json
 import threading
 from collections import deque
 from pathlib import Path
@@ -49,14 +50,15 @@ class Incidents:
         self._pictures: dict[tuple[str, Side], bytes] = {}
         self._dropped: set[str] = set()
         self._after = 0
+        self._unread: frozenset[str] = frozenset()
         self._load()
 
     @property
     def window_ids(self) -> frozenset[str]:
-        """Windows that are evidence and must not be removed."""
+        """Windows that are evidence and must not be removed, those of events that cannot be read among them."""
         with self._lock:
             both = ((event.window_before, event.window_after) for event in self._events.values())
-            return frozenset(window_id for pair in both for window_id in pair if window_id is not None)
+            return self._unread | {window_id for pair in both for window_id in pair if window_id is not None}
 
     @property
     def newest(self) -> EvidenceEvent | None:
@@ -143,14 +145,20 @@ class Incidents:
 
     def _load(self) -> None:
         """Loads events of earlier runs. A folder without its event file is removed: the power failed while the folder
-        was being filled or removed."""
+        was being filled or removed. An event that cannot be read stays on the disk, and its windows stay protected:
+        another version of the software may have written it."""
         folders = [path for path in self._folder.glob(f"{self._pair}-*") if _is_event_of(self._pair, path.name)]
         for folder in sorted(folders, key=lambda path: _stamp(path.name)):
-            with contextlib.suppress(OSError, DecodeError):
+            with contextlib.suppress(OSError):
                 if not (folder / EVENT).exists():
                     durable.remove_folder(folder)
                     continue
-                event = from_json(EvidenceEvent, (folder / EVENT).read_bytes())
+                data = (folder / EVENT).read_bytes()
+                try:
+                    event = from_json(EvidenceEvent, data)
+                except DecodeError:
+                    self._unread |= _windows_named_in(data)
+                    continue
                 if event.pair == self._pair and event.event_id == folder.name:
                     self._events[event.event_id] = self._on_disk[event.event_id] = event
         self._drop_oldest()
@@ -207,6 +215,16 @@ class Incidents:
     def _write(path: Path, data: bytes) -> None:
         durable.make_folder(path.parent)
         durable.replace(path, data)
+
+
+def _windows_named_in(data: bytes) -> frozenset[str]:
+    """The windows that an event file names, as far as that can be read."""
+    try:
+        fields = json.loads(data)
+    except (ValueError, RecursionError):
+        return frozenset()
+    named = [fields.get(name) for name in ("window_before", "window_after")] if isinstance(fields, dict) else []
+    return frozenset(name for name in named if isinstance(name, str))
 
 
 def _is_event_of(pair: str, name: str) -> bool:

@@ -38,7 +38,8 @@ from coec.runtime.decisions.chain import GENESIS, Kept
 from coec.runtime.decisions.check_log import CheckLog
 from coec.runtime.decisions.history import History
 from coec.runtime.decisions.incidents import Incidents, Side
-from coec.runtime.decisions.state_store import Clocks, StateStore
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.decisions.stored_pair import Clocks, Lost
 from coec.runtime.ingest.chooser import Served
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_index import WindowVersion
@@ -121,13 +122,14 @@ class PairStore:
         self.incidents = Incidents(config.directory / "evidence", rig.pair, config.evidence)
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
         self.protect()
+        if self.damage is not None:
+            self.history.append(_entry("chain", self.damage.code, self.damage.text))
         if self.history.damage is not None:
             losses.add("storage", "history_damaged", detail=self.history.damage)
             text = f"The chain of the history is broken: {self.history.damage}. It is kept aside."
             self.damage = self.damage or Reason("history_damaged", text)
             self.history.append(_entry("chain", "broken", text))
-            self.save()
-        elif self.damage is not None:
+        if self.damage is not None:
             self.save()
         if self._state.health is not remembered.health:
             self._since_ns = time.time_ns()
@@ -313,11 +315,17 @@ class PairStore:
             remembered = self._store.recall(self._rig)
         except StateError as error:
             damage, remembered = (*damage, str(error)), None
+        lost = () if remembered is None else remembered.lost
         if damage:
             source = "the previous copy" if remembered else "the nominal calibration"
             text = f"The state on the disk cannot be used: {'; '.join(damage)}. It is kept aside; {source} is served."
             self.damage = Reason("state_damaged", text)
             self._losses.add("storage", "state_damaged", len(damage), detail="; ".join(damage))
+        if lost:
+            self.damage = _damage_of(lost, self.damage)
+        for part in lost:
+            cause = "state_damaged" if part.written_by is None else f"state_{part.written_by}"
+            self._losses.add("storage", cause, detail=part.text)
         if remembered is None:
             return initial_state(self._rig), {}
         self._commissioned_from = remembered.commissioned_from
@@ -398,6 +406,19 @@ class PairStore:
         kept: dict[str, KeptFor] = dict.fromkeys(self._commissioned_from, "commissioning")
         kept |= dict.fromkeys(self.incidents.window_ids, "red_event")
         self._folder.protect(self._rig.pair, kept)
+
+
+def _damage_of(lost: tuple[Lost, ...], before: Reason | None) -> Reason:
+    """The reason that names the parts of the state that were lost, after the damage `before`."""
+    told = "; ".join(part.text for part in lost)
+    text = (
+        f"Parts of the state on the disk cannot be read: {told}. Everything else is kept, and the file is kept aside."
+    )
+    if before is not None:
+        return Reason(before.code, f"{before.text} {text}")
+    if any(part.written_by is None for part in lost):
+        return Reason("state_damaged", text)
+    return Reason("state_other_version", text)
 
 
 def _is_named(kept: Kept, name: str | None) -> bool:

@@ -9,13 +9,13 @@ import threading
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
 from coec.adapters.files.rig import rig_of
 from coec.adapters.files.state_file import StateFile
-from coec.config import Config, OpenPairConfig, PairConfig, config_hash
+from coec.config import CameraIntrinsics, Config, Matrix4x4, OpenPairConfig, PairConfig, config_hash
 from coec.errors import ConfigError
 from coec.runtime.nominal.findings import Found
 from coec.schemas.base import Part
@@ -25,13 +25,44 @@ _log = logging.getLogger(__name__)
 NOMINAL_FILE = "nominal.json"
 
 
+class KeptCamera(Part):
+    """What is found of a camera."""
+
+    frame_id: str
+    intrinsics: CameraIntrinsics
+
+
+class KeptLidar(Part):
+    """What is found of a LiDAR."""
+
+    frame_id: str
+    T_cloud_lidar: Matrix4x4
+    cloud_frame_id: str | None
+
+
+class KeptEgo(Part):
+    """What is found of the ego-motion."""
+
+    T_lidar_ego: Matrix4x4
+
+
+class KeptNominal(Part):
+    """What is found of a pair, out of its configuration. The file holds the whole `PairConfig`, which versions before
+    this one require; its other keys may be those of another version."""
+
+    T_camera_lidar: Matrix4x4
+    camera: KeptCamera
+    lidar: KeptLidar
+    ego: KeptEgo | None = None
+
+
 class KeptPair(Part):
     """`Found` on the disk. `asked` is the hash of what the configuration left out and where it was looked for.
     `found_ns` is the wall clock when it was found."""
 
     asked: str
     found_ns: Annotated[int, Field(ge=0, lt=2**63)]
-    pair: PairConfig
+    pair: KeptNominal
     origins: dict[str, str]
 
 
@@ -45,10 +76,12 @@ class KeptNominals:
         for damage in loaded.damage:
             _log.warning(f"nominal calibrations that were kept cannot be used: {damage}")
         self._pairs: dict[str, KeptPair] = {}
+        self._documents: dict[str, dict[str, Any]] = {}
         pairs = (loaded.body or {}).get("pairs")
         for name, document in (pairs if isinstance(pairs, dict) else {}).items():
             try:
                 self._pairs[name] = KeptPair.model_validate(document)
+                self._documents[name] = document
             except ValidationError:
                 self._file.distrust()
                 _log.warning("a nominal calibration that was kept has another form", extra={"fields": {"pair": name}})
@@ -66,8 +99,8 @@ class KeptNominals:
             return None
         document, earlier = pair.model_dump(), kept.pair
         document["T_camera_lidar"] = earlier.T_camera_lidar
-        document["camera"] |= earlier.camera.model_dump(include={"frame_id", "intrinsics"})
-        document["lidar"] |= earlier.lidar.model_dump(include={"frame_id", "T_cloud_lidar", "cloud_frame_id"})
+        document["camera"] |= earlier.camera.model_dump()
+        document["lidar"] |= earlier.lidar.model_dump()
         if pair.ego is not None and earlier.ego is not None:
             document["ego"]["T_lidar_ego"] = earlier.ego.T_lidar_ego
         try:
@@ -81,9 +114,16 @@ class KeptNominals:
 
     def keep(self, found: Found, asked: OpenPairConfig, config: Config, now_ns: int) -> None:
         """Keeps what was found; the next `flush` writes it."""
-        kept = KeptPair(asked=_asked(asked, config), found_ns=now_ns, pair=found.pair, origins=dict(found.origins))
+        document = {
+            "asked": _asked(asked, config),
+            "found_ns": now_ns,
+            "pair": found.pair.model_dump(mode="json"),
+            "origins": dict(found.origins),
+        }
+        kept = KeptPair.model_validate(document)
         with self._lock:
             self._pairs = {**self._pairs, asked.name: kept}
+            self._documents = {**self._documents, asked.name: document}
 
     def flush(self) -> None:
         """Writes to the disk what is kept.
@@ -92,8 +132,8 @@ class KeptNominals:
             StateError: it cannot be written; the next call tries again.
         """
         with self._lock:
-            pairs = self._pairs
-        self._file.save({"pairs": {name: kept.model_dump(mode="json") for name, kept in pairs.items()}})
+            documents = self._documents
+        self._file.save({"pairs": documents})
 
 
 def _asked(pair: OpenPairConfig, config: Config) -> str:

@@ -1,11 +1,13 @@
 """The file `sensors.json` keeps over a restart what is known of a rig: where its pairs were, which of its sensors had
 moved, and what was known before they did.
 
-If a sensor is knocked while the service is down, the first looks after the start show it.
+If a sensor is knocked while the service is down, the first looks after the start show it. The file may be of another
+version of the software: an edge, or the move of a sensor, that cannot be read falls back alone.
 """
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from dataclasses import replace
 from math import isfinite
@@ -73,10 +75,10 @@ class StoredEvent(Part):
 
 
 class StoredRig(Part):
-    """The file."""
+    """The file: of every edge a `StoredEdge`, and a `StoredEvent` or null."""
 
-    edges: dict[Name, StoredEdge] = Field(max_length=MOST_PAIRS)
-    event: StoredEvent | None = None
+    edges: dict[Name, Any] = Field(max_length=MOST_PAIRS)
+    event: Any = None
 
 
 class RigFile:
@@ -93,28 +95,44 @@ class RigFile:
         self._body: dict[str, Any] | None = None
         loaded = self._file.load()
         damage = [*loaded.damage]
-        self._found = StoredRig(edges={})
-        if loaded.body is not None:
-            try:
-                self._found = _sound(StoredRig.model_validate(loaded.body))
-            except (ValidationError, ValueError):
-                self._file.distrust()
-                damage.append(f"{FILE}: it has another form, or a pose in it is no rigid transform")
+        self._edges: dict[str, StoredEdge] = {}
+        self._event: StoredEvent | None = None
+        refused = [] if loaded.body is None else self._read(loaded.body)
+        if refused:
+            self._file.distrust()
+            why = "not in the form of this version, or with a pose that is no rigid transform"
+            damage.append(f"{FILE}: {', '.join(refused)} ({why})")
         text = (
-            f"What was known of the rig cannot be used: {'; '.join(damage)}. It is kept aside; the rig is learnt anew."
+            f"Something that was known of the rig cannot be used: {'; '.join(damage)}. The file is kept aside, what is "
+            "missing is learnt anew, and everything else is kept."
         )
         self.damage = (Reason("rig_state_damaged", text),) if damage else ()
+
+    def _read(self, body: dict[str, Any]) -> list[str]:
+        """Reads the edges and the event, each by itself. Returns what could not be read."""
+        try:
+            stored = StoredRig.model_validate(body)
+        except ValidationError:
+            return ["everything"]
+        for name, edge in stored.edges.items():
+            with contextlib.suppress(ValueError):  # of which a ValidationError is one
+                self._edges[name] = _sound_edge(StoredEdge.model_validate(edge))
+        with contextlib.suppress(ValueError):
+            self._event = None if stored.event is None else _sound_event(StoredEvent.model_validate(stored.event))
+        unread = len(stored.edges) - len(self._edges)
+        edges = [f"{unread} of {len(stored.edges)} edges"] if unread else []
+        return edges if self._event is not None or stored.event is None else [*edges, "the move of a sensor"]
 
     def recalled(self, rig: VehicleRig) -> VehicleRig:
         """Adds to a fresh rig, before any look, what was known before the restart."""
         histories = dict(rig.believed.histories)
         for name, edge in rig.graph.edge.items():
-            stored = self._found.edges.get(name)
+            stored = self._edges.get(name)
             # With another nominal calibration the mount is another one.
             if stored is not None and np.array_equal(_pose(stored.nominal), edge.T_a_b):
                 sigma = np.array([np.nan if value is None else value for value in stored.sigma])
                 histories[name] = History.at(_pose(stored.T_camera_lidar), sigma)
-        event = self._found.event
+        event = self._event
         if event is None or not set(event.sensors) <= set(rig.graph.place):
             return replace(rig, believed=RigState(histories))
         named = frozenset(event.named) & frozenset(event.sensors)
@@ -162,23 +180,31 @@ class RigFile:
             raise
 
 
-def _sound(stored: StoredRig) -> StoredRig:
-    """The file, with its poses and covariances checked: the checksum does not prove that this service wrote it.
+def _sound_edge(edge: StoredEdge) -> StoredEdge:
+    """The edge, with its poses checked: the checksum does not prove that this service wrote it.
+
+    Raises:
+        ValueError: a pose is no rigid transform.
+    """
+    if not (se3.is_rigid(_pose(edge.nominal)) and se3.is_rigid(_pose(edge.T_camera_lidar))):
+        raise ValueError("a pose is no rigid transform")
+    return edge
+
+
+def _sound_event(event: StoredEvent) -> StoredEvent:
+    """The event, with its poses and covariances checked likewise.
 
     Raises:
         ValueError: a pose is no rigid transform, or a matrix is no covariance.
     """
-    for known in () if stored.event is None else stored.event.before.values():
+    for known in event.before.values():
         measured = _measurement(known)
         if not se3.is_rigid(measured.T_camera_lidar):
             raise ValueError("a pose is no rigid transform")
         information_of(measured.uncertainty.noise)
         if any(abs(value) >= MOST_SIGMA for shift in known.systematic.values() for value in shift):
             raise ValueError("a shift is larger than any that is estimated")
-    for edge in stored.edges.values():
-        if not (se3.is_rigid(_pose(edge.nominal)) and se3.is_rigid(_pose(edge.T_camera_lidar))):
-            raise ValueError("a pose is no rigid transform")
-    return stored
+    return event
 
 
 def _stored(known: Measurement) -> dict[str, Any]:
