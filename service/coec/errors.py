@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
 
 from coec.untrusted import Untrusted, printable
 
-MAX_MESSAGE: Final = 4000
+MAX_MESSAGE = 4000
 """Most characters of each line of a message. A configuration with many mistakes needs them; a message that quotes a
 sender is bounded by `coec.untrusted.LIMIT` already."""
 

@@ -8,18 +8,17 @@ obeys control sequences in whatever is written to it.
 from __future__ import annotations
 
 import re
-from typing import Final
 
-LIMIT: Final = 1000
+LIMIT = 1000
 """Most characters that one untrusted text occupies in a line: about ten lines of a terminal."""
 
-_IGNORABLE: Final = re.compile(
+_IGNORABLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180d\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
 )
 """Characters that take no room, although `str.isprintable` counts them as printable: the rest of the property
 `Default_Ignorable_Code_Point` of Unicode. Texts that differ only in these look the same."""
 
-_SURROGATE: Final = re.compile("[\ud800-\udfff]")
+_SURROGATE = re.compile("[\ud800-\udfff]")
 """Halves of a character beyond U+FFFF; `str` joins proper pairs, so each of them stands alone and has no UTF-8 form."""
 
 
