@@ -4,9 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from coec.untrusted import Untrusted, printable
+
+MAX_MESSAGE = 4000
+"""Most characters of each line of a message. A configuration with many mistakes needs them; a message that quotes a
+sender is bounded by `coec.untrusted.LIMIT` already."""
+
 
 class CoecError(Exception):
     """Base of all deliberate errors. The message says what was wrong, where, and what to do.
+
+    The first argument is one line. Further arguments are the program's own text and may have several lines. `str()`
+    escapes every other control character, because a message may quote a file, a recording or a reply.
 
     Attributes:
         exit_code: process exit status of a command that ends with this error (CONTRACT, "Command line").
@@ -17,6 +26,11 @@ class CoecError(Exception):
     exit_code = 1
     reply_code = "internal"
     details: Mapping[str, object] = {}
+
+    def __str__(self) -> str:
+        first, *more = self.args or ("",)
+        lines = [str(first), *(line for text in more for line in str(text).split("\n"))]
+        return "\n".join(printable(line, MAX_MESSAGE) for line in lines)
 
 
 class UsageError(CoecError):
@@ -127,11 +141,11 @@ class ConnectionFailedError(CoecError):
 
 
 class RemoteError(CoecError):
-    """An error reply; `code` is the one that the sender gave."""
+    """An error reply; `code` and `message` are those that the sender gave."""
 
     def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.reply_code = code
+        super().__init__(Untrusted(message))
+        self.reply_code = Untrusted(code)
 
 
 class NotProvenError(CoecError):

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-import pytest
+import ast
+import logging
+import subprocess
+import sys
+from pathlib import Path
 
+import pytest
+from rich.text import Text
+
+import coec
 from coec.reports import console
+from coec.reports.progress import Bars, Words
 from coec.schemas.replies import MetricReply
+from hostile import HOSTILE, obeyed
 
 
 @pytest.mark.parametrize(
@@ -23,7 +33,7 @@ def test_a_figure_without_a_limit_keeps_none(
     assert (text, mark.plain) == shown
 
 
-@pytest.mark.fault("a text from a vehicle with control sequences for a terminal", "it is shown with marks in its place")
+@pytest.mark.fault("a text from a vehicle with control sequences for a terminal", "they are shown as escapes")
 def test_what_came_over_a_network_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
     evil = "a\x1b[2J\x07b [red]c[/red]\r"
     console.show(evil)
@@ -34,4 +44,109 @@ def test_what_came_over_a_network_moves_no_cursor(capsys: pytest.CaptureFixture[
     captured = capsys.readouterr()
     for text in (captured.out, captured.err):
         assert not {"\x1b", "\x07", "\r"} & set(text)
-        assert "a�[2J�b [red]c[/red]" in text
+        assert r"a\x1b[2J\x07b [red]c[/red]\r" in text
+
+
+def terminal() -> console.EscapingConsole:
+    """With colours, on what pytest captures."""
+    return console.EscapingConsole(force_terminal=True, color_system="truecolor", width=100)
+
+
+def test_whatever_rich_is_given_it_sends_a_terminal_its_own_sequences_only(capsys: pytest.CaptureFixture[str]) -> None:
+    screen = terminal()
+    screen.print(HOSTILE, Text(HOSTILE, "bold red"), [HOSTILE], sep=HOSTILE, end=HOSTILE)
+    screen.print(console.styled(HOSTILE))
+    screen.out(HOSTILE)
+    screen.rule(HOSTILE)
+    for column in (Text(HOSTILE), HOSTILE):
+        table = console.table(HOSTILE)
+        table.add_row(column)
+        screen.print(table)
+    with Bars(screen, console.say, counted=True) as bars:
+        bars.update(bars.add_task(HOSTILE, total=1, note=HOSTILE), completed=1, note=HOSTILE)
+        bars.refresh()
+    written = capsys.readouterr().out
+    assert "\x1b[1;31m" in written, "its own styles are there"
+    assert obeyed(written, styled=True) == ""
+    assert "[red]" in written, "markup is text"
+
+
+def test_markup_in_the_words_of_a_bar_is_text() -> None:
+    bars = Bars(terminal(), console.say, counted=False)
+    task = bars.add_task("[red]front[/red]\n", note="[link=x]y")
+    (shown,) = [Words("{task.description}").render(one) for one in bars.tasks if one.id == task]
+    assert shown.plain == r"[red]front[/red]\n"
+    assert not shown.spans
+
+
+@pytest.mark.fault("an exception in a thread or a callback quotes a reply", "its traceback has escapes in place of it")
+def test_what_the_interpreter_prints_by_itself_is_escaped() -> None:
+    program = (
+        "import logging, sys, threading\n"
+        "from coec.reports import plain_text\n"
+        "plain_text.escape_interpreter()\n"
+        "evil = '\\x1b[35;45m\\x9b\\r'\n"
+        "def fail(): raise ValueError(evil)\n"
+        "thread = threading.Thread(target=fail); thread.start(); thread.join()\n"
+        "logging.getLogger('x').warning(evil)\n"
+        "fail()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, encoding="utf-8")
+    assert ended.returncode == 1
+    assert ended.stderr.count(r"ValueError: \x1b[35;45m\x9b\r") == 2
+    assert ended.stderr.count(r"\x1b[35;45m\x9b\r") == 3
+    assert obeyed(ended.stderr) == ""
+    assert logging.lastResort is not None
+
+
+PACKAGE = Path(coec.__file__).parent
+SINKS = {
+    PACKAGE / "reports" / "plain_text.py",
+    PACKAGE / "reports" / "console.py",
+    # Each of its formatters escapes the line that it makes.
+    PACKAGE / "adapters" / "system" / "logs.py",
+    # They print fixed texts of the repository, and only its developers run them.
+    PACKAGE / "schemas" / "export.py",
+    PACKAGE / "cli" / "pages" / "__main__.py",
+    PACKAGE / "calibration" / "lifecycle" / "__main__.py",
+}
+"""Where text may go to standard output and standard error."""
+
+PRINTS = {"print", "typer.echo", "typer.secho", "click.echo", "click.secho", "rich.print", "traceback.print_exc",
+          "traceback.print_exception", "Console", "rich.console.Console", "os.write"}  # fmt: skip
+STREAMS = {"sys.stdout", "sys.stderr", "sys.__stdout__", "sys.__stderr__"}
+HARMLESS = {"isatty", "encoding"}
+"""What may be asked of a stream anywhere."""
+
+DISPLAYS = {"Live", "Progress"}
+"""Displays of rich that make a console of their own unless they are given one."""
+
+
+def bypasses(path: Path) -> list[str]:
+    """What a module prints with, or could print with, other than the sink."""
+    text = path.read_text()
+    nodes = list(ast.walk(ast.parse(text)))
+    harmless = {id(node.value) for node in nodes if isinstance(node, ast.Attribute) and node.attr in HARMLESS}
+    found = []
+    for node in nodes:
+        if isinstance(node, ast.Call):
+            name, given = ast.unparse(node.func), {keyword.arg for keyword in node.keywords}
+            alone = name in DISPLAYS and "from rich" in text and "console" not in given
+            if name in PRINTS or alone:
+                found.append((node.lineno, name))
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load) and id(node) not in harmless:
+            found += [(node.lineno, stream) for stream in STREAMS & {ast.unparse(node)}]
+    return [f"{path.relative_to(PACKAGE)}:{line}: {name}" for line, name in found]
+
+
+def test_nothing_prints_but_through_the_one_place_that_escapes() -> None:
+    modules = set(PACKAGE.rglob("*.py"))
+    assert modules > SINKS
+    assert [found for path in sorted(modules - SINKS) for found in bypasses(path)] == []
+
+
+def test_a_module_that_prints_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path)
+    path = tmp_path / "m.py"
+    path.write_text("from rich.live import Live\nimport sys\nout = sys.stderr\nprint(1)\nLive()\nsys.stdout.isatty()\n")
+    assert sorted(bypasses(path)) == ["m.py:3: sys.stderr", "m.py:4: print", "m.py:5: Live"]

@@ -15,17 +15,22 @@ from coec.reports.incident_page import Story, page, sentences
 from coec.reports.page import render
 from coec.runtime.decisions.chain import GENESIS
 from coec.schemas.base import to_json
-from coec.schemas.incident import Absent
+from coec.schemas.incident import Absent, FetchedWindow
 from coec.schemas.replies import (
     ChainedEntry,
     EvidenceEvent,
+    ExtrinsicReply,
+    HealthReply,
     HistoryEntry,
     HistoryReply,
     MetricsPoint,
     Reason,
+    StatusReply,
     Transform,
 )
+from hostile import HOSTILE, hostile, obeyed
 from reports.pages import EVIL, MADE, png
+from reports.test_page import Read
 
 S = 1_000_000_000
 IDENTITY = Transform(
@@ -100,6 +105,35 @@ def test_what_a_vehicle_says_is_text() -> None:
     assert text.count("<script") == 1, "that of the page itself"
     assert "<img" not in text
     assert "something was changed, taken out or put in" in text
+
+
+@pytest.mark.fault(
+    "control sequences and markup in every text that a vehicle sends of an event",
+    "the page has the elements and attributes that it has without them, and shows escapes",
+)
+def test_no_text_of_any_document_adds_to_the_page_or_reverses_it() -> None:
+    def of(text: str) -> str:
+        story = Story(
+            hostile(EvidenceEvent, text=text, stamp_ns=S, wall_ns=S),
+            hostile(HistoryReply, text=text),
+            hostile(HealthReply, text=text),
+            hostile(ExtrinsicReply, text=text),
+            hostile(StatusReply, text=text),
+            (hostile(FetchedWindow, text=text),),
+            (hostile(Absent, text=text),),
+            chain_holds=True,
+            snippets=(text,),
+        )
+        return told(story, {"before.jpg": png()})
+
+    shown = of(HOSTILE)
+    assert obeyed(shown) == ""
+    page, harmless = (Read(text) for text in (shown, of("name")))
+    assert [(tag, [*attributes]) for tag, attributes in page.tags] == [
+        (tag, [*attributes]) for tag, attributes in harmless.tags
+    ]
+    leads = {attributes.get("href") or "#" for _, attributes in page.tags}
+    assert all(address.startswith(("#", "windows/")) or address == "before.jpg" for address in leads)
 
 
 def chained(*texts: str) -> list[ChainedEntry]:

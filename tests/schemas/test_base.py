@@ -1,15 +1,22 @@
 """Canonical encodings of wire models, and what readers forgive."""
 
+import importlib
+import inspect
 import json
+import pkgutil
 
 import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import BaseModel
 
+from coec import schemas
 from coec.errors import DecodeError
-from coec.schemas.base import from_json, from_msgpack, to_json, to_msgpack
-from coec.schemas.replies import Acknowledgement, MetricReply, StreamStatus, Transform
+from coec.schemas.base import from_json, from_msgpack, json_value, to_json, to_msgpack
+from coec.schemas.replies import Acknowledgement, HealthReply, MetricReply, StreamStatus, Transform
+from coec.untrusted import Untrusted
+from hostile import HOSTILE, hostile, obeyed, texts
 
 ACKNOWLEDGEMENT = Acknowledgement(
     vehicle="v", pair="front", command="calibrate", accepted=False, code="too_few_pairs", text="4 more pairs — wait"
@@ -59,3 +66,55 @@ def test_anything_else_is_a_decode_error(payload: bytes) -> None:
 def test_a_model_refuses_nan() -> None:
     with pytest.raises(ValueError, match="finite"):
         MetricReply(value=float("nan"), limit=1.0, at_least=True, passed=False)
+
+
+NEVER_SHOWN = {"frames", "commands"}
+"""Modules whose messages only the service receives; it checks their texts itself."""
+
+MODELS = [
+    model
+    for module in pkgutil.iter_modules(schemas.__path__)
+    if module.name not in NEVER_SHOWN
+    for name, model in inspect.getmembers(importlib.import_module(f"coec.schemas.{module.name}"), inspect.isclass)
+    if issubclass(model, BaseModel) and model.__module__ == f"coec.schemas.{module.name}"
+]
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
+def test_every_text_of_a_message_prints_as_an_escape_and_travels_as_it_is(model: type[BaseModel]) -> None:
+    message = hostile(model)
+    assert [text for text in texts(message) if not isinstance(text, Untrusted)] == [], "declare it as `Text`"
+    for back in (from_json(model, to_json(message)), from_msgpack(model, to_msgpack(message))):
+        assert back == message
+        assert set(map(type, texts(back))) <= {Untrusted}
+    assert obeyed(f"{texts(message)}{message!r}") == ""
+
+
+def test_places_of_mistakes_name_no_key_of_the_sender_as_it_came() -> None:
+    document = json.loads(to_json(hostile(HealthReply)))
+    document["metrics"] = {HOSTILE + "k" * 10_000: {}}
+    with pytest.raises(DecodeError) as refused:
+        from_json(HealthReply, json.dumps(document).encode())
+    assert str(refused.value).isprintable()
+    assert len(str(refused.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("payload", "wrong"),
+    [
+        (b'{"a": ', "line 1 column 7"),
+        (b'"\xff"', "no UTF-8 at byte 1"),
+        (b"[" * 100_000, "nested deeper than 64"),
+        (b"[" * 66 + b"]" * 66, "nested deeper than 64"),
+        (b"1" * 5_000, "too many digits"),
+        (b"[-Infinity]", "not finite"),
+        (b"1e999", "not finite"),
+    ],
+)
+def test_a_document_that_could_not_be_written_again_is_refused(payload: bytes, wrong: str) -> None:
+    with pytest.raises(DecodeError, match=wrong):
+        json_value(payload)
+
+
+def test_a_document_that_can_be_written_again_is_read() -> None:
+    assert json_value(b'{"a": [1, 2.5, null, "\\ud800"]}') == {"a": [1, 2.5, None, "\ud800"]}

@@ -22,6 +22,7 @@ from coec.cli.exit_codes import BROKEN_PIPE, FAULT
 from coec.cli.stopping import no_interrupt_lost
 from coec.errors import CoecError, UsageError
 from coec.reports import plain_text
+from coec.untrusted import json_printable
 
 GROUPS = ("models", "sim", "fleet")
 """Commands with subcommands."""
@@ -87,7 +88,8 @@ def _tell_version(asked: bool) -> None:
     if asked:
         from coec.cli import version as work
 
-        print(json.dumps(work.document(), sort_keys=True) if "--json" in sys.argv[1:] else work.text())
+        told = json.dumps(work.document(), sort_keys=True) if "--json" in sys.argv[1:] else work.text()
+        plain_text.write(f"{told}\n")
         raise typer.Exit(0)
 
 
@@ -112,6 +114,7 @@ def main() -> int:
     """Entry point; returns the exit status."""
     as_json = "--json" in sys.argv[1:]
     plain_text.never_fail()
+    plain_text.escape_interpreter()
     # Without a home directory, matplotlib warns about where it keeps fonts, which is of no interest here.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
@@ -126,14 +129,14 @@ def main() -> int:
         status = ended.code if isinstance(ended.code, int) else 0
         # A command that ends like this by itself has printed why.
         if isinstance(getattr(ended.__context__, "__cause__", None), KeyboardInterrupt):
-            print("coec: interrupted", file=sys.stderr)
+            plain_text.write("coec: interrupted\n", on_error=True)
             if as_json:
                 _print_error("interrupted", "ended by Ctrl-C before there was a result")
         if status == UsageError.exit_code and as_json:
             _print_error("bad_request", "the command line does not fit; standard error says how")
         return status
     except CoecError as error:
-        print(f"coec: {error}", file=sys.stderr)
+        plain_text.write(f"coec: {error}\n", on_error=True)
         if as_json:
             _print_error(error.reply_code, str(error), error.details)
         return error.exit_code
@@ -142,11 +145,10 @@ def main() -> int:
     except Exception as error:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             sys.stdout = None
-            print(f"coec: cannot write: {error.strerror}; make room where the output goes", file=sys.stderr)
+            told = f"coec: cannot write: {error.strerror}; make room where the output goes\n"
+            plain_text.write(told, on_error=True)
             return CoecError.exit_code
-        import traceback
-
-        traceback.print_exc()
+        plain_text.write_traceback(error)
         if as_json:
             _print_error("internal", f"{type(error).__name__}: {error}")
         return FAULT
@@ -170,4 +172,5 @@ def _with_signs_of(encoding: str, command: Any) -> None:
 
 
 def _print_error(code: str, message: str, details: Mapping[str, Any] | None = None) -> None:
-    print(json.dumps({"error": {"code": code, "message": message}, **(details or {})}, ensure_ascii=False))
+    document = {"error": {"code": code, "message": message}, **(details or {})}
+    plain_text.write(f"{json_printable(json.dumps(document, ensure_ascii=False))}\n")

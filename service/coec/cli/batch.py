@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from coec.cli.commands.batch import Options
 from coec.fleet import batch
@@ -15,6 +15,7 @@ from coec.fleet.engines.engine import Bounds, Engine
 from coec.fleet.places import jobs_of
 from coec.fleet.terms import terms_of
 from coec.reports import console
+from coec.reports.progress import Words
 from coec.schemas.fleet import BatchReport, WindowRow
 
 MIB = 2**20
@@ -60,12 +61,12 @@ def _engine(options: Options) -> Engine:
 def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
     """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then."""
     bars = Progress(
-        TextColumn("windows"),
+        Words("windows"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        Words("{task.fields[note]}"),
         console=console.err,
         transient=True,
         disable=not console.err.is_terminal,

@@ -45,7 +45,7 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
         if as_json:
             console.print_json({"config": example().model_dump(mode="json")})
         else:
-            console.show(template().rstrip("\n"))
+            console.show_lines(template().rstrip("\n"))
         return 0
     config = load_config(path)
     checks = [check for pair in config.pairs for check in _check(pair, config)]
@@ -64,8 +64,9 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
         document = {"config": config.model_dump(mode="json"), "config_hash": digest, "checks": checks}
         console.print_json(document)
         return 0
-    console.show(commented_yaml(config).strip("\n"))
-    console.show(f"\n# config hash {digest}")
+    console.show_lines(commented_yaml(config).strip("\n"))
+    console.show("")
+    console.show(f"# config hash {digest}")
     for check in checks:
         console.show(f"# ok: {check}")
     return 0

@@ -44,7 +44,7 @@ def run(options: Options) -> int:
         written = None if options.output is None else str(options.output)
         console.print_json({"format": options.format, "text": text, "written": written})
     elif options.output is None:
-        console.raw(text)
+        console.write(text)
     else:
         console.show(f"{options.output}  {extrinsic.child} in {extrinsic.parent}, {extrinsic.origin.provenance}")
     return 0

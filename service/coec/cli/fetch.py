@@ -30,7 +30,7 @@ from coec.errors import CoecError, DecodeError, NotFoundError, OutputError, Remo
 from coec.reports import console, incident_page, provenance, replies
 from coec.reports.fleet_board import duration
 from coec.reports.page import render
-from coec.schemas.base import SCHEMA_VERSION, Message, from_json, to_json
+from coec.schemas.base import SCHEMA_VERSION, Message, from_json, json_value, to_json
 from coec.schemas.incident import Absent, FetchedFile, FetchedWindow, IncidentReport
 from coec.schemas.keys import MAX_LENGTH, Keys
 from coec.schemas.last_word import read as read_word
@@ -232,11 +232,7 @@ class _Fetch:
 
     def _configuration(self) -> bytes:
         """The configuration as the vehicle sends it; a newer vehicle may have keys that this program does not know."""
-        data = self._answer(f"{self.keys.config}?format=json")
-        try:
-            document = json.loads(data)
-        except (ValueError, RecursionError) as error:
-            raise DecodeError("message_malformed", "the configuration is no JSON") from error
+        document = json_value(self._answer(f"{self.keys.config}?format=json"))
         return json.dumps(document, indent=2, sort_keys=True).encode()
 
     def _picture(self, event_id: str, side: str) -> None:

@@ -84,9 +84,9 @@ def _said(path: Path) -> FleetNow:
 
 
 def _show_sql(results: Path) -> None:
-    console.raw(f"-- the view `{questions.WINDOWS}` of the examples below\n")
-    console.raw(f"{questions.statement(questions.WINDOWS, results)};\n\n")
+    console.write(f"-- the view `{questions.WINDOWS}` of the examples below\n")
+    console.write(f"{questions.statement(questions.WINDOWS, results)};\n\n")
     for name, kind in questions.columns(results):
-        console.raw(f"--   {name:<22} {kind}\n")
+        console.write(f"--   {name:<22} {kind}\n")
     for question, query in questions.EXAMPLES.items():
-        console.raw(f"\n-- {question}{query};\n")
+        console.write(f"\n-- {question}{query};\n")

@@ -25,7 +25,7 @@ def show(file: Path, *, as_json: bool) -> int:
     if as_json:
         console.print_json(document)
     else:
-        console.out.print_json(data=document)
+        console.show_json(document)
     return 0
 
 
@@ -41,5 +41,6 @@ def run(*, as_json: bool) -> int:
         digest = card.sha256[:12] if card.sha256 else "any"
         listed.add_row(card.name, card.file or f"{card.name}.onnx", card.output.kind, digest, card.licence)
     console.out.print(listed)
-    console.show(f"\nnetworks are looked for by name in {models_folder()}; any other ONNX file by its path")
+    console.show("")
+    console.show(f"networks are looked for by name in {models_folder()}; any other ONNX file by its path")
     return 0

@@ -32,12 +32,13 @@ from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.cli.commands.query import Options
 from coec.config import Config, ZenohConfig, load_config
-from coec.errors import NotFoundError, OutputError, UsageError
+from coec.errors import DecodeError, NotFoundError, OutputError, UsageError
 from coec.reports import console, replies
-from coec.schemas.base import from_json
+from coec.schemas.base import from_json, json_value
 from coec.schemas.commands import NAMES, REASON, RELEASE, SENSOR, TO, arguments_of
 from coec.schemas.keys import RIG, VERSION_CHUNK, Keys
-from coec.schemas.replies import StatusReply
+from coec.schemas.replies import Acknowledgement, StatusReply
+from coec.untrusted import Untrusted
 
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
 PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
@@ -264,9 +265,13 @@ def _show(replies: list[Reply], kind: str | None, options: Options, key: str) ->
 
 
 def _value(reply: Reply) -> Any:
-    """The payload as a JSON value, or as text if it is not JSON."""
-    if reply.encoding.startswith("application/json"):
-        return json.loads(reply.payload)
+    """The payload as a JSON value, or as text if its sender does not call it JSON.
+
+    Raises:
+        DecodeError: the sender calls it JSON, but it is not.
+    """
+    if reply.encoding.startswith(JSON):
+        return _json(reply)
     return reply.payload.decode("utf-8", errors="replace")
 
 
@@ -274,14 +279,30 @@ def _render(reply: Reply, kind: str | None) -> None:
     shown = replies.BY_KIND.get(kind or "")
     if shown is not None:
         shown(reply.payload)
-    elif reply.encoding.startswith("application/json"):
-        console.out.print_json(reply.payload.decode())
+    elif reply.encoding.startswith(JSON):
+        console.show_json(_json(reply))
     else:
-        console.show(reply.payload.decode("utf-8", errors="replace").rstrip("\n"))
+        console.show_lines(reply.payload.decode("utf-8", errors="replace").rstrip("\n"))
 
 
 def _succeeded(reply: Reply, kind: str | None) -> bool:
-    return kind != "command" or bool(json.loads(reply.payload).get("accepted", True))
+    return kind != "command" or from_json(Acknowledgement, reply.payload).accepted
+
+
+def _json(reply: Reply) -> Any:
+    """The document of a reply.
+
+    Raises:
+        DecodeError: it is none; says what is wrong with it, whose it is, and what to do.
+    """
+    try:
+        return json_value(reply.payload)
+    except DecodeError as error:
+        raise DecodeError(
+            error.reason,
+            f"the reply of {Untrusted(reply.key)} is {error}, although its sender calls it JSON ({len(reply.payload)} "
+            "bytes): see the log of the service for a fault, or forbid other programs its keys with the router's rules",
+        ) from error
 
 
 def _save_picture(options: Options, way: Way, keys: Keys, head: str, argument: str) -> int:

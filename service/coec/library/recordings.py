@@ -24,6 +24,7 @@ from coec.sources import Recording as Opened
 from coec.sources import open_source, windows
 from coec.sources.recording import KnowsTruth
 from coec.sources.windows import NoPairsError
+from coec.untrusted import Untrusted, printable
 
 NS_PER_S = 1e9
 
@@ -82,8 +83,10 @@ class Description:
     def __str__(self) -> str:
         width, height = self.intrinsics["width"], self.intrinsics["height"]
         motion = "none" if self.motion is None else f"{self.motion.frames} samples, {self.motion.rate_hz:.2f} Hz"
+        # Names and frames are as the recording has them, and whoever prints this has a terminal that would obey them.
         return "\n".join(
-            (
+            printable(line, None)
+            for line in (
                 f"{self.name}: {self.seconds:.1f} s of the pair {self.pair}",
                 f"  camera  {self.camera.frames} frames, {self.camera.rate_hz:.2f} Hz  {self.camera_model}, "
                 f"{width:.0f} x {height:.0f} px, frame {self.camera_frame}",
@@ -101,7 +104,7 @@ class Recording:
         self._opened = opened
 
     def __repr__(self) -> str:
-        return f"<coec.Recording {self._opened.name}>"
+        return f"<coec.Recording {Untrusted(self._opened.name)}>"
 
     @property
     def source(self) -> str:

@@ -1,4 +1,9 @@
-"""How commands print: documents and tables on standard output, progress and remarks on standard error."""
+"""How commands print: documents and tables on standard output, progress and remarks on standard error.
+
+Whatever is printed may hold text that came over a network or out of a recording. Nothing here lets a control character
+other than a line break through, except those of the styles and of the cursor that rich makes itself; none of it is read
+as markup.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +13,16 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from rich.console import Console, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.highlighter import JSONHighlighter
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
 from coec.reports import plain_text
 from coec.reports.progress import Bars
 from coec.schemas import replies
+from coec.untrusted import json_printable, printable, printable_lines
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 AXIS_NAMES = ("rx pitch", "ry yaw", "rz roll", "tx right", "ty down", "tz forward")
@@ -38,13 +46,31 @@ PIPE_WIDTH = 140
 """Columns where standard output is no terminal, so that lines of a log are not folded."""
 
 
+class EscapingConsole(Console):
+    """A console that escapes control characters in all text that it renders, before rich adds styles, and that reads no
+    text as markup."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(markup=False, emoji=False, highlight=False, **settings)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """The segments of a renderable, as rich makes them, with their text escaped. Segments with control codes are
+        those with which rich moves the cursor."""
+        for segment in super().render(renderable, options):
+            text = segment.text
+            if segment.control or (text.isascii() and text.isprintable()):
+                yield segment
+            else:
+                yield Segment(printable_lines(text), segment.style)
+
+
 def made(environment: Mapping[str, str], *, on_error: bool = False) -> Console:
     """A console on standard output, or on standard error. A plain one is no terminal to rich: no colours, no bold,
     nothing that moves."""
     width = PIPE_WIDTH if not on_error and not sys.stdout.isatty() else None
     if plain_text.wants_plain(environment):
-        return Console(stderr=on_error, highlight=False, width=width, force_terminal=False, color_system=None)
-    return Console(stderr=on_error, highlight=False, width=width)
+        return EscapingConsole(stderr=on_error, width=width, force_terminal=False, color_system=None)
+    return EscapingConsole(stderr=on_error, width=width)
 
 
 out = made(os.environ)
@@ -55,31 +81,42 @@ def print_json(document: Any) -> None:
     """The one document of `--json`: a line with sorted keys, floats in the shortest form that reads back exactly."""
     escaped = not plain_text.is_unicode(sys.stdout.encoding)
     text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=escaped, allow_nan=False)
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    plain_text.write(f"{json_printable(text)}\n")
 
 
-def raw(text: str) -> None:
-    """Prints text that is meant as a file to standard output, unchanged."""
-    sys.stdout.write(text)
-    sys.stdout.flush()
+def show_json(document: Any) -> None:
+    """A JSON document for people, on standard output: indented, and in colours on a terminal."""
+    escaped = not plain_text.is_unicode(sys.stdout.encoding)
+    text = json_printable(json.dumps(document, indent=2, ensure_ascii=escaped, allow_nan=False))
+    out.print(JSONHighlighter()(Text(text)), soft_wrap=True)
+
+
+def write(text: str) -> None:
+    """Writes text that is meant as a file to standard output, without styles or folding."""
+    plain_text.write(text)
 
 
 def plain(text: str) -> str:
-    """The text without control characters that a terminal would obey, because some of it came over a network. Signs
+    """The text as one line without anything that a terminal would obey, because some of it came over a network. Signs
     that the terminal lacks are replaced here, so that columns stay in line."""
-    obeyed = "".join(character if character.isprintable() or character in "\n\t" else "\ufffd" for character in text)
-    return obeyed if plain_text.is_unicode(out.encoding) else plain_text.encodable(obeyed, out.encoding)
+    shown = printable(text, None)
+    return shown if plain_text.is_unicode(out.encoding) else plain_text.encodable(shown, out.encoding)
 
 
 def say(text: str) -> None:
-    """Prints a remark, as it is, on standard error."""
+    """Prints a remark, as it is, as one line on standard error."""
     err.print(Text(plain(text)), soft_wrap=True)
 
 
 def show(text: str, style: str = "") -> None:
-    """Prints a line, as it is, on standard output."""
+    """Prints a text, as it is, as one line on standard output."""
     out.print(Text(plain(text), style=style), soft_wrap=True)
+
+
+def show_lines(text: str) -> None:
+    """Prints a document of several lines, as it is, on standard output."""
+    for line in text.split("\n"):
+        show(line)
 
 
 def progress(*, counted: bool = True) -> Bars:
@@ -116,7 +153,7 @@ def figure(value: float | None, digits: int = 3, sign: bool = False) -> str:
 
 def styled(state: str) -> Text:
     """A state in its colour."""
-    return Text(state, style=STATE_STYLES.get(state, "bold"))
+    return Text(plain(state), style=STATE_STYLES.get(state, "bold"))
 
 
 def show_verdict(result: replies.CalibrationResult) -> None:

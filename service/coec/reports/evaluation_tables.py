@@ -218,7 +218,8 @@ def _show_experiments(report: EvaluationReport) -> None:
 
 def show_closure(report: ClosureReport) -> None:
     """Prints how two calibrations close."""
-    console.show(f"A {report.source_a}\nB {report.source_b}")
+    console.show(f"A {report.source_a}")
+    console.show(f"B {report.source_b}")
     known = ", ".join(
         f"{console.figure(value)} {unit}" for value, unit in zip(report.known, console.UNITS, strict=True)
     )

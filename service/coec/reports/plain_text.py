@@ -1,10 +1,16 @@
-"""Text for limited terminals: without colours, or without signs outside ASCII."""
+"""Text for limited terminals: without colours, or without signs outside ASCII; and the one place, beside
+`coec.reports.console`, from which text goes to standard output and standard error."""
 
 from __future__ import annotations
 
 import codecs
+import logging
 import sys
+import threading
+import traceback
 from collections.abc import Mapping
+
+from coec.untrusted import printable_lines
 
 SIGNS: Mapping[str, str] = {
     "°": "deg", "±": "+-", "≥": ">=", "≤": "<=", "✓": "ok", "✗": "x", "·": "*", "×": "x", "−": "-", "–": "-", "—": "-",
@@ -29,6 +35,35 @@ def is_unicode(encoding: str | None) -> bool:
     return (encoding or "").lower().replace("-", "").replace("_", "").startswith("utf")
 
 
+def write(text: str, *, on_error: bool = False) -> None:
+    """Writes text to standard output, or to standard error. Control characters in it other than line breaks are
+    escaped, whatever it was made of."""
+    stream = sys.stderr if on_error else sys.stdout
+    stream.write(printable_lines(text))
+    stream.flush()
+
+
+def write_traceback(error: BaseException) -> None:
+    """Writes the traceback of an exception, whose text may quote a reply or a file, to standard error."""
+    write("".join(traceback.format_exception(error)), on_error=True)
+
+
+def escape_interpreter() -> None:
+    """From now on, what the interpreter itself prints is escaped too: tracebacks of threads and of callbacks, and log
+    records of a command that configures no log. A hook that somebody else has set stays."""
+
+    def of_thread(ended: threading.ExceptHookArgs) -> None:
+        if ended.exc_value is not None and not isinstance(ended.exc_value, SystemExit):
+            write_traceback(ended.exc_value)
+
+    if threading.excepthook is threading.__excepthook__:
+        threading.excepthook = of_thread
+    if sys.excepthook is sys.__excepthook__:
+        sys.excepthook = lambda _, error, __: write_traceback(error)
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_EscapingFormatter())
+
+
 def never_fail() -> None:
     """From now on, printing never fails because the locale's encoding lacks a sign."""
     for stream in (sys.stdout, sys.stderr):
@@ -41,6 +76,11 @@ def never_fail() -> None:
 def wants_plain(environment: Mapping[str, str]) -> bool:
     """Whether to send the terminal nothing but text: with NO_COLOR (https://no-color.org), or for a dumb terminal."""
     return bool(environment.get("NO_COLOR")) or environment.get("TERM", "").lower() in ("dumb", "unknown")
+
+
+class _EscapingFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return printable_lines(super().format(record))
 
 
 def _substitute(error: UnicodeError) -> tuple[str, int]:

@@ -18,8 +18,10 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.text import Text
 
 from coec.geometry import compile_news
+from coec.untrusted import printable
 
 LINE_S = 30.0
 """Time between two lines without a terminal: the log of an hour has about a hundred."""
@@ -55,6 +57,17 @@ class CompilingNews:
         return 0.0 if self._began_s is None else self._now_s() - self._began_s
 
 
+class Words(TextColumn):
+    """A column of text that is shown as it is, on one line: names in it come from recordings and vehicles."""
+
+    def __init__(self, text_format: str) -> None:
+        super().__init__(text_format, markup=False)
+
+    def render(self, task: Task) -> Text:
+        """The text of a task."""
+        return Text(printable(self.text_format.format(task=task)))
+
+
 class Bars(Progress):
     """A bar for each task that disappears when all is done. Where the console is no terminal, a line on the current
     task every half minute; quicker work gets none."""
@@ -78,11 +91,11 @@ class Bars(Progress):
         count = (MofNCompleteColumn(),) if counted else ()
         super().__init__(
             SpinnerColumn("dots" if console.encoding.startswith("utf") else "line"),
-            TextColumn("{task.description}"),
+            Words("{task.description}"),
             BarColumn(),
             *count,
             TimeElapsedColumn(),
-            TextColumn("{task.fields[note]}"),
+            Words("{task.fields[note]}"),
             console=console,
             transient=True,
             disable=not console.is_terminal,

@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import json
-from typing import Any, TypeVar
+import math
+from typing import Annotated, Any, Final, TypeVar
 
 import msgpack
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from coec.errors import DecodeError
+from coec.untrusted import Untrusted, printable
 
 SCHEMA_VERSION = 6
 """Version of the models in this package, raised when a field is added. A field that changes its meaning or goes away
 needs a new `@v2` in the keys instead."""
+
+MAX_JSON_DEPTH: Final = 64
+"""Deepest nesting of a JSON document that is read; ours have at most 10."""
+
+MAX_PLACE: Final = 100
+"""Most characters of the place of a mistake in a message."""
+
+Text = Annotated[str, AfterValidator(Untrusted)]
+"""Text in a message. A model cannot know whether its sender is to be trusted, so that an f-string prints it with its
+control characters escaped (`coec.untrusted`); on the wire it is unchanged."""
 
 
 class Part(BaseModel):
@@ -69,6 +81,35 @@ def from_json(model: type[M], payload: bytes) -> M:
         raise DecodeError("message_malformed", f"not a {model.__name__} in JSON: {_places(error)}") from error
 
 
+def json_value(payload: bytes) -> Any:
+    """The value of any JSON document, which can be written again: every number is finite, and the nesting is at most
+    `MAX_JSON_DEPTH`.
+
+    Raises:
+        DecodeError: not such a document; says what is wrong and at which place of it.
+    """
+    try:
+        value = json.loads(payload)
+    except json.JSONDecodeError as error:
+        raise DecodeError("message_malformed", f"not JSON: {error}") from error
+    except UnicodeDecodeError as error:
+        raise DecodeError("message_malformed", f"not JSON: no UTF-8 at byte {error.start}") from error
+    except ValueError as error:
+        raise DecodeError("message_malformed", "not JSON: a number with too many digits") from error
+    except RecursionError as error:
+        raise DecodeError("message_malformed", f"not read: nested deeper than {MAX_JSON_DEPTH}") from error
+    waiting = [(value, 0)]
+    while waiting:
+        part, depth = waiting.pop()
+        if depth > MAX_JSON_DEPTH:
+            raise DecodeError("message_malformed", f"not read: nested deeper than {MAX_JSON_DEPTH}")
+        if isinstance(part, dict | list):
+            waiting += ((item, depth + 1) for item in (part.values() if isinstance(part, dict) else part))
+        elif isinstance(part, float) and not math.isfinite(part):
+            raise DecodeError("message_malformed", "not JSON: a number that is not finite")
+    return value
+
+
 def from_msgpack(model: type[M], payload: bytes) -> M:
     """The model that `to_msgpack` wrote, here or in a newer version. Use it for replies, whose sender was asked. Frames
     come from anywhere and go through `coec.adapters.frames.msgpack_frames`, which is stricter.
@@ -92,8 +133,9 @@ def _sorted(value: Any) -> Any:
 
 def _places(error: Exception) -> str:
     if isinstance(error, ValidationError):
-        # At most three places, and never the values: they are text from the sender.
+        # At most three places, and never the values: they are text from the sender, as are keys in a place.
         return "; ".join(
-            f"{'.'.join(str(part) for part in item['loc'])}: {item['type']}" for item in error.errors()[:3]
+            f"{printable('.'.join(str(part) for part in item['loc']), MAX_PLACE)}: {item['type']}"
+            for item in error.errors()[:3]
         )
     return type(error).__name__

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 from coec.schemas.replies import Count, Vector6
 
 
@@ -20,15 +20,15 @@ class Judged(Part):
     distance2: float
     flagged: bool
     undecided: bool
-    faint: tuple[str, ...] = Field(description="what its edges have too little of; empty if they are not faint")
-    causes: tuple[str, ...] = Field(description="codes of what is wrong with its data")
+    faint: tuple[Text, ...] = Field(description="what its edges have too little of; empty if they are not faint")
+    causes: tuple[Text, ...] = Field(description="codes of what is wrong with its data")
 
 
 class CheckedPose(Part):
     """All checks of a drive at one served pose, in order, for two rigs: one that is not commissioned, and one that was
     commissioned on other drives."""
 
-    moved: str = Field(description="`right`, or how far the served pose is off")
+    moved: Text = Field(description="`right`, or how far the served pose is off")
     uncommissioned: tuple[Judged, ...]
     commissioned: tuple[Judged, ...] = Field(description="empty if the rig could not be commissioned")
 
@@ -36,19 +36,19 @@ class CheckedPose(Part):
 class CheckedDrive(Message):
     """One drive."""
 
-    name: str
-    rig: str
-    place: str
+    name: Text
+    rig: Text
+    place: Text
     seed: Count
-    source: str = Field(description="SOURCE that draws it again")
+    source: Text = Field(description="SOURCE that draws it again")
     poses: tuple[CheckedPose, ...]
-    failure: str | None = Field(default=None, description="why the drive has no result")
+    failure: Text | None = Field(default=None, description="why the drive has no result")
 
 
 class MovedStatistics(Part):
     """All checks at poses that are off by one amount."""
 
-    moved: str
+    moved: Text
     drives: Count
     checks: Count
     blind: Count = Field(description="checks with something wrong in their data: they say nothing about the pose")
@@ -69,7 +69,7 @@ class MovedStatistics(Part):
 class PlaceStatistics(Part):
     """All checks of right mounts in places of one kind, and how many of them can tell."""
 
-    place: str
+    place: Text
     checks: Count
     blind: Count
     weak: Count
@@ -80,7 +80,7 @@ class PlaceStatistics(Part):
 class HoursStatistics(Part):
     """How often the detector accused a right mount in hours of driving."""
 
-    how: str = Field(
+    how: Text = Field(
         description="`rendered`: the drives one after the other; `resampled`: drawn from them, place after place"
     )
     hours: float
@@ -90,7 +90,7 @@ class HoursStatistics(Part):
         description="upper bound of the alarm rate at 95 % confidence (Poisson); for resampled hours it holds as if "
         "there were no drives but the rendered ones"
     )
-    alarmed: tuple[str, ...] = Field(description="where there were alarms: rig and place")
+    alarmed: tuple[Text, ...] = Field(description="where there were alarms: rig and place")
 
 
 class TailStatistics(Part):
@@ -125,5 +125,5 @@ class ChecksReport(Message):
     """What `coec sim checks --json` prints and report.json holds."""
 
     drives: Count
-    failed: dict[str, str] = Field(description="drives without a result, and why")
+    failed: dict[Text, Text] = Field(description="drives without a result, and why")
     rigs: tuple[RigStatistics, ...]

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 
 Level = Literal["ok", "warn", "fail"]
 
@@ -14,11 +14,11 @@ Level = Literal["ok", "warn", "fail"]
 class Finding(Part):
     """One thing that was checked."""
 
-    check: str = Field(description="what was checked, one of a fixed set of words")
+    check: Text = Field(description="what was checked, one of a fixed set of words")
     level: Level = Field(description="fail: the service cannot work like this; warn: it can, but needs attention")
-    where: str = Field(description="file, endpoint, key or pair; empty for the computer as a whole")
-    text: str = Field(description="what was found, one sentence")
-    advice: str | None = Field(default=None, description="what to do about it; null if there is nothing to do")
+    where: Text = Field(description="file, endpoint, key or pair; empty for the computer as a whole")
+    text: Text = Field(description="what was found, one sentence")
+    advice: Text | None = Field(default=None, description="what to do about it; null if there is nothing to do")
 
 
 class DoctorReport(Message):

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 from coec.schemas.replies import Count, Counts, Maybe6, Vector3, Vector6
 
 
@@ -79,7 +79,7 @@ class DetectionRow(Part):
     """Checks after one kind of move of the extrinsic, and the share that each classifier flagged. For the right
     extrinsic these shares are the false alarms."""
 
-    name: str = Field(description="`right`, or how far the extrinsic was moved")
+    name: Text = Field(description="`right`, or how far the extrinsic was moved")
     checks: Count
     flagged: float = Field(
         ge=0, le=1, description="share flagged because the local optimum lies, and its edges insist, elsewhere"
@@ -106,7 +106,7 @@ class DetectionReport(Part):
 class StepRow(Part):
     """Windows within which the mount was moved, and what became of them."""
 
-    name: str = Field(description="kind of knock; `none`: no move")
+    name: Text = Field(description="kind of knock; `none`: no move")
     windows: Count
     accepted: float = Field(ge=0, le=1, description="share that was accepted")
     wrong: float = Field(
@@ -126,7 +126,7 @@ class NormalisedErrorsReport(Part):
     """Errors of accepted results divided by the standard deviations that they claim: rx ry rz (deg), tx ty tz (m); null
     on axes without a claim."""
 
-    against: str = Field(description="reference of the errors")
+    against: Text = Field(description="reference of the errors")
     judged: Count = Field(description="results that were accepted and claim a standard deviation")
     refused: Count = Field(description="the other results, which no figure includes")
     independent: Count = Field(description="judged results that share no frame; the bounds are for this number")
@@ -149,7 +149,7 @@ class NormalisedErrorsReport(Part):
 class ClosureGroup(Part):
     """Closure errors of calibrations on one choice of frames."""
 
-    frames: str = Field(description="all frames, the same half for both sensors, or different halves")
+    frames: Text = Field(description="all frames, the same half for both sensors, or different halves")
     pairs_a: Count = Field(description="camera-LiDAR pairs in a solve")
     pairs_b: Count
     errors: NormalisedErrorsReport
@@ -161,20 +161,20 @@ class ClosureReport(Message):
     """What `coec evaluate --closure A B --json` prints: two sensors, each calibrated by itself, compared with the known
     pose between them. Errors are about and along the axes of B's camera."""
 
-    source_a: str
-    source_b: str
-    relation: str = Field(description="what the sources share")
+    source_a: Text
+    source_b: Text
+    relation: Text = Field(description="what the sources share")
     known: Vector6 = Field(description="pose of sensor A in the frame of B: rx ry rz (deg), tx ty tz (m)")
     from_recordings: bool = Field(
         description="whether `known` comes from the recordings; otherwise from the command line"
     )
-    objective: str
+    objective: Text
     dof: Literal[3, 6]
     start_rotation_deg: float = Field(description="radius of the sphere of starts")
     start_translation_m: float
     trials: Count
     groups: tuple[ClosureGroup, ...]
-    elapsed_s: dict[str, float] = Field(description="by stage, s")
+    elapsed_s: dict[Text, float] = Field(description="by stage, s")
 
 
 class FalseAlarmsRow(Part):
@@ -220,13 +220,13 @@ class AlarmsReport(Message):
 class EvaluationReport(Message):
     """What `coec evaluate --json` prints: solves from starts all around the source's calibration, on one window."""
 
-    source: str
-    vehicle: str
-    pair: str
-    window_id: str
+    source: Text
+    vehicle: Text
+    pair: Text
+    window_id: Text
     pairs: Count = Field(description="camera-LiDAR pairs in the window")
-    camera_model: str
-    objective: str
+    camera_model: Text
+    objective: Text
     dof: Literal[3, 6]
     start_rotation_deg: float = Field(description="radius of the sphere of starts")
     start_translation_m: float = Field(description="radius of the sphere of starts")
@@ -264,19 +264,19 @@ class EvaluationReport(Message):
     normalised: tuple[NormalisedErrorsReport, ...] = Field(
         default=(), description="errors over claimed standard deviations; empty if not asked for"
     )
-    depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
-    config_hash: str = Field(description="hash of everything that decides the results, except the start")
-    elapsed_s: dict[str, float] = Field(description="by stage, s")
+    depth_identity: Text = Field(description="sha256 of the depth network, or `precomputed`")
+    config_hash: Text = Field(description="hash of everything that decides the results, except the start")
+    elapsed_s: dict[Text, float] = Field(description="by stage, s")
 
 
 class ComparisonReport(Message):
     """What `coec evaluate --objective all --json` prints: every method on the same window and from the same starts."""
 
-    source: str
-    methods: dict[str, EvaluationReport] = Field(description="by the name of the objective")
-    not_evaluated: dict[str, str] = Field(description="objectives that this source does not allow, and why")
+    source: Text
+    methods: dict[Text, EvaluationReport] = Field(description="by the name of the objective")
+    not_evaluated: dict[Text, Text] = Field(description="objectives that this source does not allow, and why")
     interrupted: bool = Field(default=False, description="ended early: the last method is not finished")
-    elapsed_s: dict[str, float] = Field(description="by stage, s")
+    elapsed_s: dict[Text, float] = Field(description="by stage, s")
 
 
 Maybe3 = tuple[float | None, float | None, float | None]
@@ -300,13 +300,13 @@ class ModelAssessment(Message):
     """What `coec models assess --json` prints: how well a depth network suits calibration, on one window at the
     source's calibration. Rank correlations are positive for networks that give inverse depth, negative for depth."""
 
-    model: str
-    source: str
-    window_id: str
+    model: Text
+    source: Text
+    window_id: Text
     pairs: Count = Field(description="camera-LiDAR pairs in the window")
-    depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
+    depth_identity: Text = Field(description="sha256 of the depth network, or `precomputed`")
     suitability: Suitability
-    verdict: str = Field(description="one sentence for people")
+    verdict: Text = Field(description="one sentence for people")
     rank_correlation: float | None = Field(description="median over the frames")
     covered: float = Field(ge=0, le=1, description="median over the frames")
     inference_ms: float | None = Field(description="median over the frames")
@@ -320,4 +320,4 @@ class ModelAssessment(Message):
     peakedness_per_deg2: Vector3 = Field(description="-f''/f at the optimum, rx ry rz")
     search_deg: float = Field(description="half-width of the box in which the optimum was searched")
     frames: tuple[DepthFrame, ...]
-    elapsed_s: dict[str, float] = Field(description="by stage, s")
+    elapsed_s: dict[Text, float] = Field(description="by stage, s")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 from coec.schemas.replies import CalibrationResult, Count, Counts, Maybe6
 
 AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
@@ -20,24 +20,24 @@ SEEN = (0.5, 0.5, 0.5, 0.1, 0.1, 0.1)
 class WindowRow(Message):
     """A window of a batch, kept until it becomes a row of a table. It holds either a result or an error."""
 
-    url: str = Field(description="where the window was found; its name in the batch")
-    sha256: str | None = Field(description="hash of the whole file, hexadecimal; null if it could not be read")
+    url: Text = Field(description="where the window was found; its name in the batch")
+    sha256: Text | None = Field(description="hash of the whole file, hexadecimal; null if it could not be read")
     bytes: Count | None = Field(description="size of the file")
-    vehicle: str = Field(description="vehicle named in the window; empty if it names none")
+    vehicle: Text = Field(description="vehicle named in the window; empty if it names none")
     result: CalibrationResult | None = Field(default=None, description="what was decided; null with an error")
-    recorded: str | None = Field(default=None, description="sha256 of the result in the file, as canonical JSON")
-    decided: str | None = Field(default=None, description="sha256 of `result`; equals `recorded` if both agree")
-    error_code: str | None = Field(default=None, description="why there is no result, for programs")
-    error: str | None = Field(default=None, description="why there is no result, for people")
+    recorded: Text | None = Field(default=None, description="sha256 of the result in the file, as canonical JSON")
+    decided: Text | None = Field(default=None, description="sha256 of `result`; equals `recorded` if both agree")
+    error_code: Text | None = Field(default=None, description="why there is no result, for programs")
+    error: Text | None = Field(default=None, description="why there is no result, for people")
     seconds: float = Field(ge=0, description="wall-clock time of reading and solving")
     cpu_s: float = Field(ge=0, description="processor time of reading and solving")
-    versions: dict[str, str] = Field(description="versions of the program and of the libraries it calculates with")
+    versions: dict[Text, Text] = Field(description="versions of the program and of the libraries it calculates with")
 
 
 class BatchReport(Message):
     """What `coec batch --json` prints."""
 
-    output: str = Field(description="folder of the tables")
+    output: Text = Field(description="folder of the tables")
     windows: Count = Field(description="windows of the batch")
     kept: Count = Field(description="windows that were judged before this run")
     accepted: Count
@@ -55,7 +55,7 @@ class BatchReport(Message):
 class DayOfPair(Part):
     """Accepted windows of a pair on one day; null on axes that none of them told."""
 
-    date: str = Field(description="UTC, such as 2026-11-22")
+    date: Text = Field(description="UTC, such as 2026-11-22")
     windows: Count
     low: Maybe6 = Field(description="16th percentile of the correction; one standard deviation below if it is normal")
     middle: Maybe6 = Field(description="median of the correction")
@@ -65,8 +65,8 @@ class DayOfPair(Part):
 class PairOfFleet(Part):
     """A pair of a vehicle over time. Corrections are from its nominal calibration."""
 
-    vehicle: str
-    pair: str
+    vehicle: Text
+    pair: Text
     windows: Count
     accepted: Count
     errors: Count = Field(description="windows without a result")
@@ -74,7 +74,7 @@ class PairOfFleet(Part):
     latest: Maybe6 = Field(description="median of the last accepted windows; null on axes that they do not tell")
     drift: Maybe6 = Field(description="`latest` minus the median of as many windows that were accepted first")
     slope: Maybe6 = Field(description="slope of the corrections over time, per 30 days; null with windows of one day")
-    worst: str | None = Field(description="axis that drifted furthest, in steps that a monitor has to detect")
+    worst: Text | None = Field(description="axis that drifted furthest, in steps that a monitor has to detect")
     urgency: float = Field(ge=0, description="drift of that axis in such steps")
     days: tuple[DayOfPair, ...]
 
@@ -82,8 +82,8 @@ class PairOfFleet(Part):
 class FigureOfFleet(Part):
     """A figure of self-diagnosis over the accepted windows of all vehicles."""
 
-    name: str
-    pair: str
+    name: Text
+    pair: Text
     vehicles: Count
     windows: Count
     low: float = Field(description="0.5 % of the windows are below")
@@ -94,10 +94,10 @@ class FigureOfFleet(Part):
 class ChangedWindow(Part):
     """A window whose decision changed."""
 
-    vehicle: str
-    window_id: str
-    before: str = Field(description="`accepted`, or codes of the reasons or of the error")
-    now: str
+    vehicle: Text
+    window_id: Text
+    before: Text = Field(description="`accepted`, or codes of the reasons or of the error")
+    now: Text
     rotation_deg: float | None = Field(description="largest difference of the corrections; null without two results")
     translation_m: float | None
 
@@ -124,7 +124,7 @@ class FalseAlarms(Part):
     withdrawn: Count = Field(description="false alarms: they ended with the extrinsic that they had accused")
     per_100_h: float | None = Field(description="false alarms per 100 h of a pair; null if nothing was watched")
     per_100_h_at_most: float | None = Field(description="upper bound of that rate, exceeded once in twenty (Poisson)")
-    by_pair: dict[str, Count] = Field(description="false alarms by vehicle/pair, for pairs that have any")
+    by_pair: dict[Text, Count] = Field(description="false alarms by vehicle/pair, for pairs that have any")
 
 
 class FleetReport(Message):

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 from coec.schemas.replies import Count, Decision
 
 
 class FetchedFile(Part):
     """A file in the folder."""
 
-    name: str = Field(description="path relative to the folder")
-    sha256: str = Field(description="hexadecimal")
+    name: Text = Field(description="path relative to the folder")
+    sha256: Text = Field(description="hexadecimal")
     size_bytes: Count
 
 
 class FetchedWindow(Part):
     """A window before or after the event."""
 
-    window_id: str
-    sha256: str = Field(description="hash of the file, equal to that in the vehicle's list")
+    window_id: Text
+    sha256: Text = Field(description="hash of the file, equal to that in the vehicle's list")
     size_bytes: Count
     pairs: Count | None
     decision: Decision | None
@@ -32,19 +32,19 @@ class FetchedWindow(Part):
 class Absent(Part):
     """Something that could not be fetched."""
 
-    what: str
-    why: str
+    what: Text
+    why: Text
 
 
 class IncidentReport(Message):
     """`incident.json` in the folder, and what `coec fetch --json` prints."""
 
-    folder: str
-    vehicle: str
-    pair: str
-    event_id: str
+    folder: Text
+    vehicle: Text
+    pair: Text
+    event_id: Text
     fetched_ns: Count = Field(description="wall clock of the fetching computer, ns since 1970")
-    version: str = Field(description="version of the program that fetched")
+    version: Text = Field(description="version of the program that fetched")
     files: tuple[FetchedFile, ...]
     windows: tuple[FetchedWindow, ...]
     entries: Count = Field(description="entries of the history around the event")

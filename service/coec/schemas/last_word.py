@@ -12,7 +12,7 @@ import msgpack
 from pydantic import Field, ValidationError
 
 from coec.errors import DecodeError
-from coec.schemas.base import Message
+from coec.schemas.base import Message, Text
 from coec.schemas.keys import LAST, VERSION_CHUNK
 from coec.schemas.replies import Alarms, Count, HealthState, Maybe6, Provenance, Reason, Status, Vector6
 
@@ -30,15 +30,15 @@ MAX_NESTING: Final = 256
 class LastWord(Message):
     """The last word of a pair. Times are from the vehicle's clocks."""
 
-    vehicle: str
-    pair: str
+    vehicle: Text
+    pair: Text
     said_ns: Count = Field(description="wall clock of the vehicle when it said this, ns since 1970")
     period_s: float = Field(gt=0, description="the word is repeated after this time even if nothing has changed, s")
     service: Literal["starting", "running", "stopping", "failing"] = Field(
         description="`stopping`: the service said goodbye, and no more words will come"
     )
-    version: str = Field(max_length=64)
-    config_hash: str = Field(max_length=64)
+    version: Text = Field(max_length=64)
+    config_hash: Text = Field(max_length=64)
     state: HealthState
     level: Literal[0, 1, 2, 3] = Field(description="ROS: 0 OK, 1 WARN, 2 ERROR, 3 STALE")
     reasons: tuple[Reason, ...] = Field(max_length=MAX_REASONS, description="the first reasons for the state")
@@ -59,7 +59,7 @@ class LastWord(Message):
     held: bool = Field(description="frozen by `command/hold`")
     windows: Count = Field(description="windows recorded since the start")
     alarms: Alarms | None = Field(default=None, description="counts of its alarms; null while the pair is awaited")
-    event: str | None = Field(max_length=128, description="id of the newest kept red event; null: none")
+    event: Text | None = Field(max_length=128, description="id of the newest kept red event; null: none")
 
 
 def read(key: str, payload: bytes) -> LastWord:

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 from coec.schemas.replies import Count, Counts, Maybe6
 
 
@@ -26,15 +26,15 @@ class SolvedWindow(Part):
     translation_m: float | None
     error: Maybe6 = Field(description="null on axes that were not solved")
     sigma: Maybe6 = Field(description="as the estimate claims it")
-    reasons: tuple[str, ...] = Field(description="codes of the reasons why it was refused")
+    reasons: tuple[Text, ...] = Field(description="codes of the reasons why it was refused")
     evaluations: Count
-    failure: str | None = Field(description="why there is no estimate")
+    failure: Text | None = Field(description="why there is no estimate")
 
 
 class Watched(Part):
     """The checks of one served pose along a drive, in order, through the change detector."""
 
-    moved: str = Field(description="`right`, or how far the served pose is off")
+    moved: Text = Field(description="`right`, or how far the served pose is off")
     checks: Count
     flagged: Count = Field(description="checks over their limits")
     blind: Count = Field(description="checks with something wrong in the data: they say nothing about the pose")
@@ -46,18 +46,18 @@ class Watched(Part):
 class MatrixRow(Message):
     """One drive."""
 
-    name: str
-    scene: str
-    lens: str
-    lidar: str
-    light: str
-    fault: str
+    name: Text
+    scene: Text
+    lens: Text
+    lidar: Text
+    light: Text
+    fault: Text
     seed: Count
-    source: str = Field(description="SOURCE that draws it again")
+    source: Text = Field(description="SOURCE that draws it again")
     windows: dict[Literal["3", "6"], tuple[SolvedWindow, ...]] = Field(description="by degrees of freedom")
     watched: tuple[Watched, ...] = Field(description="empty if the mount itself moves")
-    failure: str | None = Field(default=None, description="why the drive has no result")
-    settings: str = Field(description="what else decides the result; a row with other settings is run again")
+    failure: Text | None = Field(default=None, description="why the drive has no result")
+    settings: Text = Field(description="what else decides the result; a row with other settings is run again")
     cpu_s: float = Field(ge=0, description="processor time of one core, drawing included, s")
 
 
@@ -79,8 +79,8 @@ class AxisStatistics(Part):
 class GroupStatistics(Part):
     """Windows of the drives that have one property in common."""
 
-    of: str = Field(description="the property: scene, lens, lidar, light or fault")
-    value: str
+    of: Text = Field(description="the property: scene, lens, lidar, light or fault")
+    value: Text
     windows: Count
     hits: Count
     accepted: Count
@@ -97,7 +97,7 @@ class SolveStatistics(Part):
     accepted: Count
     accepted_hits: Count
     accepted_wrong: Count = Field(description="off by more than the limit and by more than 4 sigma on some axis")
-    wrong: tuple[str, ...] = Field(description="names of the accepted wrong ones, with axis, error and sigma")
+    wrong: tuple[Text, ...] = Field(description="names of the accepted wrong ones, with axis, error and sigma")
     axes: tuple[AxisStatistics, ...]
     groups: tuple[GroupStatistics, ...]
     reasons: Counts = Field(description="refused windows by code; a window may have several")
@@ -106,7 +106,7 @@ class SolveStatistics(Part):
 class WatchStatistics(Part):
     """All checks of one served pose."""
 
-    moved: str
+    moved: Text
     drives: Count
     checks: Count
     flagged: float | None = Field(description="flagged share of the checks that could tell")
@@ -116,7 +116,7 @@ class WatchStatistics(Part):
     hours: float
     alarms_per_hour: float | None
     median_delay_checks: float | None = Field(description="over the drives with an alarm")
-    names: tuple[str, ...] = Field(
+    names: tuple[Text, ...] = Field(
         description="the drives that went wrong: with an alarm at the right pose, without one at any other"
     )
 
@@ -125,7 +125,7 @@ class MatrixReport(Message):
     """What `coec sim matrix --json` prints and report.json holds."""
 
     drives: Count
-    failed: dict[str, str] = Field(description="drives without a result, and why")
+    failed: dict[Text, Text] = Field(description="drives without a result, and why")
     solves: tuple[SolveStatistics, ...]
     watched: tuple[WatchStatistics, ...]
     rows: tuple[MatrixRow, ...]

@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 
 Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
@@ -19,7 +19,7 @@ Maybe6 = tuple[float | None, float | None, float | None, float | None, float | N
 Maybe6x6 = tuple[Maybe6, Maybe6, Maybe6, Maybe6, Maybe6, Maybe6]
 Flags6 = tuple[bool, bool, bool, bool, bool, bool]
 Count = Annotated[int, Field(ge=0)]
-Counts = dict[str, Count]
+Counts = dict[Text, Count]
 
 Provenance = Literal["nominal", "commissioned", "estimated", "restored"]
 Status = Literal["not_accepted", "accepted", "failed"]
@@ -56,8 +56,8 @@ class Transform(Part):
 class Reason(Part):
     """One reason, for programs and for people."""
 
-    code: str = Field(description="machine-readable, stable")
-    text: str = Field(description="one sentence for people")
+    code: Text = Field(description="machine-readable, stable")
+    text: Text = Field(description="one sentence for people")
 
 
 class MetricReply(Part):
@@ -119,11 +119,11 @@ class CalibrationResult(Message):
     """The result of calibrating one window; the same in the state, the history, the window's file and `coec
     calibrate`."""
 
-    vehicle: str
-    pair: str
-    camera_frame: str
-    lidar_frame: str
-    window_id: str
+    vehicle: Text
+    pair: Text
+    camera_frame: Text
+    lidar_frame: Text
+    window_id: Text
     data_stamp_ns: int = Field(description="stamp of the last contributing pair, ns")
     pairs: Count = Field(description="camera-LiDAR pairs in the window")
     camera_from_lidar: Transform = Field(description="the estimate; served as current only if accepted")
@@ -133,7 +133,7 @@ class CalibrationResult(Message):
     noise: Maybe6x6 = Field(
         description="covariance (rad, m), exact, of the errors that differ from window to window; null: unknown"
     )
-    systematic: dict[str, Vector6] = Field(
+    systematic: dict[Text, Vector6] = Field(
         description="errors that windows have in common, by name: the shift (rad, m) for one standard deviation"
     )
     correlation_pitch_height: float | None = Field(
@@ -151,7 +151,7 @@ class CalibrationResult(Message):
     )
     status: Status
     verdict: Verdict
-    metrics: dict[str, MetricReply] = Field(description="figures of self-diagnosis by name")
+    metrics: dict[Text, MetricReply] = Field(description="figures of self-diagnosis by name")
     score: float | None = Field(description="objective at the result, in nats; for `fused` in standard deviations")
     score_at_start: float | None = Field(description="objective at the start, in the same unit")
     mi: float | None = Field(description="mutual information at the result, equation (1), nats")
@@ -162,8 +162,8 @@ class CalibrationResult(Message):
     first_derivative: Maybe6 = Field(description="f': d(objective) per rad or m; null on axes not searched")
     second_derivative: Maybe6 = Field(description="f'': -d²(objective) per rad² or m²; null on axes not searched")
     compensation: Counts = Field(description="pairs by outcome of motion compensation")
-    depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
-    config_hash: str = Field(description="hash of everything that decides the result")
+    depth_identity: Text = Field(description="sha256 of the depth network, or `precomputed`")
+    config_hash: Text = Field(description="hash of everything that decides the result")
     moved: MovedWithin | None = Field(
         default=None, description="set if the window was refused because the camera moved within it"
     )
@@ -172,7 +172,7 @@ class CalibrationResult(Message):
 class CalibrationReport(CalibrationResult):
     """What `coec calibrate --json` prints: the result and how long it took."""
 
-    elapsed_s: dict[str, float] = Field(description="by stage, s")
+    elapsed_s: dict[Text, float] = Field(description="by stage, s")
 
 
 # --- replies ------------------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ class CalibrationReport(CalibrationResult):
 class Candidate(Part):
     """A result that waits for `apply`."""
 
-    window_id: str
+    window_id: Text
     data_stamp_ns: int
     camera_from_lidar: Transform
     step: Vector6 | None = Field(default=None, description="from the served extrinsic: rx ry rz (deg), tx ty tz (m)")
@@ -194,19 +194,19 @@ class Hold(Part):
     since_ns: int | None = Field(
         description="wall clock of the service, ns since 1970; null: an earlier version held it"
     )
-    sender: str = Field(description="attachment of the command, or the name on a certificate, sanitised")
-    reason: str | None = Field(description="in the sender's words; null if none was given")
+    sender: Text = Field(description="attachment of the command, or the name on a certificate, sanitised")
+    reason: Text | None = Field(description="in the sender's words; null if none was given")
 
 
 class ExtrinsicReply(Message):
     """The calibration to use now. Before the first result it is nominal, not_accepted, 0 %."""
 
-    vehicle: str
-    pair: str
-    camera_frame: str
-    lidar_frame: str
+    vehicle: Text
+    pair: Text
+    camera_frame: Text
+    lidar_frame: Text
     camera_from_lidar: Transform = Field(description="current; an unaccepted estimate is never served here")
-    cloud_frame: str | None = Field(
+    cloud_frame: Text | None = Field(
         default=None, description="frame of the points that the driver sends; null if it is `lidar_frame`"
     )
     camera_from_cloud: Transform | None = Field(
@@ -224,8 +224,8 @@ class ExtrinsicReply(Message):
     )
     valid_from_ns: int = Field(description="sensor time from which it holds, ns; 0 for nominal")
     data_stamp_ns: int | None = Field(description="stamp of the last contributing pair, ns; null for nominal")
-    window_id: str | None = Field(description="the window that it comes from; null for nominal")
-    config_hash: str
+    window_id: Text | None = Field(description="the window that it comes from; null for nominal")
+    config_hash: Text
     pending: Candidate | None = None
     held: bool = Field(default=False, description="frozen by `command/hold`")
     hold: Hold | None = Field(default=None, description="who holds it, since when and why; null if not held")
@@ -236,12 +236,12 @@ class DataQuality(Part):
 
     pair_rate_hz: float | None = Field(default=None, description="camera-LiDAR pairs per second of sensor time")
     sync_error_s: float | None = Field(default=None, description="latest camera stamp minus LiDAR stamp")
-    drops: dict[str, Counts] = Field(default_factory=dict, description="frames lost, by stream, then by cause")
+    drops: dict[Text, Counts] = Field(default_factory=dict, description="frames lost, by stream, then by cause")
     sharpness: float | None = Field(default=None, description="sharpness of the latest image; falls with blur")
     mean_level: float | None = Field(default=None, description="mean grey value of the latest image, 0 to 255")
     clipped: float | None = Field(default=None, description="share of black or white pixels in the latest image")
     frozen_image: bool = Field(default=False, description="whether the camera repeats the same picture")
-    point_times: str = Field(default="", description="how point times are read, for clouds that leave this open")
+    point_times: Text = Field(default="", description="how point times are read, for clouds that leave this open")
 
 
 class CheckReply(Part):
@@ -258,7 +258,7 @@ class CheckReply(Part):
     causes: tuple[Reason, ...] = Field(
         description="what is wrong with the data; a check with a cause says nothing about the pose"
     )
-    metrics: dict[str, MetricReply] = Field(description="figures of the check by name")
+    metrics: dict[Text, MetricReply] = Field(description="figures of the check by name")
     first_derivative: Maybe6 = Field(description="f' at the pose: dMI, nats per rad or m")
     second_derivative: Maybe6 = Field(description="f'' at the pose: -d²MI, nats per rad² or m²")
     offset: Maybe6 = Field(
@@ -290,12 +290,12 @@ class Alarms(Part):
 class HealthReply(Message):
     """Whether the calibration is right. `unknown` means that nothing has looked yet."""
 
-    vehicle: str
-    pair: str
+    vehicle: Text
+    pair: Text
     state: HealthState
     level: Literal[0, 1, 2, 3] = Field(description="ROS: 0 OK, 1 WARN, 2 ERROR, 3 STALE")
     reasons: tuple[Reason, ...]
-    metrics: dict[str, MetricReply] = Field(description="figures of the latest result and the latest check, by name")
+    metrics: dict[Text, MetricReply] = Field(description="figures of the latest result and the latest check, by name")
     axes: Axes
     drift: Maybe6 | None = Field(
         default=None, description="served extrinsic from the commissioned one (deg, m); null before commissioning"
@@ -308,7 +308,7 @@ class HealthReply(Message):
     check: CheckReply | None = Field(
         default=None, description="the latest check; null if none was made at the served extrinsic"
     )
-    needs: tuple[str, ...] = Field(description="what is still missing, one sentence each")
+    needs: tuple[Text, ...] = Field(description="what is still missing, one sentence each")
     data_quality: DataQuality
     since_ns: int = Field(description="wall clock when this state began, ns since 1970")
     evaluated_ns: int | None = Field(description="stamp of the last evaluated pair, ns; null before the first window")
@@ -326,19 +326,19 @@ class HistoryEntry(Message):
 
     sequence: Count = Field(description="number of the entry among all books of the pair, from 0")
     book: Book = Field(default="results", description="chain that the entry belongs to; each has a quota of its own")
-    previous_sha256: str = Field(
+    previous_sha256: Text = Field(
         description="sha256 of the previous entry in the book, hexadecimal; 64 zeros for the first"
     )
     kind: Literal["estimate", "extrinsic", "state", "command", "commissioned", "chain"]
-    code: str = Field(description="machine-readable: decision, provenance, state, or outcome of the command")
-    text: str = Field(description="one sentence")
+    code: Text = Field(description="machine-readable: decision, provenance, state, or outcome of the command")
+    text: Text = Field(description="one sentence")
     wall_ns: int = Field(description="wall clock of the service, ns since 1970")
     stamp_ns: int | None = Field(default=None, description="sensor time of the data behind it, ns")
-    window_id: str | None = None
-    sender: str | None = Field(default=None, description="attachment of a command, sanitised")
-    reason: str | None = Field(default=None, description="reason for a command, in the sender's words")
+    window_id: Text | None = None
+    sender: Text | None = Field(default=None, description="attachment of a command, sanitised")
+    reason: Text | None = Field(default=None, description="reason for a command, in the sender's words")
     camera_from_lidar: Transform | None = Field(default=None, description="what is served from here on (`extrinsic`)")
-    result_sha256: str | None = Field(
+    result_sha256: Text | None = Field(
         default=None, description="sha256 of the canonical JSON of the result (`estimate`)"
     )
 
@@ -346,15 +346,15 @@ class HistoryEntry(Message):
 class ChainedEntry(Part):
     """An entry of the history with its own sha256, by which `command/rollback` can name it."""
 
-    sha256: str
+    sha256: Text
     entry: HistoryEntry
 
 
 class HistoryReply(Message):
     """Past results and what else happened, oldest first."""
 
-    vehicle: str
-    pair: str
+    vehicle: Text
+    pair: Text
     total: Count = Field(description="results kept, before the selector is applied")
     results: tuple[CalibrationResult, ...]
     entries: tuple[ChainedEntry, ...] = Field(
@@ -368,32 +368,32 @@ class MetricsPoint(Part):
 
     stamp_ns: int
     state: HealthState
-    metrics: dict[str, float | None]
+    metrics: dict[Text, float | None]
 
 
 class EvidenceEvent(Message):
     """What is kept of a red event: windows before and after, pictures, figures around it, and how it ended."""
 
-    event_id: str
-    vehicle: str
-    pair: str
+    event_id: Text
+    vehicle: Text
+    pair: Text
     stamp_ns: int = Field(description="sensor time of the data that decided, ns")
     wall_ns: int = Field(description="wall clock, ns since 1970")
     reasons: tuple[Reason, ...]
     camera_from_lidar: Transform = Field(description="what was served then")
-    window_before: str | None = Field(description="the last window before the event; null if there is none")
-    window_after: str | None = Field(default=None, description="the first window after it; null until there is one")
+    window_before: Text | None = Field(description="the last window before the event; null if there is none")
+    window_after: Text | None = Field(default=None, description="the first window after it; null until there is one")
     overlays: tuple[Literal["before", "after"], ...] = Field(default=(), description="the kept pictures")
     metrics: tuple[MetricsPoint, ...] = Field(description="figures around the event, oldest first")
     resolved_stamp_ns: int | None = Field(default=None, description="sensor time at which the red state ended, ns")
-    resolution: str | None = Field(default=None, description="how it ended, one sentence; null while it is red")
+    resolution: Text | None = Field(default=None, description="how it ended, one sentence; null while it is red")
 
 
 class EvidenceReply(Message):
     """The kept red events, oldest first, without their figures."""
 
-    vehicle: str
-    pair: str
+    vehicle: Text
+    pair: Text
     events: tuple[EvidenceEvent, ...]
 
 
@@ -403,8 +403,8 @@ KeptFor = Literal["red_event", "commissioning"]
 class WindowInfo(Part):
     """One recorded window."""
 
-    window_id: str
-    sha256: str | None = Field(
+    window_id: Text
+    sha256: Text | None = Field(
         description="hash of the whole file, hexadecimal; null until the service has read this version of it"
     )
     size_bytes: Count
@@ -418,19 +418,19 @@ class WindowInfo(Part):
 class SnippetInfo(Part):
     """A full-rate recording of the seconds around an event; `windows/<snippet_id>` gives its bytes."""
 
-    snippet_id: str
-    event: str = Field(description="state of health that was entered; empty if the file does not say")
+    snippet_id: Text
+    event: Text = Field(description="state of health that was entered; empty if the file does not say")
     stamp_ns: int = Field(description="sensor time of the last frame before the event was reported, ns")
     recorded_ns: int = Field(description="wall clock when it was on the disk, ns")
     size_bytes: Count
-    sha256: str = Field(description="hash of the whole file, hexadecimal")
+    sha256: Text = Field(description="hash of the whole file, hexadecimal")
 
 
 class WindowsReply(Message):
     """Recorded windows, oldest first."""
 
-    vehicle: str
-    pair: str
+    vehicle: Text
+    pair: Text
     windows: tuple[WindowInfo, ...]
     snippets: tuple[SnippetInfo, ...] = Field(default=(), description="oldest first")
 
@@ -448,7 +448,7 @@ class StreamStatus(Part):
 class PairStatus(Part):
     """One camera-LiDAR pair."""
 
-    name: str
+    name: Text
     camera: StreamStatus = StreamStatus()
     lidar: StreamStatus = StreamStatus()
     ego: StreamStatus | None = Field(default=None, description="null if no ego-motion is configured")
@@ -467,7 +467,7 @@ class PairStatus(Part):
     awaits: tuple[Reason, ...] = Field(
         default=(), description="what the configuration leaves out and the service has not found yet"
     )
-    found: dict[str, str] = Field(
+    found: dict[Text, Text] = Field(
         default_factory=dict,
         description="sources of the values that the configuration leaves out, by key of the configuration",
     )
@@ -483,7 +483,7 @@ class WorkerStatus(Part):
     waiting: Counts = Field(
         default_factory=dict, description="jobs that wait, by kind; `backlog`: windows of an earlier run"
     )
-    job: str | None = Field(default=None, description="kind of the job that the worker has; null if it has none")
+    job: Text | None = Field(default=None, description="kind of the job that the worker has; null if it has none")
     job_age_s: float | None = Field(default=None, ge=0, description="how long the worker has had this job, s")
     outcomes: Counts = Field(
         default_factory=dict, description="ended jobs by outcome: result, failed, superseded, deadline_passed"
@@ -523,11 +523,11 @@ class BudgetStatus(Part):
         ge=1, description="factor by which periods of checks and slices of windows are longer than configured"
     )
     in_store_s: float = Field(description="unspent processor time, s; below 0: borrowed for a suspicion")
-    spent_s: dict[str, float] = Field(
+    spent_s: dict[Text, float] = Field(
         description="processor time of the worker since the start by purpose, s: check, solve, prefetch (depth for a "
         "window), start, idle, backlog, overlay, picture, commission"
     )
-    pairs: dict[str, BudgetShare]
+    pairs: dict[Text, BudgetShare]
 
 
 class StorageStatus(Part):
@@ -543,9 +543,9 @@ class ConfigurationStatus(Part):
 
     read_ns: int = Field(description="wall clock when it was read, ns since 1970")
     reloads: Count = Field(default=0, description="how often it was read again and applied, wholly or in part")
-    taken: tuple[str, ...] = Field(default=(), description="keys whose new values apply since then")
-    waiting: tuple[str, ...] = Field(default=(), description="keys whose new values wait for a restart")
-    refused: str | None = Field(
+    taken: tuple[Text, ...] = Field(default=(), description="keys whose new values apply since then")
+    waiting: tuple[Text, ...] = Field(default=(), description="keys whose new values wait for a restart")
+    refused: Text | None = Field(
         default=None, description="why the file on the disk was refused; then the earlier values stay in force"
     )
 
@@ -553,13 +553,13 @@ class ConfigurationStatus(Part):
 class StatusReply(Message):
     """Status of the daemon."""
 
-    version: str
-    vehicle: str
+    version: Text
+    vehicle: Text
     state: Literal["starting", "running", "stopping", "failing"]
     reasons: tuple[Reason, ...] = ()
     started_ns: int = Field(description="wall clock, ns since 1970")
     uptime_s: float
-    config_hash: str = Field(description="hash of the configuration in effect, reloads included")
+    config_hash: Text = Field(description="hash of the configuration in effect, reloads included")
     configuration: ConfigurationStatus | None = Field(default=None, description="null from an older service")
     pairs: tuple[PairStatus, ...]
     worker: WorkerStatus
@@ -571,13 +571,13 @@ class StatusReply(Message):
 class Acknowledgement(Message):
     """The answer to a command that was understood: whether it is carried out."""
 
-    vehicle: str
-    pair: str
-    command: str
+    vehicle: Text
+    pair: Text
+    command: Text
     accepted: bool
-    code: str = Field(description="machine-readable outcome")
-    text: str = Field(description="one sentence")
-    window_id: str | None = Field(default=None, description="the window it acts on")
+    code: Text = Field(description="machine-readable outcome")
+    text: Text = Field(description="one sentence")
+    window_id: Text | None = Field(default=None, description="the window it acts on")
     durable: bool | None = Field(
         default=None,
         description="whether the effect is on the disk, safe from a power cut; false: not yet, and `health` says what "
@@ -588,5 +588,5 @@ class Acknowledgement(Message):
 class ErrorReply(Message):
     """Payload of an error reply."""
 
-    code: str
-    message: str
+    code: Text
+    message: Text

@@ -7,15 +7,15 @@ from enum import StrEnum
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 from coec.schemas.replies import Count, Maybe6x6, Vector6
 
 
 class MovesRow(Part):
     """Drives with one kind of fault on one rig."""
 
-    rig: str
-    fault: str
+    rig: Text
+    fault: Text
     drives: Count
     right: Count = Field(description="drives on which exactly the moved sensors were named within the time allowed")
     undecided: Count = Field(description="drives on which not all of them were named, and no other sensor was")
@@ -28,7 +28,7 @@ class MovesRow(Part):
 class JointRow(Part):
     """One window of each pair of a rig, all from one time, combined."""
 
-    rig: str
+    rig: Text
     rigs: Count = Field(description="rigs that were drawn")
     pairs: Count = Field(description="pairs of one rig")
     rms_ratio: Vector6 = Field(description="rms error of the rig estimate over that of the windows, per axis")
@@ -44,7 +44,7 @@ class JointRow(Part):
 class KnockedRow(Part):
     """One window of each pair of a rig after one of its LiDARs was knocked, combined with what was known before."""
 
-    rig: str
+    rig: Text
     rigs: Count = Field(description="rigs that were drawn")
     pairs: Count = Field(description="pairs of one rig")
     rms_ratio: Vector6 = Field(description="rms error of the rig estimate over that of the windows, per axis")
@@ -80,7 +80,7 @@ class RigLook(Part):
     """One look at one pair of a rendered rig: those fields of `Observation` that attribution and the change detector
     take. Radians and metres; axes rx ry rz tx ty tz about and along the camera axes."""
 
-    edge: str
+    edge: Text
     mounts: Mounts
     pair_stamps_ns: tuple[int, ...] = Field(min_length=1)
     offset: Vector6
@@ -91,45 +91,45 @@ class RigLook(Part):
     distance2: float
     flagged: bool
     weak: bool
-    causes: tuple[str, ...]
+    causes: tuple[Text, ...]
 
 
 class RigWindow(Part):
     """One urgent window of one pair of a rendered rig: what `calibration.tracker.Measurement` takes. Radians and
     metres."""
 
-    edge: str
+    edge: Text
     mounts: Mounts
     first_ns: int = Field(description="stamp of its first pair of frames")
     last_ns: int = Field(description="stamp of its last pair of frames")
     known_ns: int = Field(description="when its answer counts")
     accepted: bool
-    reasons: tuple[str, ...] = Field(description="codes of the reasons for which it was refused")
+    reasons: tuple[Text, ...] = Field(description="codes of the reasons for which it was refused")
     offset: Vector6 = Field(description="from the extrinsic that the pair serves")
     noise: Maybe6x6
-    systematic: dict[str, Vector6]
+    systematic: dict[Text, Vector6]
 
 
 class RigDriveRow(Message):
     """All looks at one rendered drive of a rig, in the order of their stamps, and its urgent windows."""
 
-    name: str
+    name: Text
     seed: Count
-    camera: str = Field(description="lens of every camera of the rig, such as `fisheye350`")
+    camera: Text = Field(description="lens of every camera of the rig, such as `fisheye350`")
     looks: tuple[RigLook, ...] = ()
     windows: tuple[RigWindow, ...] = ()
-    failure: str | None = Field(default=None, description="why the drive has no result")
+    failure: Text | None = Field(default=None, description="why the drive has no result")
 
 
 class RigDriveMoves(Part):
     """What was reported of one fault on one rendered drive. Times are seconds of driving after the fault; null if the
     event did not happen."""
 
-    name: str
-    moved: tuple[str, ...] = Field(description="sensors that were knocked")
+    name: Text
+    moved: tuple[Text, ...] = Field(description="sensors that were knocked")
     named_s: float | None = Field(description="when exactly these sensors were named")
     alarm_s: float | None = Field(description="when the first pair with one of them was sure that its mount had moved")
-    wrong: tuple[str, ...] = Field(description="sensors that were ever named but had not been knocked")
+    wrong: tuple[Text, ...] = Field(description="sensors that were ever named but had not been knocked")
     wrong_s: float | None = Field(description="when the first of these was named, of a drive that begins at the fault")
 
 
@@ -144,7 +144,7 @@ class RigDrivesReport(Message):
     """What `coec sim rig-drives --json` prints."""
 
     allowed_s: float
-    camera: str
+    camera: Text
     drives: Count = Field(description="drives with a result")
     failed: Count = Field(description="drives without a result")
     looks: Count

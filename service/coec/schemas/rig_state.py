@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.base import Message, Part, Text
 from coec.schemas.replies import Count, Counts, Maybe6x6, Reason, Transform, Vector6
 
 SensorKind = Literal["camera", "lidar"]
@@ -29,7 +29,7 @@ class SensorMove(Part):
 class SensorReply(Part):
     """A camera or a LiDAR of the vehicle, over all its pairs."""
 
-    name: str
+    name: Text
     kind: SensorKind
     state: SensorState = Field(
         description="`undecided`: something moved or is disturbed, and it may be this sensor; `unknown`: no look yet. "
@@ -38,16 +38,16 @@ class SensorReply(Part):
     probability: Probability | None = Field(description="probability that the sensor moved; null if nothing can tell")
     since_ns: int | None = Field(description="sensor time at which this state began, ns; null before any look")
     moved: SensorMove | None = Field(description="set if the sensor moved, or may have")
-    pairs: tuple[str, ...] = Field(description="pairs of this sensor")
+    pairs: tuple[Text, ...] = Field(description="pairs of this sensor")
     reasons: tuple[Reason, ...] = Field(description="why the sensor is in this state; the first one says most")
 
 
 class JointPair(Part):
     """The extrinsic of a pair, estimated from all pairs together."""
 
-    pair: str
-    camera: str
-    lidar: str
+    pair: Text
+    camera: Text
+    lidar: Text
     measured: bool = Field(description="whether a window of its own is included; otherwise it follows from the others")
     camera_from_lidar: Transform
     sigma: Vector6 = Field(description="standard deviations (deg, m)")
@@ -60,7 +60,7 @@ class JointPair(Part):
 class OpenLoop(Part):
     """A loop along pairs and links that does not close: it should end where it begins."""
 
-    names: tuple[str, ...] = Field(description="pairs and links of the loop, in order")
+    names: tuple[Text, ...] = Field(description="pairs and links of the loop, in order")
     rotation_deg: float = Field(description="rotation by which it does not close")
     translation_m: float | None = Field(
         description="translation by which it does not close; null if a pair in it does not tell"
@@ -77,7 +77,7 @@ class JointReply(Part):
     freedom: Count = Field(description="degrees of freedom of `chi2`: six for each loop; 0 if there is no loop")
     p_value: Probability = Field(description="chance of a `chi2` at least as large")
     consistent: bool = Field(description="whether the pairs fit each other; if not, they report `inconsistent_rig`")
-    left_out: str | None = Field(description="the one pair that did not fit and was left out, if any")
+    left_out: Text | None = Field(description="the one pair that did not fit and was left out, if any")
     open_loops: tuple[OpenLoop, ...] = Field(description="loops that do not close, the least likely first")
     widened: float = Field(ge=1, description="factor on all standard deviations, to cover the gaps of the loops")
 
@@ -85,19 +85,19 @@ class JointReply(Part):
 class RigMove(Part):
     """A move of one or two sensors. It lasts from their naming until every pair of them serves another extrinsic."""
 
-    sensors: tuple[str, ...]
+    sensors: tuple[Text, ...]
     since_ns: int = Field(description="sensor time at which they were named, ns")
     stepped_ns: int = Field(description="sensor time before which they moved, ns")
     over_ns: int | None = Field(description="sensor time at which the move was corrected, ns; null until then")
-    by: dict[str, SensorMove] = Field(description="size of the move by sensor, as known when they were named")
+    by: dict[Text, SensorMove] = Field(description="size of the move by sensor, as known when they were named")
 
 
 class LidarsReply(Part):
     """Two LiDARs of the vehicle, compared by the surfaces that both see, without any camera."""
 
-    name: str = Field(description="name of the edge, as in `disturbed` and `looks`")
-    a: str
-    b: str
+    name: Text = Field(description="name of the edge, as in `disturbed` and `looks`")
+    a: Text
+    b: Text
     state: LidarsState = Field(
         description="`measured`: the latest look tells the pose of b in a; `refused`: it does not, or no look came of "
         "the latest sweep; `waiting`: no look yet; `not_measured`: not looked at"
@@ -123,20 +123,20 @@ class RigCorrection(Part):
 
     stamp_ns: int = Field(description="sensor time at which it was decided, ns")
     from_ns: int = Field(description="sensor time from which the pairs are checked with it, ns")
-    sensors: tuple[str, ...]
-    pairs: tuple[str, ...]
+    sensors: tuple[Text, ...]
+    pairs: tuple[Text, ...]
 
 
 class RigReply(Message):
     """All sensors of a vehicle. Before the first look all of them are `unknown`."""
 
-    vehicle: str
+    vehicle: Text
     stamp_ns: int | None = Field(
         description="sensor time up to which everything that was asked for is included, ns; null: nothing yet"
     )
     sensors: tuple[SensorReply, ...]
     nobody: Probability | None = Field(description="probability that no sensor moved; null before the first look")
-    disturbed: dict[str, Probability] = Field(
+    disturbed: dict[Text, Probability] = Field(
         description="by pair, or by edge between two LiDARs: probability that something else disturbs it lastingly"
     )
     joint: JointReply | None = Field(description="null before the first accepted window, and for a single pair")

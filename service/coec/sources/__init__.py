@@ -37,7 +37,7 @@ def open_source(spec: str) -> Recording:
 
 def _open_path(spec: SourceSpec) -> Recording:
     if not spec.path.exists():
-        raise SourceError(f"{spec.path} does not exist\n{FORMS}")
+        raise SourceError(f"{spec.path} does not exist", FORMS)
     if is_bag(spec):
         from coec.sources.bag.recording import open_bag
 
@@ -46,4 +46,4 @@ def _open_path(spec: SourceSpec) -> Recording:
         from coec.sources.manifest import open_manifest
 
         return open_manifest(spec)
-    raise UsageError(f"{spec.path} is neither a folder nor an .mcap, .db3, .yaml or .yml file\n{FORMS}")
+    raise UsageError(f"{spec.path} is neither a folder nor an .mcap, .db3, .yaml or .yml file", FORMS)

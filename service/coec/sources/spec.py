@@ -42,7 +42,7 @@ class SourceSpec:
         unknown = sorted(set(self.query) - set(keys))
         if unknown:
             known = f"known here: {', '.join(keys)}" if keys else "this kind of source takes none"
-            raise UsageError(f"unknown query key {', '.join(unknown)} in {self.text}; {known}\n{FORMS}")
+            raise UsageError(f"unknown query key {', '.join(unknown)} in {self.text}; {known}", FORMS)
         return self.query
 
 
@@ -55,12 +55,12 @@ def parse_spec(text: str) -> SourceSpec:
     prefix, colon, rest = text.partition(":")
     layout = prefix if colon and prefix in LAYOUTS else None
     if layout is None and colon and "/" not in prefix and "." not in prefix:
-        raise UsageError(f"unknown source layout {prefix!r} in {text}\n{FORMS}")
+        raise UsageError(f"unknown source layout {prefix!r} in {text}", FORMS)
     # A simulated drive has no path, so the question mark may be left out.
     place = f"?{rest.removeprefix('?')}" if layout == "sim" else rest if layout else text
     location, _, query = place.partition("?")
     if not location and layout != "sim":
-        raise UsageError(f"no path in source {text!r}\n{FORMS}")
+        raise UsageError(f"no path in source {text!r}", FORMS)
     return SourceSpec(text, layout, from_home(location), _parse_query(query, text))
 
 
@@ -79,7 +79,7 @@ def _parse_query(query: str, text: str) -> dict[str, str]:
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
     except ValueError as error:
-        raise UsageError(f"malformed query in source {text}: {error}\n{FORMS}") from error
+        raise UsageError(f"malformed query in source {text}: {error}", FORMS) from error
     result: dict[str, str] = {}
     for key, value in pairs:
         if key in result:

@@ -14,6 +14,7 @@ import pytest
 
 from coec.adapters.system import logs
 from coec.adapters.system.logs import Form
+from hostile import HOSTILE, obeyed
 
 NASTY = "two\nlines \x1b[31mred\x1b[0m\r and a \u202ebackwards"
 
@@ -48,6 +49,25 @@ def test_for_people_it_is_one_line_that_moves_no_cursor() -> None:
     assert re.match(r"\d\d:\d\d:\d\d\.\d{3} warning: two\\nlines ", line), line
     assert line.isprintable()
     assert "pair=front" in line
+
+
+@pytest.mark.fault("control characters in a name that the log quotes", "both forms of the log show escapes")
+@pytest.mark.parametrize("form", ["json", "human"])
+def test_no_form_of_the_log_steers_a_terminal(form: Form) -> None:
+    stream = io.StringIO()
+    logs.configure("info", form, stream)
+    try:
+        raise ValueError(HOSTILE)
+    except ValueError:
+        logging.getLogger(HOSTILE).exception("frame %s", HOSTILE, extra={"fields": {HOSTILE: HOSTILE}})
+    assert obeyed(stream.getvalue()) == ""
+    line, *traceback = stream.getvalue().splitlines()
+    assert r"\u202e" in repr(line)
+    if form == "json":
+        assert json.loads(line)[HOSTILE] == HOSTILE
+        assert not traceback
+    else:
+        assert traceback[-2].startswith(r"ValueError: \x1b[35;45m")
 
 
 def test_where_it_goes_to_a_terminal_it_is_for_people() -> None:

@@ -11,6 +11,8 @@ from collections import Counter
 from datetime import UTC, datetime
 from typing import Literal, TextIO
 
+from coec.untrusted import json_printable, printable, printable_lines
+
 Form = Literal["auto", "json", "human"]
 
 _LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
@@ -20,7 +22,7 @@ class JsonFormatter(logging.Formatter):
     """One JSON object per record: time (UTC), level, logger, message, then what `extra={"fields": …}` gave."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as one line; line breaks inside are escaped by JSON."""
+        """The record as one line; line breaks and control characters inside are escaped by JSON."""
         document: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -32,7 +34,7 @@ class JsonFormatter(logging.Formatter):
             document.update({key: value for key, value in fields.items() if key not in document})
         if record.exc_info:
             document["exception"] = self.formatException(record.exc_info)
-        return json.dumps(document, ensure_ascii=False, default=str)
+        return json_printable(json.dumps(document, ensure_ascii=False, default=str))
 
 
 class HumanFormatter(logging.Formatter):
@@ -45,12 +47,10 @@ class HumanFormatter(logging.Formatter):
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
         fields = getattr(record, "fields", None)
         told = "".join(f"  {key}={value}" for key, value in fields.items()) if isinstance(fields, dict) else ""
-        line = _printable(f"{time} {level}{record.getMessage()}{told}")
-        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
-
-
-def _printable(text: str) -> str:
-    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
+        line = printable(f"{time} {level}{record.getMessage()}{told}", None)
+        if not record.exc_info:
+            return line
+        return f"{line}\n{printable_lines(self.formatException(record.exc_info))}"
 
 
 def configure(level: str, form: Form, stream: TextIO | None = None) -> None:

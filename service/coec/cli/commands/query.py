@@ -101,7 +101,8 @@ class Options:
     output: Annotated[
         Path | None,
         typer.Option(
-            help="File to write: windows/ID with its sha256 verified, overlay, or a picture of evidence/ID.",
+            help="File to write, byte for byte as it was sent: windows/ID with its sha256 verified, overlay, or a "
+            "picture of evidence/ID.",
             metavar="FILE",
         ),
     ] = None

@@ -118,7 +118,7 @@ def _until_running(watch: Watch, daemon: Daemon, screen: Screen) -> None:
             if seen.status.state == "running":
                 return
         if time.monotonic() > deadline_s:
-            raise DemoError(f"the service is not ready after {START_S:g} s; {daemon.last_words()}")
+            raise DemoError(f"the service is not ready after {START_S:g} s", daemon.last_words())
         time.sleep(POLL_S)
 
 
@@ -127,7 +127,7 @@ def _watch(watch: Watch, vehicle: Vehicle, daemon: Daemon, screen: Screen) -> tu
     deadline_s = time.monotonic() + DRIVE_S
     try:
         if vehicle.start(START_S):
-            raise DemoError(f"the service does not listen to its sensors; {daemon.last_words()}")
+            raise DemoError("the service does not listen to its sensors", daemon.last_words())
         while True:
             daemon.check()
             arrived = vehicle.arrived
@@ -135,7 +135,7 @@ def _watch(watch: Watch, vehicle: Vehicle, daemon: Daemon, screen: Screen) -> tu
                 raise vehicle.failure
             seen = watch.look(vehicle.second, vehicle.pictures)
             if seen is None:
-                raise DemoError(f"the service answers no more; {daemon.last_words()}")
+                raise DemoError("the service answers no more", daemon.last_words())
             screen.show(watch, seen)
             outcome = outcome_of(watch.timeline, story.KNOCK_S, story.MAX_ERROR_DEG)
             told = outcome.repaired_s is not None and vehicle.second >= outcome.repaired_s + story.REST_S

@@ -38,7 +38,7 @@ class Daemon:
     def check(self) -> None:
         """Raises DemoError, with the last lines of the log, when the service has ended."""
         if self._child.poll() is not None:
-            raise DemoError(f"the service ended with status {self._child.returncode}; {self.last_words()}")
+            raise DemoError(f"the service ended with status {self._child.returncode}", self.last_words())
 
     def last_words(self) -> str:
         """The last lines of the log, for error messages."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 
 import zenoh
@@ -15,7 +14,7 @@ from coec.errors import CoecError, NotFoundError
 from coec.runtime.api.configuration import shown
 from coec.runtime.api.troubles import TROUBLES
 from coec.runtime.reload import differing
-from coec.schemas.base import from_json
+from coec.schemas.base import from_json, json_value
 from coec.schemas.doctor import Finding, Level
 from coec.schemas.keys import Keys
 from coec.schemas.replies import HealthReply, StatusReply
@@ -57,7 +56,7 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
 def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:
     """Whether the service runs with this file."""
     try:
-        served = json.loads(ask_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
+        served = json_value(ask_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
         places = [place for place in differing(served, shown(config)) if place not in OF_THE_COMMAND_LINE]
     except (CoecError, ValueError, KeyError, TypeError) as error:
         text = f"the service does not tell with which configuration it runs: {error}"

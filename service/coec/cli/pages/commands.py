@@ -18,6 +18,10 @@ Exit codes are those of [operations](operations.md#exit-codes). With `--json`, s
 and nothing else; progress and remarks go to standard error. Each command and group also takes `--help` (`-h`). A SOURCE
 is described in [recordings](recordings.md#source).
 
+What a vehicle or a recording says is printed with its control characters as escapes (`\\x1b`), so that none of it can
+steer the terminal; standard output and standard error hold no other control characters than line breaks, and styles on
+a terminal.
+
 {commands}
 {sections}"""
 

@@ -1,7 +1,8 @@
 """From a `Page` to one HTML file that loads nothing from anywhere.
 
 Names that came over a network can only ever be text, for two reasons: templates escape whatever they are given, and the
-content policy in the head of the page lets no script run but the page's own.
+content policy in the head of the page lets no script run but the page's own. Characters without a shape, and those that
+reverse the order of others, are shown as escapes (`coec.untrusted`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from coec.adapters.files import output
 from coec.reports.page import charts, discs
 from coec.reports.page.blocks import Compare, Page, Picture, Pictures, Section, Trend
 from coec.reports.page.embedding import Embedded, embedded
+from coec.untrusted import printable_lines
 
 TREND_WIDTH, TREND_HEIGHT, TREND_MARGIN = 180, 40, 3
 """Size of a plot within a table, px."""
@@ -102,6 +104,7 @@ def _environment() -> Environment:
         loader=PackageLoader("coec.reports.page"),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=_finalized,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -115,8 +118,14 @@ def _environment() -> Environment:
     return made
 
 
+def _finalized(value: object) -> object:
+    """What an expression of a template comes to, as it stands in the page before its markup is escaped."""
+    return printable_lines(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
 def _prose(text: str) -> Markup:
     """A sentence as HTML. Text between two backticks is code; with an odd number of backticks none is."""
+    text = printable_lines(text)
     parts = text.split("`")
     if len(parts) % 2 == 0:
         return escape(text)

@@ -107,7 +107,7 @@ class Service:
     def _go_on(self, deadline_s: float, what: str) -> None:
         self._daemon.check()
         if time.monotonic() > deadline_s:
-            raise DemoError(f"the service {what} in time; {self._daemon.last_words()}")
+            raise DemoError(f"the service {what} in time", self._daemon.last_words())
         time.sleep(POLL_S)
 
     def _ask(self, key: str) -> bytes:

@@ -1,0 +1,103 @@
+"""Text that a terminal would obey, in every field of a message that can hold text, and what must not come of it."""
+
+from __future__ import annotations
+
+import enum
+import re
+import types
+import unicodedata
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, MaxLen
+from pydantic import BaseModel
+
+M = TypeVar("M", bound=BaseModel)
+
+HOSTILE = (
+    "\x1b[35;45m\x9b2J\x1b]52;c;aGk=\x07\r\b\t\x7f\x85\u2028\u202e\u2066\u200f\u200b\ufeff\U000e0041\ufe0f"
+    "\nx[red]&<i a='\">"
+)
+"""Colours, an erased screen, the clipboard, a line that overwrites another, text in the other direction, characters
+without a shape, a second line, markup of rich and of HTML."""
+
+SHORT = "\x1b[35;45m\x9b\r\u202e\n"
+"""The worst of it, for fields of a few characters."""
+
+OBEYED = frozenset({"Cc", "Cf", "Cs", "Co", "Zl", "Zp"})
+"""Categories of characters that a terminal obeys or does not show."""
+
+OF_RICH = re.compile(r"\x1b\[[0-9;]*m|\x1b\[\?25[hl]|\x1b\[\?1049[hl]|\x1b\[[0-9;]*[AHJK]|\x1b\[2K|\r")
+"""What rich sends to a terminal by itself: styles, and the moves of a live display."""
+
+
+def obeyed(text: str, *, styled: bool = False) -> str:
+    """The characters of an output that a terminal would obey, apart from line breaks and, if `styled`, what rich makes;
+    empty for a harmless output."""
+    assert "\x1b[35;45m" not in text, "colours of the text itself"
+    assert "\ufe0f" not in text
+    left = OF_RICH.sub("", text) if styled else text
+    return "".join(sign for sign in left if sign != "\n" and unicodedata.category(sign) in OBEYED)
+
+
+def hostile(model: type[M], choice: int = 0, text: str = HOSTILE, **known: Any) -> M:
+    """A message in which every text, and every name in a map, is `text`; optional fields are there. `choice` selects
+    among fixed words, and of yes and no. `known` are fields whose values are not chosen here."""
+    given = {
+        name: known[name] if name in known else _value(field.annotation, tuple(field.metadata), choice, text)
+        for name, field in model.model_fields.items()
+    }
+    return model.model_validate(given)
+
+
+def texts(value: object) -> list[str]:
+    """Every text in a message."""
+    if isinstance(value, BaseModel):
+        value = [getattr(value, name) for name in type(value).model_fields if not _is_fixed(type(value), name)]
+    if isinstance(value, dict):
+        return [found for item in (*value.keys(), *value.values()) for found in texts(item)]
+    if isinstance(value, list | tuple):
+        return [found for item in value for found in texts(item)]
+    return [value] if isinstance(value, str) and not isinstance(value, enum.Enum) else []
+
+
+def _is_fixed(model: type[BaseModel], name: str) -> bool:
+    """Whether a field holds only words of a fixed set."""
+    return "Literal" in str(model.model_fields[name].annotation)
+
+
+def _value(kind: Any, limits: tuple[Any, ...], choice: int, text: str) -> Any:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _value(inner[0], (*limits, *_flat(inner[1:])), choice, text)
+    if origin is Literal:
+        return inner[-choice]
+    if origin in (Union, types.UnionType):
+        return _value(next(one for one in inner if one is not type(None)), limits, choice, text)
+    if origin is tuple:
+        several = (inner[0],) if inner[-1] is Ellipsis else inner
+        return tuple(_value(one, (), choice, text) for one in several)
+    if origin is dict:
+        return {_value(inner[0], (), choice, text): _value(inner[1], (), choice, text)}
+    if issubclass(kind, BaseModel):
+        return {
+            name: _value(field.annotation, tuple(field.metadata), choice, text)
+            for name, field in kind.model_fields.items()
+        }
+    if issubclass(kind, enum.Enum):
+        return list(kind)[-choice]
+    if issubclass(kind, bool):
+        return choice == 0
+    if issubclass(kind, str):
+        longest = min((limit.max_length for limit in limits if isinstance(limit, MaxLen)), default=len(text))
+        return (text if longest >= len(text) else SHORT)[:longest]
+    least = max((_number(limit) for limit in limits if isinstance(limit, Ge | Gt)), default=0)
+    most = min((_number(limit) for limit in limits if isinstance(limit, Le)), default=least + 1)
+    return kind(min(least + 1, most))
+
+
+def _flat(annotations: tuple[Any, ...]) -> tuple[Any, ...]:
+    return tuple(limit for one in annotations for limit in getattr(one, "metadata", (one,)))
+
+
+def _number(limit: Any) -> float:
+    return float(getattr(limit, "ge", getattr(limit, "gt", getattr(limit, "le", 0))))
