@@ -50,7 +50,14 @@ MIN_SPEED_MPS = 1.0
 
 
 def explained_by_nuisance(
-    edges: Sequence[FramePair], rig: Rig, level: EdgeFrames, expected: Matrix4, found: Matrix4, min_significance: float
+    edges: Sequence[FramePair],
+    rig: Rig,
+    level: EdgeFrames,
+    expected: Matrix4,
+    found: Matrix4,
+    found_pose: Matrix4,
+    min_significance: float,
+    zooms: Sequence[float] = ZOOMS,
 ) -> Cause | None:
     """The clock, ego-motion or focal length that explains the images better than the extrinsic alone; None if none
     does. Clock and ego-motion are tried only if there is enough motion.
@@ -59,19 +66,21 @@ def explained_by_nuisance(
         edges: the pairs of a check, their sweeps reduced to the range edges of `level`, as measured.
         level: the same range edges, placed, and the edge maps of one level.
         expected: (4, 4) where the local optimum should be.
-        found: (4, 4) where it is.
+        found: (4, 4) where it is, over rotations.
+        found_pose: (4, 4) where it is over all six degrees of freedom: a mount that was shifted is an explanation, too.
         min_significance: below this nothing is explained.
+        zooms: factors on the focal length to try.
     """
     null, at_found = frame_alignment(level, expected).significance, frame_alignment(level, found)
-    to_beat = at_found.significance
+    turned, shifted = at_found.significance, frame_alignment(level, found_pose).significance
     least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
     best, explanation = 0.0, None
-    for again, motions, cause in _hypotheses(edges, rig, level):
+    for again, motions, cause in _hypotheses(edges, rig, level, zooms):
         unmoved = alignment_of_each(again, expected @ motions).significance
         moved = alignment_of_each(again, found @ motions)
         agree = float((moved.strength > at_found.strength).mean()) >= FRAMES_AGREE
-        gains = agree and moved.significance >= least_gain * to_beat
-        enough = unmoved >= max(AS_GOOD * to_beat, BETTER * null)
+        gains = agree and moved.significance >= least_gain * turned
+        enough = unmoved >= max(AS_GOOD * max(turned, shifted), BETTER * null)
         reached = max(unmoved if enough else 0.0, moved.significance if gains else 0.0)
         if reached > max(best, min_significance):
             best, explanation = reached, cause
@@ -79,12 +88,12 @@ def explained_by_nuisance(
 
 
 def _hypotheses(
-    edges: Sequence[FramePair], rig: Rig, level: EdgeFrames
+    edges: Sequence[FramePair], rig: Rig, level: EdgeFrames, zooms: Sequence[float]
 ) -> Iterator[tuple[EdgeFrames, NDArray[np.float64], Cause]]:
     """For each hypothesis the range edges as it places them, the motions (F, 4, 4) that then move the edges of each
     pair, and the cause that it stands for."""
     still = np.tile(np.eye(4), (len(edges), 1, 1))
-    for zoom in ZOOMS:
+    for zoom in zooms:
         camera = level.camera._replace(fx=zoom * level.camera.fx, fy=zoom * level.camera.fy)
         yield replace(level, camera=camera), still, INTRINSICS_WRONG
     moving = [pair for pair in edges if pair.motion is not None and pair.motion.reaches(MIN_SPEED_MPS)]

@@ -76,7 +76,7 @@ counted, so that a cause that went away is forgotten after three."""
 ACQUITTAL_PERIODS = 3
 """Periods of the monitor after which an acquitting check no longer vouches for the served extrinsic (ARCHITECTURE)."""
 
-LEARNED2 = chi2_quantile(0.95, AXES)
+LEARNED2 = chi2_quantile(0.99, AXES)
 """Squared distance, in standard deviations, from where the mount has been so far, beyond which a check does not acquit,
 even if its optimum is no farther off than on rigs about which nothing is known: one in twenty of a right mount."""
 

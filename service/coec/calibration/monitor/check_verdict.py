@@ -25,7 +25,7 @@ from coec.calibration.commissioning.baseline import (
 from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.sampling import drives
-from coec.calibration.frames.timing import explained_by_nuisance
+from coec.calibration.frames.timing import ZOOMS, explained_by_nuisance
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import AT_POSE, Check, CheckInput, Expected, check_at, gather
 from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
@@ -182,7 +182,10 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
             evidence.edges.whole.frames,
             se3.perturb(pose, rotation.expected),
             seen.T_rotation,
+            seen.T_pose,
             limits.min_edges_per_pair * float(np.sqrt(seen.pairs)),
+            # Edges that stand out nowhere fit some other focal length by chance.
+            () if Faint.CONTRAST in faint else ZOOMS,
         )
         causes = () if explained is None else (explained,)
     stamps_ns = tuple(pair.stamp_ns for pair in evidence.pairs)
