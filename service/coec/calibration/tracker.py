@@ -5,6 +5,10 @@ The slow track is an information filter on SE(3). Its state is a pose and the co
 that perturbation. Between windows the covariance grows with time, so that the track follows a mount that creeps. Errors
 that windows have in common do not average away: they are carried beside the noise and reported with it.
 
+A window that is improbable, but no step, while the monitor doubts what is served, comes from a mount that drifts faster
+than configured: the covariance of the slow track grows until it explains the window (adaptive fading: Xia, Rao, Ying,
+Shen 1994), so that the track follows a drift instead of averaging it away.
+
 Each window is first tested for whether it can come from the same mount: the squared Mahalanobis distance of its
 innovation is chi-square distributed if it does (Bar-Shalom, Li, Kirubarajan 2001, section 5.4). A window that fails the
 test opens a fast track and moves nothing. If the next window agrees with the fast track and not with the slow one, the
@@ -33,6 +37,13 @@ Matrix6 = NDArray[np.float64]
 
 NS_PER_H = 3_600_000_000_000
 """Nanoseconds in an hour."""
+
+IMPROBABLE, EXPLAINED = 0.01, 0.1
+"""Chance of a window below which the mount drifts faster than configured, if the monitor doubts what is served, and the
+chance that the window has once the covariance has grown."""
+
+GROWTH = 1.5
+"""Factor by which the covariance grows at a time."""
 
 
 class StepState(StrEnum):
@@ -169,8 +180,9 @@ def creep_sigma(config: TrackerConfig) -> NDArray[np.float64]:
     return np.array([radians(config.drift_deg_per_sqrt_h)] * 3 + [config.drift_m_per_sqrt_h] * 3)
 
 
-def absorb(track: Track, measurement: Measurement, config: TrackerConfig) -> Track:
-    """The track after another accepted window; a window that determines no axis leaves the track unchanged."""
+def absorb(track: Track, measurement: Measurement, config: TrackerConfig, *, doubted: bool = False) -> Track:
+    """The track after another accepted window; a window that determines no axis leaves the track unchanged. `doubted`:
+    whether the monitor doubts what is served."""
     axes = measurement.told_axes()
     if not axes:
         return track
@@ -180,6 +192,8 @@ def absorb(track: Track, measurement: Measurement, config: TrackerConfig) -> Tra
     stamp_ns = max(track.stamp_ns, measurement.stamp_ns)
     heard = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
     if chance >= config.step_false_alarm:
+        if doubted and chance < IMPROBABLE:
+            slow = _grown(slow, measurement, axes)
         return replace(heard, slow=_updated(slow, measurement, axes), step=StepState.NONE, candidate=None)
     alone = _restarted(track, measurement, axes)
     if chance < config.overwhelming_false_alarm:
@@ -207,6 +221,15 @@ def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belie
 def _drifted(belief: Belief, elapsed_h: float, config: TrackerConfig) -> Belief:
     """The belief after `elapsed_h` hours in which the mount may have crept."""
     return replace(belief, covariance=belief.covariance + np.diag(elapsed_h * creep_sigma(config) ** 2))
+
+
+def _grown(belief: Belief, measurement: Measurement, axes: list[int]) -> Belief:
+    """The belief with a covariance that explains a window."""
+    grown = belief
+    # Ends: the distance of the window falls to nothing as the covariance grows.
+    while _disagreement(grown, measurement, axes)[1] < EXPLAINED:
+        grown = replace(grown, covariance=GROWTH * grown.covariance)
+    return grown
 
 
 def _disagreement(belief: Belief, measurement: Measurement, axes: list[int]) -> tuple[float, float]:

@@ -344,7 +344,7 @@ def _tracked(state: PairState, estimate: Estimate, rules: Rules) -> Track:
     track = state.track
     if track is None or _accused_elsewhere(state, estimate, rules):
         track = Track.initial(pose, prior_sigma(rules.tracker), estimate.data_stamp_ns)
-    return absorb(track, measurement, rules.tracker)
+    return absorb(track, measurement, rules.tracker, doubted=state.monitor.unacquitted > 0)
 
 
 def _accused_elsewhere(state: PairState, estimate: Estimate, rules: Rules) -> bool:
