@@ -124,7 +124,8 @@ RIG = rig_of(configuration(Path("state")).pairs[0])
 @dataclass
 class KnowingWorker:
     """Answers at once, and rightly. `cost_s`: processor time that work of a kind takes, for which `pay` is told;
-    `checked` are the stamps of the pairs of each check, `drawn` the questions for pictures."""
+    `checked` are the stamps of the pairs of each check, `drawn` the questions for pictures, `commissionings` says how
+    far those of pairs are."""
 
     cause: str | None = None
     baseline_not_used: str | None = None
@@ -136,6 +137,10 @@ class KnowingWorker:
     pay: Callable[[Cost], None] = lambda _: None
     checked: list[tuple[int, ...]] = field(default_factory=list)
     drawn: list[Job] = field(default_factory=list)
+    commissionings: dict[str, str] = field(default_factory=dict)
+
+    def commissioning(self, pair: str) -> str | None:
+        return self.commissionings.get(pair)
 
     def ask(self, job: Job) -> None:
         if job.kind in self.cost_s:
