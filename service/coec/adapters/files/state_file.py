@@ -65,6 +65,10 @@ class StateFile:
                 return LoadedState(body, tuple(damage))
         return LoadedState(None, tuple(damage))
 
+    def exists(self) -> bool:
+        """Whether there is a current copy, good or not."""
+        return self._path.exists()
+
     def distrust(self) -> None:
         """Call this if the loaded body turns out to be unusable: it is kept aside and does not become the previous
         copy."""

@@ -121,6 +121,8 @@ class PairStore:
         self.incidents = Incidents(config.directory / "evidence", rig.pair, config.evidence)
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
         self.protect()
+        scribe.keep(self.history, self.incidents, self._checks, store)
+        scribe.on_replaced(lambda text: self.history.append(_entry("chain", "rewritten", text)))
         if self.history.damage is not None:
             losses.add("storage", "history_damaged", detail=self.history.damage)
             text = f"The chain of the history is broken: {self.history.damage}. It is kept aside."

@@ -92,6 +92,7 @@ class RigFile:
         self._lock = threading.Lock()
         self._body: dict[str, Any] | None = None
         loaded = self._file.load()
+        self._on_disk = loaded.body
         damage = [*loaded.damage]
         self._found = StoredRig(edges={})
         if loaded.body is not None:
@@ -99,6 +100,7 @@ class RigFile:
                 self._found = _sound(StoredRig.model_validate(loaded.body))
             except (ValidationError, ValueError):
                 self._file.distrust()
+                self._on_disk = None
                 damage.append(f"{FILE}: it has another form, or a pose in it is no rigid transform")
         text = (
             f"What was known of the rig cannot be used: {'; '.join(damage)}. It is kept aside; the rig is learnt anew."
@@ -145,13 +147,15 @@ class RigFile:
             self._body = {"edges": edges, "event": told}
 
     def flush(self) -> None:
-        """Writes what is kept to the disk.
+        """Writes what is kept to the disk, and what was written before if the file is gone.
 
         Raises:
             StateError: the disk refuses; the next call tries again.
         """
         with self._lock:
             body, self._body = self._body, None
+        if body is None and not self._file.exists():
+            body = self._on_disk
         if body is None:
             return
         try:
@@ -160,6 +164,7 @@ class RigFile:
             with self._lock:
                 self._body = body if self._body is None else self._body
             raise
+        self._on_disk = body
 
 
 def _sound(stored: StoredRig) -> StoredRig:
