@@ -20,6 +20,7 @@ from coec.adapters.files.conversions import result_of
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Reason
 from coec.config import CalibrationConfig, WorkerConfig
+from coec.runtime.api.status import worker_status_of
 from coec.runtime.worker import jobs, link
 from coec.runtime.worker.child import Child, ChildError, Fault
 from coec.runtime.worker.costs import Cost
@@ -208,6 +209,7 @@ def test_other_work_is_done_between_the_slices_of_a_commissioning(tmp_path: Path
         assert it.failure() == ("rig again", BUSY)
         assert it.worker.commissioning("front") == "waiting for the worker"
         assert it.worker.commissioning("rear") is None
+        assert worker_status_of(it.worker).commissioning == {"front": "waiting for the worker"}
         for name in ("w1", "w2"):
             it.solve(name)
         (tmp_path / LET_GO).touch()

@@ -148,7 +148,7 @@ class Scribe:
             return
         text = (
             f"The folder {self._folder} was removed or replaced while the service ran. State, history, checks, events "
-            "and baselines were written again from memory; recordings, and pictures of events, from before are gone."
+            "and baselines are written again from memory; recordings, and pictures of events, from before are gone."
         )
         _log.warning(text)
         for report in self._report_replaced:
