@@ -254,8 +254,8 @@ class FullDisk:
 
         class File(io.FileIO):
             def __init__(self, path: Any, mode: str = "r") -> None:
-                self._below = disk._is_below(path)
-                if self._below and mode != "rb":
+                self._below = path in disk._opened if isinstance(path, int) else disk._is_below(path)
+                if self._below and mode != "rb" and not isinstance(path, int):
                     disk._count()
                 super().__init__(path, mode)
                 if self._below:

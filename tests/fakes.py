@@ -49,7 +49,8 @@ def fake_worker_command(fault: str, folder: Path, at: str = "solve") -> list[str
 
 
 def _answer(folder: Path, question: dict[str, Any]) -> Any:
-    """Packed by hand, after what `coec.runtime.worker.answers` documents."""
+    """Packed by hand, after what `coec.runtime.worker.answers` documents. A commissioning takes a slice for each of its
+    windows, and one more."""
     match question["kind"]:
         case "prefetch":
             result: Any = None
@@ -61,10 +62,18 @@ def _answer(folder: Path, question: dict[str, Any]) -> Any:
             result = {"observation": _OBSERVATION, "baseline_not_used": f"{len(question['frames'])} pairs"}
         case "overlay":
             result = {"jpeg": question["title"].encode()}
+        case "commission" if (done := _SLICES.get(question["run"], 0)) < len(question["paths"]):
+            _SLICES[question["run"]] = done + 1
+            underway = {"stage": "windows", "done": done + 1, "total": len(question["paths"])}
+            return {"id": question["id"], "underway": underway}
         case _:
             pose = _array([4, 4], [float(value) for row in question["pose"] for value in row])
             result = {"pose": pose, "baseline_hash": "b" * 16, "windows": len(question["paths"]), "pairs": 7}
     return {"id": question["id"], "result": result}
+
+
+_SLICES: dict[int, int] = {}
+"""Slices that were done, by the number of the commissioning."""
 
 
 def _array(shape: list[int], values: list[float]) -> msgpack.ExtType:

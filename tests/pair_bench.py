@@ -54,7 +54,7 @@ from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutco
 from coec.runtime.worker.messages import unpack_pairs
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.keys import Keys
-from coec.schemas.replies import HistoryEntry
+from coec.schemas.replies import Acknowledgement, HistoryEntry
 from estimates import estimate
 
 S = 1_000_000_000
@@ -124,7 +124,8 @@ RIG = rig_of(configuration(Path("state")).pairs[0])
 @dataclass
 class KnowingWorker:
     """Answers at once, and rightly. `cost_s`: processor time that work of a kind takes, for which `pay` is told;
-    `checked` are the stamps of the pairs of each check, `drawn` the questions for pictures."""
+    `checked` are the stamps of the pairs of each check, `drawn` the questions for pictures, `commissionings` says how
+    far those of pairs are."""
 
     cause: str | None = None
     baseline_not_used: str | None = None
@@ -136,6 +137,10 @@ class KnowingWorker:
     pay: Callable[[Cost], None] = lambda _: None
     checked: list[tuple[int, ...]] = field(default_factory=list)
     drawn: list[Job] = field(default_factory=list)
+    commissionings: dict[str, str] = field(default_factory=dict)
+
+    def commissioning(self, pair: str) -> str | None:
+        return self.commissionings.get(pair)
 
     def ask(self, job: Job) -> None:
         if job.kind in self.cost_s:
@@ -379,12 +384,15 @@ class Bench:
             self.worker.work(share=0.05)
 
     def do(self, name: str, **arguments: Any) -> str:
+        return self.acknowledged(name, **arguments).code
+
+    def acknowledged(self, name: str, **arguments: Any) -> Acknowledgement:
         with ThreadPoolExecutor(1) as other:
             told = other.submit(self.pair.commands.carry_out, name, arguments, "the test")
             while not told.done():
                 self.settle()
         self.settle()
-        return told.result().code
+        return told.result()
 
     @property
     def pose(self) -> Matrix4:

@@ -111,11 +111,12 @@ def _statvfs(path: Any) -> os.statvfs_result:
 
 
 class _File(io.FileIO):
-    """Of the disk, when its name is below the folder."""
+    """Of the disk, when its name is below the folder, or it was opened there."""
 
     def __init__(self, path: Any, mode: str = "r", *rest: Any, **options: Any) -> None:
-        self._below = _below(path)
-        if self._below and mode.strip("b") != "r":
+        opened = isinstance(path, int)
+        self._below = path in _opened if opened else _below(path)
+        if self._below and not opened and mode.strip("b") != "r":
             _take(FSYNC_BYTES, grows=False)
         super().__init__(path, mode, *rest, **options)
         if self._below:

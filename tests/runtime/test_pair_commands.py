@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from unittest.mock import create_autospec
 
 import numpy as np
@@ -27,9 +27,9 @@ from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.api.uplink import Uplink
-from coec.runtime.worker.jobs import Commissioned, Fate, JobOutcome
+from coec.runtime.worker.jobs import Commissioned, Fate, Job, JobOutcome, Kind
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
-from pair_bench import BEGIN_S, END_S, STEP_S, Bench
+from pair_bench import BEGIN_S, END_S, STEP_S, Bench, KnowingWorker
 
 
 def test_a_roll_back_on_a_commissioned_rig_serves_what_was_served_to_the_byte(tmp_path: Path) -> None:
@@ -189,6 +189,62 @@ def test_windows_that_a_pair_was_commissioned_from_are_kept_for_that_across_a_re
     assert {before[name] for name in others} == {None}
     bench.restart()
     assert kept_for() == before
+
+
+class CommissioningWorker(KnowingWorker):
+    """Has a commissioning under way for as long as the test wants."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.jobs: list[Job] = []
+
+    def commissioning(self, pair: str) -> str | None:
+        return "spread 4 of 10" if any(job.pair == pair for job in self.jobs) else None
+
+    def ask(self, job: Job) -> None:
+        if job.kind is Kind.COMMISSION:
+            self.jobs.append(job)
+        else:
+            super().ask(job)
+
+    def end(self, answer: Commissioned) -> None:
+        self.jobs.pop().done(JobOutcome(Fate.RESULT, answer, None, 100.0))
+
+
+def commissioning(folder: Path) -> tuple[Bench, CommissioningWorker]:
+    bench = Bench(folder, worker=CommissioningWorker)
+    bench.drive(BEGIN_S, BEGIN_S + 90)
+    assert bench.do("commission") == "commissioning"
+    return bench, cast("CommissioningWorker", bench.worker)
+
+
+@pytest.mark.fault("`commission` while a commissioning of the pair runs", "refused, with how far that is")
+def test_a_pair_is_commissioned_once_at_a_time(tmp_path: Path) -> None:
+    bench, worker = commissioning(tmp_path / "state")
+    told = [bench.do("commission") for _ in range(3)]
+    assert told == ["commissioning_underway"] * 3
+    assert len(worker.jobs) == 1
+    assert "(spread 4 of 10)" in bench.entries("command")[-1].text
+    held = bench.outside.folder._held
+    assert set(held) == {Path(path).stem for path in worker.jobs[0].body["paths"]}, "its windows are not removed"
+    worker.end(Commissioned(bench.pose, "0123abcd", 1, 10))
+    bench.settle()
+    assert (bench.store.state.provenance.value, len(bench.entries("commissioned"))) == ("commissioned", 1)
+    assert not held
+    assert bench.do("commission") == "commissioning"
+
+
+@pytest.mark.fault("the extrinsic is replaced during a commissioning", "what is served does not count as commissioned")
+def test_a_commissioning_of_an_extrinsic_that_was_replaced_says_nothing_of_the_new_one(tmp_path: Path) -> None:
+    bench, worker = commissioning(tmp_path / "state")
+    commissioned = bench.pose.copy()
+    assert bench.do("reset") == "reset"
+    before = bench.store.state
+    worker.end(Commissioned(commissioned, "0123abcd", 1, 10))
+    bench.settle()
+    after = bench.store.state
+    assert not np.array_equal(after.T_camera_lidar, commissioned)
+    assert (after.provenance, after.proven, after.health) == (before.provenance, before.proven, before.health)
 
 
 @pytest.mark.fault("commands faster than a person gives them", "they are answered, and do nothing")

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.types import CameraFrame, DepthMap, ImageQuality
+
+T = TypeVar("T")
 
 
 class DepthModel(Protocol):
@@ -76,6 +80,30 @@ class Silence:
 
     def step(self, stage: str, done: int, total: int) -> None:
         """Nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A part of a long computation that is complete: `done` of `total` parts of a stage."""
+
+    stage: str
+    done: int
+    total: int
+
+
+Steps = Generator[Step, None, T]
+"""A long computation that can be suspended after each of its steps, and returns a T."""
+
+
+def run_to_end(steps: Steps[T], progress: Progress) -> T:
+    """The result of a computation, without a pause. `progress` receives each step."""
+    while True:
+        try:
+            step = next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+        progress.step(step.stage, step.done, step.total)
 
 
 class Neighbourhood(Protocol):

@@ -11,6 +11,7 @@ from typing import Any
 
 import zenoh
 
+from coec.adapters.files import output
 from coec.adapters.tls.conversation import Credentials, Speaker
 from coec.adapters.zenoh.bus import JSON, MSGPACK
 from coec.adapters.zenoh.client import (
@@ -32,7 +33,7 @@ from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.cli.commands.query import Options
 from coec.config import Config, ZenohConfig, load_config
-from coec.errors import DecodeError, NotFoundError, OutputError, UsageError
+from coec.errors import DecodeError, NotFoundError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json, json_value
 from coec.schemas.commands import NAMES, REASON, RELEASE, SENSOR, TO, arguments_of
@@ -320,7 +321,7 @@ def _save_picture(options: Options, way: Way, keys: Keys, head: str, argument: s
     if reply.encoding != JPEG:
         raise UsageError("the answer is no picture: give --param overlay=before or overlay=after")
     path = Path(str(options.output))
-    _save(path, reply.payload)
+    output.replace(path, reply.payload)
     if options.as_json:
         console.print_json({"path": str(path), "size_bytes": len(reply.payload)})
     else:
@@ -352,13 +353,3 @@ def _download(options: Options, way: Way, keys: Keys, window_id: str) -> int:
     else:
         console.show(f"{options.output}  {info.size_bytes} bytes, sha256 {info.sha256} verified")
     return 0
-
-
-def _save(path: Path, data: bytes) -> None:
-    part = path.with_name(f"{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(data)
-        part.replace(path)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error

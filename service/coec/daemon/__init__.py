@@ -28,8 +28,8 @@ def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
     logs.configure(config.log.level, config.log.format)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     try:
-        with received() as signals, locked(config.state.directory):
-            return Daemon(config, Notifier.from_environment()).serve(signals, reread)
+        with received() as signals, locked(config.state.directory) as lock:
+            return Daemon(config, Notifier.from_environment(), lock).serve(signals, reread)
     except CoecError as error:
         _log.error(str(error), extra={"fields": {"code": error.reply_code}})
         return error.exit_code

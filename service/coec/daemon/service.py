@@ -29,6 +29,7 @@ from coec.calibration.types import Reason
 from coec.config import AuthorityConfig, Config, config_hash
 from coec.daemon.asked import Signals
 from coec.daemon.ending import attempt, joined, stopped
+from coec.daemon.state_folder import FolderLock
 from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
 from coec.runtime.api.authority import Authority
@@ -101,8 +102,8 @@ QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER
 class Daemon:
     """Composes the service from its parts."""
 
-    def __init__(self, config: Config, notifier: Notifier) -> None:
-        """Builds everything and opens the Zenoh session. No thread runs yet.
+    def __init__(self, config: Config, notifier: Notifier, lock: FolderLock) -> None:
+        """Builds everything and opens the Zenoh session. No thread runs yet. `lock` is that of the state directory.
 
         Raises:
             ConfigError: a rig, an endpoint or a certificate cannot be used.
@@ -136,6 +137,7 @@ class Daemon:
         self._ros_outputs = RosOutputs(publishers, config, self._worker)
         store = StateStore(config.state.directory, config.vehicle)
         self._scribe = Scribe(config.state.directory)
+        self._scribe.keep(lock, self._folder)
         self._rig = RigKeeper(config.state.directory, config.links, self._scribe)
         self._rig_answers = RigAnswers(self._keys, self._publish)
         own = (self._worker, self._budget, self._rig, self._publish, self._troubles, self._ros_outputs.show)
@@ -143,6 +145,8 @@ class Daemon:
         self._intake = Intake(config.limits, config.snippets.memory_bytes)
         told = (*own, *of_ros, self._rig_answers.troubles)
         snippets = _snippets_of(config)
+        if snippets is not None:
+            self._scribe.keep(snippets)
         self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *told, snippets=snippets)
         self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
         self._lidars = LidarEdges(config.lidar_edges, self._intake, self._worker, self._budget, self._rig)

@@ -1,31 +1,129 @@
-"""Locks the state directory, so that only one daemon uses it."""
+"""The state directory: locked, so that only one daemon uses it, and closed to other users of the machine."""
 
 from __future__ import annotations
 
 import fcntl
+import logging
+import os
+import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from coec.errors import UnavailableError
+from coec.adapters.files import durable
+from coec.errors import StateError, UnavailableError
+
+_log = logging.getLogger(__name__)
+
+LOCK = "lock"
+
+FORBIDDEN = 0o777 & ~durable.PRIVATE_FOLDER
+"""Permissions that nothing in the state directory may have: writing for the group, anything for other users."""
+
+OWN_FOLDERS = ("windows", "snippets", "evidence")
+"""Folders of the service in the state directory; other ones in it are left alone."""
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Makes the state directory if it does not exist, and locks it against other daemons within the block.
+def locked(folder: Path) -> Iterator[FolderLock]:
+    """Makes the state directory if it does not exist, locks it against other daemons within the block, and takes from
+    its files what other users of the machine may do with them.
 
     Raises:
         UnavailableError: the directory cannot be made or written, or another daemon uses it.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / "lock").open("w")
+        durable.make_folder(folder)
+        lock = FolderLock(folder)
     except OSError as error:
         text = f"state.directory {folder} cannot be made or written: {error.strerror}; see to its disk and its owner"
         raise UnavailableError(text) from error
-    with lock:
+    try:
+        tightened = close_to_others(folder)
+        if tightened:
+            text = f"{tightened} files and folders of {folder} were open to other users: these permissions were removed"
+            _log.warning(text)
+        yield lock
+    finally:
+        lock.release()
+
+
+class FolderLock:
+    """The lock of a state directory. It is one of its books (`scribe.Book`): if somebody has removed the directory and
+    made it again, the lock is taken again with the rest."""
+
+    def __init__(self, folder: Path) -> None:
+        """Takes the lock.
+
+        Raises:
+            OSError: the lock file cannot be made.
+            UnavailableError: another daemon has the lock.
+        """
+        self._path = folder / LOCK
+        self._descriptor = self._taken()
+
+    def flush(self) -> None:
+        """Takes the lock again if its file is not in the directory any more.
+
+        Raises:
+            StateError: the lock file cannot be made, or another daemon has the lock.
+        """
+        with suppress(FileNotFoundError):
+            if os.path.samestat(self._path.lstat(), os.fstat(self._descriptor)):
+                return
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            descriptor = self._taken()
         except OSError as error:
-            raise UnavailableError(f"state.directory {folder} is in use by another daemon") from error
-        yield
+            raise StateError(f"cannot write {self._path}: {error.strerror}") from error
+        except UnavailableError as error:
+            raise StateError(str(error)) from error
+        self.release()
+        self._descriptor = descriptor
+
+    def release(self) -> None:
+        """Gives the lock up."""
+        os.close(self._descriptor)
+
+    def _taken(self) -> int:
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+        descriptor = os.open(self._path, flags, durable.PRIVATE)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(descriptor)
+            raise UnavailableError(f"state.directory {self._path.parent} is in use by another daemon") from error
+        return descriptor
+
+
+def close_to_others(folder: Path) -> int:
+    """Takes the permissions `FORBIDDEN` from the state directory and what the service keeps in it, as an earlier
+    version of the service may have left them. Returns how many files and folders had some. Links, and what belongs to
+    another user, stay as they are."""
+    below = [folder / name for name in OWN_FOLDERS]
+    events = [path for path in _entries(folder / "evidence") if path.is_dir()]
+    places = [folder, *below]
+    for place in (folder, *below, *events):
+        places += [path for path in _entries(place) if place is not folder or not path.is_dir()]
+    return sum(_is_tightened(path) for path in places)
+
+
+def _entries(folder: Path) -> list[Path]:
+    with suppress(OSError):
+        return [] if folder.is_symlink() else sorted(folder.iterdir())
+    return []
+
+
+def _is_tightened(path: Path) -> bool:
+    """Whether a file or folder had permissions to take, and they were taken."""
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            status = os.fstat(descriptor)
+            mode = status.st_mode
+            own = status.st_uid == os.geteuid() and (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+            if own and mode & FORBIDDEN:
+                os.fchmod(descriptor, stat.S_IMODE(mode) & ~FORBIDDEN)
+                return True
+        finally:
+            os.close(descriptor)
+    return False

@@ -55,6 +55,7 @@ class Pair:
         of_rig = outside.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.unanswered == 0)
         questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, of_rig, outside.show)
         baseline = RigBaseline(pair, rig, config.state)
+        outside.scribe.keep(baseline)
         self._rig, self._vehicle, self._packed = rig, config.vehicle, config.state.packing == "lz4"
         plan = self._plan(pair, baseline.calibration)
         snippets = self._snippets_of(plan, outside, losses)

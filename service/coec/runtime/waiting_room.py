@@ -106,6 +106,8 @@ class WaitingRoom:
     def open(self, config: Config, outside: Outside) -> Mapping[str, AwaitedAnswers]:
         """Makes answers for the pairs that are still awaited in this configuration."""
         self._outside = outside
+        if self._asked:
+            outside.scribe.keep(self._kept)
         self.answers = {pair.name: AwaitedAnswers(pair, config.vehicle, outside) for pair in config.awaited}
         return self.answers
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -234,3 +235,101 @@ def test_whatever_is_refused_no_line_is_lost_torn_or_out_of_order(
             disk.refuses = ()
             log.flush()
             assert log_of(root / "log", []).load()[-1] == b"9"
+
+
+# --- links ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Path:
+    """A file that somebody would like to have overwritten."""
+    path = tmp_path / "other"
+    path.write_bytes(b"not yours")
+    return path
+
+
+@pytest.mark.fault("a link under the name of a temporary file", "it is removed; the file behind it is not written")
+@pytest.mark.parametrize("symbolic", [True, False], ids=["symbolic", "hard"])
+@pytest.mark.parametrize("name", ["f.new", "f.link", "f"])
+def test_a_replacement_writes_through_no_link(root: Path, other: Path, name: str, symbolic: bool) -> None:
+    if name == "f.link" and not symbolic:
+        return
+    link = root / name
+    link.symlink_to(other) if symbolic else link.hardlink_to(other)
+    durable.replace(root / "f", b"mine", root / "f.previous")
+    durable.replace(root / "f", b"mine too", root / "f.previous")
+    assert other.read_bytes() == b"not yours"
+    assert (root / "f").read_bytes() == b"mine too"
+    assert not (root / "f").is_symlink()
+    assert (root / "f.previous").read_bytes() == b"mine"
+    assert names(root) == ["f", "f.previous"]
+
+
+@pytest.mark.fault("a link in the place of a log", "the log is written again beside it; the file behind it is not")
+@pytest.mark.parametrize("before", [True, False], ids=["before the start", "meanwhile"])
+def test_a_log_writes_through_no_link(root: Path, other: Path, before: bool) -> None:
+    lines: list[bytes] = []
+    path = root / "log"
+    log = log_of(path, lines)
+    if before:
+        path.symlink_to(other)
+        assert log.load() == []
+    else:
+        write(log, lines, b"zero")
+        path.unlink()
+        path.symlink_to(other)
+    write(log, lines, b"one")
+    assert other.read_bytes() == b"not yours"
+    assert not path.is_symlink()
+    assert path.read_bytes() == b"".join(line + b"\n" for line in lines)
+
+
+@pytest.mark.parametrize("harm", ["removed", "replaced"])
+def test_a_log_that_somebody_else_removed_is_written_again_though_nothing_waits(root: Path, harm: str) -> None:
+    lines: list[bytes] = []
+    path = root / "log"
+    log = log_of(path, lines)
+    log.flush()
+    assert not path.exists(), "nothing was ever written"
+    write(log, lines, b"one")
+    if harm == "replaced":
+        (root / "copy").write_bytes(b"something else\n")
+        (root / "copy").replace(path)
+    else:
+        path.unlink()
+    log.flush()
+    assert path.read_bytes() == b"one\n"
+
+
+def test_a_part_is_gone_on_with_unless_it_is_a_link(root: Path, other: Path) -> None:
+    path = root / "f.part"
+    for data in (b"one ", b"two"):
+        with os.fdopen(durable.reopen(path), "a+b") as stream:
+            stream.write(data)
+    assert path.read_bytes() == b"one two"
+    for link in (path.symlink_to, path.hardlink_to):
+        path.unlink()
+        link(other)
+        with os.fdopen(durable.reopen(path), "a+b") as stream:
+            assert stream.tell() == 0
+            stream.write(b"mine")
+        assert (other.read_bytes(), path.read_bytes()) == (b"not yours", b"mine")
+
+
+@pytest.mark.fault("a umask that hides nothing", "files of the service are closed to other users from the beginning")
+def test_files_are_private_whatever_the_umask(root: Path) -> None:
+    before = os.umask(0)
+    try:
+        durable.make_folder(root / "a" / "b")
+        path = root / "a" / "b" / "f"
+        durable.replace(path, b"1")
+        log = log_of(root / "log", [b"one"])
+        log.add(b"one")
+        log.flush()
+        os.close(durable.reopen(root / "part"))
+        durable.replace(root / "told", b"1", mode=durable.BY_UMASK)
+    finally:
+        os.umask(before)
+    files = (path, root / "log", root / "part", root / "told")
+    assert [oct(path.stat().st_mode & 0o777) for path in files] == ["0o640"] * 3 + ["0o666"]
+    assert [oct(path.stat().st_mode & 0o777) for path in (root / "a", root / "a" / "b")] == ["0o750"] * 2

@@ -1,6 +1,7 @@
 """Windows on disk: exact round trip, readable by others, and nothing half-written under any kind of failure."""
 
 import hashlib
+import os
 import struct
 import subprocess
 import sys
@@ -784,3 +785,36 @@ def test_a_stamp_that_ros_cannot_hold_is_a_recording_error(tmp_path: Path, stamp
     with pytest.raises(RecordingError, match="stamp"):
         a_window(tmp_path / "w.mcap", [replace(pair, camera=replace(pair.camera, stamp_ns=stamp_ns))])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.fault("a link under the name of a window that is being recorded", "what lies behind it is not overwritten")
+@pytest.mark.parametrize("suffix", [".part", ".rewrite"])
+def test_a_window_is_not_written_through_a_link(tmp_path: Path, suffix: str) -> None:
+    other, path = tmp_path / "other", tmp_path / "front-1.mcap"
+    other.write_bytes(b"not yours")
+    if suffix != PART_SUFFIX:
+        a_window(path)
+    path.with_name(path.name + suffix).symlink_to(other)
+    if suffix == PART_SUFFIX:
+        a_window(path)
+    else:
+        write_result(path, a_result())
+    assert other.read_bytes() == b"not yours"
+    assert is_window(path)
+    assert not path.is_symlink()
+
+
+def test_a_window_is_closed_to_other_users_while_it_is_written_and_afterwards(tmp_path: Path) -> None:
+    before, modes, rig = os.umask(0), [], a_rig()
+    try:
+        path = tmp_path / "front-1.mcap"
+        writer = WindowWriter(path, rig, rig.T_camera_lidar_nominal, path.stem, CONFIGURATION, {})
+        modes.append(path.with_name(path.name + PART_SUFFIX).stat().st_mode & 0o777)
+        writer.add(a_pair(0))
+        writer.finish()
+        modes.append(path.stat().st_mode & 0o777)
+        write_result(path, a_result())
+        modes.append(path.stat().st_mode & 0o777)
+    finally:
+        os.umask(before)
+    assert modes == [0o640] * 3

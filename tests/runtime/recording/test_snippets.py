@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import logging
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -220,3 +221,18 @@ def test_a_stop_keeps_what_can_be_written_in_time(
     assert bench.losses.snapshot() == ({("window", "snippet_cut_short"): 1} if sweeps < 10 else {})
     (name,) = bench.ids
     assert opened(bench.store.path(name)).counts["/front/lidar/points"] == sweeps
+
+
+@pytest.mark.fault(
+    "the folder of snippets is removed under the running service", "the next snippet is recorded in a new one"
+)
+def test_snippets_that_somebody_removed_are_not_listed_and_the_next_one_is_recorded(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.record(snippet())
+    (before,) = bench.ids
+    shutil.rmtree(bench.folder)
+    bench.store.flush()
+    assert bench.ids == []
+    bench.record(snippet())
+    assert bench.ids == [before]
+    assert bench.store.path(before).exists()

@@ -12,7 +12,7 @@ from coec.calibration.rig import vehicle
 from coec.calibration.rig.vehicle import VehicleRig
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from coec.runtime.rig.rig_file import RigFile
+from coec.runtime.rig.rig_file import FILE, RigFile
 from driven_rig import STAR, Drive, Poses, pose_of
 from rigs import POSES, graph, with_moved
 
@@ -99,3 +99,18 @@ def test_pairs_that_join_one_after_the_other_find_what_was_known_of_them(tmp_pat
     assert grown is not None
     assert grown.before is not None
     assert set(grown.before.edges) == {edge.name for edge in graph(STAR).edges}
+
+
+@pytest.mark.parametrize("changed", [True, False], ids=["written in this run", "read at the start"])
+def test_a_file_that_somebody_removed_is_written_again(tmp_path: Path, changed: bool) -> None:
+    file = RigFile(tmp_path)
+    file.flush()
+    assert not (tmp_path / FILE).exists(), "there is nothing to remember"
+    file.remember(knocked().state)
+    file.flush()
+    before = (tmp_path / FILE).read_bytes()
+    if not changed:
+        file = RigFile(tmp_path)
+    (tmp_path / FILE).unlink()
+    file.flush()
+    assert (tmp_path / FILE).read_bytes() == before

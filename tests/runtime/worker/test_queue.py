@@ -19,7 +19,7 @@ from hypothesis.stateful import (
 )
 
 from coec.calibration.types import Reason
-from coec.runtime.worker.jobs import DEADLINE_S, Drawn, Fate, Job, JobOutcome, Kind, Prefetch
+from coec.runtime.worker.jobs import DEADLINE_S, Drawn, Fate, Job, JobOutcome, Kind, Prefetch, Underway
 from coec.runtime.worker.queue import BUSY, PREFETCHES_WAITING, STOPPING, SUPERSEDED, WAITING, JobQueue, Lane, Ticket
 
 ANSWER = Drawn(b"")
@@ -90,7 +90,7 @@ def test_numbers_are_never_used_again() -> None:
     assert len(set(numbers)) == 3
 
 
-def test_checks_go_first_then_windows_errands_prefetches_and_the_backlog() -> None:
+def test_checks_go_first_then_windows_errands_prefetches_the_backlog_and_commissionings() -> None:
     queue = asked(
         [a_job("old", live=False), a_job("picture", Kind.OVERLAY), a_job("baseline", Kind.COMMISSION), a_job("window")]
     )
@@ -101,7 +101,7 @@ def test_checks_go_first_then_windows_errands_prefetches_and_the_backlog() -> No
         order.append(subject_of(ticket))
         queue.sent(0.0)
         queue.answered(None if isinstance(ticket.work, Prefetch) else ANSWER, 0.0)
-    assert order == ["check", "window", "picture", "baseline", "prefetch", "old"]
+    assert order == ["check", "window", "picture", "prefetch", "old", "baseline"]
 
 
 def test_a_window_that_checks_have_kept_waiting_goes_before_them() -> None:
@@ -113,6 +113,63 @@ def test_a_window_that_checks_have_kept_waiting_goes_before_them() -> None:
         order.append(begin(queue, now_s))
         queue.answered(ANSWER, now_s)
     assert order == ["check 0", "window", "check 4", "check 8"]
+
+
+@pytest.mark.fault("`commission` while the pair is watched", "checks and windows go before every slice of it")
+def test_a_commissioning_goes_on_only_when_nothing_else_waits() -> None:
+    queue = asked([a_job("baseline", Kind.COMMISSION)])
+    assert queue.commissionings == {"front": None}
+    order = []
+    for number in range(1, 4):
+        order.append(begin(queue))
+        for other in (a_job(f"window {number}"), check(f"check {number}"), a_job(f"picture {number}", Kind.OVERLAY)):
+            queue.ask(other, 0.0)
+        queue.answered(Underway("spread", number, 10), 0.0)
+        assert queue.commissionings == {"front": Underway("spread", number, 10)}
+        for _ in range(3):
+            order.append(begin(queue))
+            queue.answered(ANSWER, 0.0)
+    order.append(begin(queue))
+    queue.answered(ANSWER, 9.0)
+    slices = [f"{what} {number}" for number in (1, 2, 3) for what in ("baseline", "check", "window", "picture")]
+    assert order == [name if name[:8] != "baseline" else "baseline" for name in slices] + ["baseline"]
+    assert queue.commissionings == {}
+    assert {job.subject: o.elapsed_s for job, o in queue.drain()}["baseline"] == 9.0
+
+
+def test_a_pair_has_one_commissioning_and_those_of_several_pairs_follow_each_other() -> None:
+    queue = asked([a_job("front", Kind.COMMISSION), a_job("left", Kind.COMMISSION, "left")])
+    queue.ask(a_job("waiting already", Kind.COMMISSION), 0.0)
+    assert begin(queue) == "front"
+    queue.ask(a_job("begun already", Kind.COMMISSION), 0.0)
+    queue.answered(Underway("windows", 1, 8), 0.0)
+    assert ends(queue) == [("waiting already", Fate.FAILED, "busy"), ("begun already", Fate.FAILED, "busy")]
+    assert begin(queue) == "front", "it is ended before the next one begins"
+    queue.answered(ANSWER, 0.0)
+    queue.ask(a_job("front again", Kind.COMMISSION), 0.0)
+    assert [begin(queue), queue.commissionings] == ["left", {"front": None, "left": None}]
+
+
+def test_a_commissioning_begins_again_when_the_worker_dies_of_something_else() -> None:
+    queue = asked([a_job("baseline", Kind.COMMISSION)])
+    begin(queue)
+    queue.answered(Underway("spread", 4, 10), 0.0)
+    queue.ask(check("deadly"), 0.0)
+    assert begin(queue) == "deadly"
+    queue.died("was ended by signal 9", 0.0)
+    assert queue.commissionings == {"front": None}
+    assert begin(queue) == "baseline"
+    queue.died("was ended by signal 9", 0.0)
+    assert ends(queue) == [("deadly", Fate.FAILED, "worker_failed"), ("baseline", Fate.FAILED, "worker_failed")]
+
+
+def test_a_commissioning_that_never_comes_to_its_end_is_given_up() -> None:
+    queue = asked([a_job("baseline", Kind.COMMISSION)])
+    begin(queue)
+    queue.answered(Underway("spread", 1, 10), 0.0)
+    queue.expire(DEADLINE_S[Kind.COMMISSION])
+    assert ends(queue) == [("baseline", Fate.LATE, "deadline_passed")]
+    assert (queue.commissionings, queue.take(DEADLINE_S[Kind.COMMISSION])) == ({}, None)
 
 
 def test_the_newest_checks_and_windows_of_a_pair_stay_and_pairs_do_not_push_each_other_out() -> None:
@@ -176,7 +233,7 @@ def test_a_window_that_could_not_be_sent_has_had_no_attempt() -> None:
 
 @pytest.mark.parametrize("kind", [Kind.CHECK, Kind.OVERLAY, Kind.COMMISSION, Kind.REGISTER])
 def test_other_work_is_done_once_or_not_at_all_and_sent_at_most_twice(kind: Kind) -> None:
-    queue = asked([a_job("begun", kind), a_job("unsent", kind)])
+    queue = asked([a_job("begun", kind), a_job("unsent", kind, "left")])
     begin(queue)
     queue.died("was ended by signal 9", 0.0)
     assert ends(queue) == [("begun", Fate.FAILED, "worker_failed")]
@@ -315,7 +372,7 @@ class Followed:
             return Lane.CHECK
         if self.job.kind is Kind.SOLVE:
             return Lane.LIVE if self.job.live else Lane.BACKLOG
-        return Lane.ERRAND
+        return Lane.COMMISSIONING if self.job.kind is Kind.COMMISSION else Lane.ERRAND
 
     @property
     def due_s(self) -> float:
@@ -360,9 +417,12 @@ class QueueMachine(RuleBasedStateMachine):
             self.queue.ask(made.job, self.now_s)
             room = [other for other in self.waiting if (other.lane, other.job.pair) == (made.lane, pair)]
             full = len(room) == WAITING[made.lane]
+            hand = self.hand
+            if made.lane is Lane.COMMISSIONING and hand is not None and hand.lane is made.lane and not hand.outcomes:
+                full |= hand.job.pair == pair
             if self.stopped:
                 self.expect(made, Fate.FAILED, STOPPING.code)
-            elif full and made.lane in (Lane.ERRAND, Lane.BACKLOG):
+            elif full and made.lane in (Lane.ERRAND, Lane.BACKLOG, Lane.COMMISSIONING):
                 self.expect(made, Fate.FAILED, BUSY.code)
             else:
                 if full:
@@ -429,6 +489,17 @@ class QueueMachine(RuleBasedStateMachine):
         if not job.outcomes:
             self.expect(job, Fate.FAILED if refused else Fate.RESULT, reason.code if refused else None)
 
+    @precondition(lambda self: self.hand is not None and self.hand.lane is Lane.COMMISSIONING and self.was_sent)
+    @rule()
+    def underway(self) -> None:
+        """A slice of a commissioning is done."""
+        job, self.hand = self.hand, None
+        assert job is not None
+        self.queue.answered(Underway("spread", 1, 10), self.now_s)
+        if not job.outcomes:
+            job.unsent = 0
+            self.waiting.insert(0, job)
+
     @rule(why=st.sampled_from(["died", "said what nobody asked"]))
     def died(self, why: str) -> None:
         self.queue.died(why, self.now_s)
@@ -485,7 +556,7 @@ class QueueMachine(RuleBasedStateMachine):
         if self.check_was_fatal:
             order = [Lane.LIVE, Lane.CHECK, Lane.ERRAND]
         if not self.prefetches:
-            order.append(Lane.BACKLOG)
+            order += [Lane.BACKLOG, Lane.COMMISSIONING]
         return next((job for lane in order for job in self.waiting if job.lane is lane), None)
 
     def prefetch_is_next(self) -> bool:
@@ -520,7 +591,8 @@ class QueueMachine(RuleBasedStateMachine):
         for job in self.jobs:
             pending = job in waiting or (job is self.hand and not job.outcomes)
             assert len(job.outcomes) == (0 if pending else 1)
-            assert job.begun <= (self.attempts if job.job.kind is Kind.SOLVE else 1)
+            if job.job.kind is not Kind.COMMISSION:
+                assert job.begun <= (self.attempts if job.job.kind is Kind.SOLVE else 1)
 
     @invariant()
     def the_room_is_bounded(self) -> None:

@@ -20,10 +20,12 @@ from coec.adapters.files.conversions import result_of
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Reason
 from coec.config import CalibrationConfig, WorkerConfig
+from coec.runtime.api.status import worker_status_of
 from coec.runtime.worker import jobs, link
 from coec.runtime.worker.child import Child, ChildError, Fault
 from coec.runtime.worker.costs import Cost
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Fate, Job, JobOutcome, Kind, Solved
+from coec.runtime.worker.queue import BUSY
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas.base import to_msgpack
 from estimates import RIG, estimate
@@ -195,6 +197,47 @@ def test_each_kind_comes_back_with_its_answer(tmp_path: Path) -> None:
         assert (status.starts, status.faults, status.losses) == (1, {}, {})
         assert status.outcomes == {Fate.RESULT: 4}
         assert status.rss_bytes > 0
+
+
+def test_other_work_is_done_between_the_slices_of_a_commissioning(tmp_path: Path) -> None:
+    with running("late", tmp_path, at="check") as it:
+        it.check("c")
+        wait_until(lambda: it.worker.status().state is WorkerState.BUSY, "the check")
+        windows = [Path("a"), Path("b"), Path("c")]
+        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig")))
+        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig again")))
+        assert it.failure() == ("rig again", BUSY)
+        assert it.worker.commissioning("front") == "waiting for the worker"
+        assert it.worker.commissioning("rear") is None
+        assert worker_status_of(it.worker).commissioning == {"front": "waiting for the worker"}
+        for name in ("w1", "w2"):
+            it.solve(name)
+        (tmp_path / LET_GO).touch()
+        assert [it.answer()[0] for _ in range(4)] == ["c", "w1", "w2", "rig"]
+        assert (it.worker.commissioning("front"), it.worker.status().starts) == (None, 1)
+        assert it.worker.status().outcomes == {Fate.RESULT: 4, Fate.FAILED: 1}
+
+
+@pytest.mark.fault("the worker is replaced during a commissioning", "it begins again with the next worker")
+def test_a_commissioning_outlives_a_worker_that_dies_of_something_else(tmp_path: Path) -> None:
+    with waiting("crash-once", tmp_path, at="check") as it:
+        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig")))
+        it.check("c")
+        it.worker.start()
+        name, reason = it.failure()
+        assert (name, reason.code) == ("c", "worker_failed")
+        name, rig = it.answer()
+        assert (name, rig.windows, it.worker.status().starts) == ("rig", 2, 2)
+
+
+@pytest.mark.fault("the worker dies of a commissioning", "it ends with the reason; the worker is replaced")
+def test_a_commissioning_that_kills_the_worker_has_failed(tmp_path: Path) -> None:
+    with running("crash-once", tmp_path, at="commission") as it:
+        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, [Path("a")], it.done("rig")))
+        name, reason = it.failure()
+        assert (name, reason.code) == ("rig", "worker_failed")
+        it.check("c")
+        assert it.answer()[0] == "c"
 
 
 def test_a_refusal_is_an_answer_not_a_fault(tmp_path: Path) -> None:

@@ -4,11 +4,16 @@ When a function here returns, its effect is on the disk: the data of a file by f
 the folder. If the system refuses something, its `OSError` is raised. Then the files are as they were, or, if only the
 last fsync failed, as they were meant to be, never in between. Nothing here is safe for use from several threads at
 once.
+
+Whatever the umask, files and folders that are made here are closed to other users of the machine from the beginning,
+and nothing here writes through a symbolic link: a file of the service's own name that somebody has put there is
+replaced.
 """
 
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -18,8 +23,12 @@ FRESH_SUFFIX = ".new"
 """Suffix of a file that is about to replace another. One that is found at a start is useless; the next replacement
 overwrites it."""
 
-_MODE = 0o666
-"""Permissions of a new file before the umask of the process, as `open` uses them."""
+PRIVATE, PRIVATE_FOLDER = 0o640, 0o750
+"""Most permissions of the service's own files and folders: windows show streets, and the state decides what is served.
+The umask of the process may take further ones away."""
+
+BY_UMASK = 0o666
+"""Permissions of files that a command writes for its user: as the umask says."""
 
 MAX_ASIDE = 8
 """Most files of one name that are kept aside. The first ones tell most, and a disk that damages every file must not be
@@ -29,17 +38,18 @@ _LINK_SUFFIX = ".link"
 """Suffix of the second name of a file that is about to become the previous copy."""
 
 
-def replace(path: Path, data: bytes, previous: Path | None = None) -> None:
+def replace(path: Path, data: bytes, previous: Path | None = None, mode: int = PRIVATE) -> None:
     """Make `data` the whole content of a file, atomically: at any moment the file has either the old or the new
     content.
 
     Args:
         path: the file; need not exist.
         previous: path that receives the replaced file, if there was one; None: it is not kept.
+        mode: permissions of the new file, from which the umask takes its own.
     """
     fresh, link = _beside(path, FRESH_SUFFIX), _beside(path, _LINK_SUFFIX)
     try:
-        _write_new(fresh, data)
+        _write_new(fresh, data, mode)
         if previous is not None:
             link.unlink(missing_ok=True)
             with suppress(FileNotFoundError):
@@ -51,6 +61,23 @@ def replace(path: Path, data: bytes, previous: Path | None = None) -> None:
         for leftover in (fresh, link):
             with suppress(OSError):
                 leftover.unlink(missing_ok=True)
+
+
+def create(path: Path, mode: int = PRIVATE) -> int:
+    """Create an empty file in place of whatever has its name, and return its descriptor, for writing. A link of that
+    name is removed and not followed: who may write the folder could otherwise have another file overwritten."""
+    path.unlink(missing_ok=True)
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
+
+
+def reopen(path: Path, mode: int = PRIVATE) -> int:
+    """Open a file to read it and to append to it, and return its descriptor; it is created if it does not exist. If
+    the name is a link, or another name of the same file exists, an empty file takes its place."""
+    with suppress(FileNotFoundError):
+        status = path.lstat()
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
+            path.unlink()
+    return os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
 
 
 def publish(stream: BinaryIO, temporary: Path, final: Path) -> None:
@@ -94,12 +121,12 @@ def remove_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and its missing parents."""
+    """Make a folder and its missing parents, with the permissions `PRIVATE_FOLDER`."""
     if folder.is_dir():
         return
     make_folder(folder.parent)
     with suppress(FileExistsError):
-        folder.mkdir()
+        folder.mkdir(PRIVATE_FOLDER)
     sync_folder(folder)  # raises if the name belongs to something that is no folder
     sync_folder(folder.parent)
 
@@ -118,7 +145,8 @@ class Log:
 
     The log knows how many bytes of the file are sound. Anything behind them, left by a failed write of this process or
     by the end of an earlier one, is cut off before more is written. Lines that could not be written wait and go to the
-    disk in order with the next.
+    disk in order with the next. If somebody else has removed, replaced or truncated the file, the next `flush` rewrites
+    it, even if no line waits.
     """
 
     def __init__(self, path: Path, limit: int, content: Callable[[], Iterable[bytes]]) -> None:
@@ -134,6 +162,7 @@ class Log:
         self._limit = limit
         self._content = content
         self._sound_bytes = 0
+        self._identity: tuple[int, int] | None = None
         self._lines = 0
         self._longest = 2 * limit
         self._waiting: list[bytes] = []
@@ -154,6 +183,7 @@ class Log:
         self._anew = True
         try:
             data = self._path.read_bytes()
+            self._identity = _identity_of(self._path)
         except FileNotFoundError:
             data = b""
         self._anew = False
@@ -179,11 +209,11 @@ class Log:
         Raises:
             OSError: they could not be written; they wait for the next call.
         """
-        if not self.waiting:
-            return
         too_long = self._lines + len(self._waiting) > self._longest
-        if self._anew or too_long or self._was_cut():
+        if self._anew or too_long or self._is_lost():
             self._rewrite()
+            return
+        if not self._waiting:
             return
         data = _joined(self._waiting)
         self._write(data)
@@ -199,21 +229,27 @@ class Log:
         self._anew = False
         self._waiting.clear()
         self._sound_bytes, self._lines = len(data), len(lines)
+        self._identity = _identity_of(self._path)
         self._longest = 2 * max(self._limit, len(lines))
 
-    def _was_cut(self) -> bool:
-        """Whether somebody else has truncated or removed the file."""
+    def _is_lost(self) -> bool:
+        """Whether somebody else has truncated, replaced or removed the file."""
         try:
-            return self._path.stat().st_size < self._sound_bytes
+            status = self._path.lstat()
         except FileNotFoundError:
-            return self._sound_bytes > 0
+            return self._identity is not None
+        # The number of a file that was removed may be that of a link in its place.
+        own = stat.S_ISREG(status.st_mode) and (status.st_dev, status.st_ino) == self._identity
+        return not own or status.st_size < self._sound_bytes
 
     def _write(self, data: bytes) -> None:
         """Write behind the sound bytes. If that fails, truncate to them; if that fails, too, the next write does it."""
-        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, _MODE)
+        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
         try:
+            status = os.fstat(descriptor)
+            self._identity = (status.st_dev, status.st_ino)
             try:
-                if os.fstat(descriptor).st_size > self._sound_bytes:
+                if status.st_size > self._sound_bytes:
                     os.ftruncate(descriptor, self._sound_bytes)
                 _write_at(descriptor, data, self._sound_bytes)
                 os.fsync(descriptor)
@@ -228,8 +264,14 @@ class Log:
             self._named = True
 
 
-def _write_new(path: Path, data: bytes) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, _MODE)
+def _identity_of(path: Path) -> tuple[int, int]:
+    """Device and number of a file, or of a link in its place."""
+    status = path.lstat()
+    return status.st_dev, status.st_ino
+
+
+def _write_new(path: Path, data: bytes, mode: int) -> None:
+    descriptor = create(path, mode)
     try:
         _write_at(descriptor, data, 0)
         os.fsync(descriptor)

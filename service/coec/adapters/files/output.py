@@ -81,7 +81,7 @@ def replace(path: Path, data: bytes) -> Path:
         real = path.resolve()
         real.parent.mkdir(parents=True, exist_ok=True)
         mode = real.stat().st_mode if real.exists() else None
-        durable.replace(real, data)
+        durable.replace(real, data, mode=durable.BY_UMASK)
         if mode is not None:
             real.chmod(mode)
     except OSError as error:

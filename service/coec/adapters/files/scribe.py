@@ -3,6 +3,9 @@
 A thread that has noted something tells the scribe and goes on. If the disk is full, read-only or slow, only the scribe
 waits. It tries again every second, together with whatever was noted meanwhile. A thread that has to know can ask
 whether everything is on the disk; it waits no longer than a healthy disk needs.
+
+Somebody may remove the folder and make it again while the service runs. Then all books are written again, from what
+each has in memory: nothing counts as being on the disk because it was written into a folder that is gone.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import logging
 import os
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -39,7 +43,8 @@ class Book(Protocol):
     """Something that can be written to the disk."""
 
     def flush(self) -> None:
-        """Write what was noted since the last time; may take as long as the disk does.
+        """Write what was noted since the last time, and everything if the file is not there any more; may take as
+        long as the disk does.
 
         Raises:
             StateError: it could not be written; the next call tries again.
@@ -54,6 +59,9 @@ class Scribe:
         self._folder = folder
         self._condition = threading.Condition()
         self._due: dict[Book, None] = {}
+        self._kept: dict[Book, None] = {}
+        self._report_replaced: list[Callable[[str], object]] = []
+        self._pin = _Pin.of(folder)
         self._asked = self._written = 0
         self._begun_s: float | None = None
         self._failure: Reason | None = None
@@ -63,8 +71,21 @@ class Scribe:
         """Have these books written soon, in this order, because something was noted in them."""
         with self._condition:
             self._due.update(dict.fromkeys(books))
+            self._kept.update(dict.fromkeys(books))
             self._asked += 1
             self._condition.notify_all()
+
+    def keep(self, *books: Book) -> None:
+        """Have these books written, in this order and after all earlier ones, whenever the folder was removed and made
+        again. Those that were ever written are kept anyway."""
+        with self._condition:
+            for book in books:
+                self._kept.pop(book, None)
+                self._kept[book] = None
+
+    def on_replaced(self, report: Callable[[str], object]) -> None:
+        """Call `report` with one sentence on the scribe's thread, before the books are written into another folder."""
+        self._report_replaced.append(report)
 
     def has_written(self) -> bool:
         """Whether everything noted before this call is on the disk. Waits at most `PATIENCE_S`, and not at all if the
@@ -92,15 +113,18 @@ class Scribe:
     def write_due(self) -> None:
         """Write the books that are due. For the scribe's own thread, or for use without a thread."""
         with self._condition:
+            self._begun_s = time.monotonic()
+        self._notice_replacement()
+        with self._condition:
             books, number = tuple(self._due), self._asked
             self._due.clear()
-            self._begun_s = time.monotonic()
         failed: dict[Book, StateError] = {}
         for book in books:
             try:
                 book.flush()
             except StateError as error:
                 failed[book] = error
+        self._notice_replacement()  # while the books were written: then they have to be written again
         with self._condition:
             self._begun_s = None
             self._due = {**dict.fromkeys(failed), **self._due}
@@ -111,8 +135,32 @@ class Scribe:
                 self._failure, self._written = None, number
             self._condition.notify_all()
 
+    def _notice_replacement(self) -> None:
+        """Make all books due if the folder is another one than before."""
+        try:
+            there = self._folder.stat()
+        except OSError:
+            return  # the books cannot be written either, and say so
+        if self._pin is not None and self._pin.holds(there):
+            return
+        before, self._pin = self._pin, _Pin.of(self._folder)
+        if before is None:
+            return
+        text = (
+            f"The folder {self._folder} was removed or replaced while the service ran. State, history, checks, events "
+            "and baselines are written again from memory; recordings, and pictures of events, from before are gone."
+        )
+        _log.warning(text)
+        for report in self._report_replaced:
+            report(text)
+        with self._condition:
+            self._due = {**self._kept, **self._due}
+            self._asked += 1
+
     def look(self) -> None:
-        """See whether the disk has room. For the scribe's own thread, because on a disk that hangs even this waits."""
+        """See whether the disk has room, and whether the folder is still the same. For the scribe's own thread, because
+        on a disk that hangs even this waits."""
+        self._notice_replacement()
         try:
             found = os.statvfs(self._folder)
         except OSError as error:
@@ -145,3 +193,26 @@ class Scribe:
         self.thread.request_stop()
         with self._condition:
             self._condition.notify_all()
+
+
+class _Pin:
+    """An open folder. As long as it is open, no other folder gets the same number, even if it has been removed."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    @classmethod
+    def of(cls, folder: Path) -> _Pin | None:
+        """None if there is no such folder."""
+        try:
+            return cls(os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC))
+        except OSError:
+            return None
+
+    def holds(self, status: os.stat_result) -> bool:
+        """Whether this is the status of the folder."""
+        return os.path.samestat(status, os.fstat(self._descriptor))
+
+    def __del__(self) -> None:
+        """Closes the folder."""
+        os.close(self._descriptor)

@@ -72,6 +72,10 @@ class StateFile:
                 return LoadedState(body, tuple(damage))
         return LoadedState(None, tuple(damage))
 
+    def exists(self) -> bool:
+        """Whether there is a current copy, good or not."""
+        return self._path.exists()
+
     def distrust(self, suffix: str = BROKEN) -> None:
         """Call this if the loaded body, or a part of it, turns out to be unusable: the copy that it came from is kept
         aside under `suffix` and does not become the previous copy. `BROKEN` outweighs the other suffixes."""

@@ -3,9 +3,11 @@ coec."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from coec.adapters.files import durable
 from coec.adapters.mcap.chunk_writer import ChunkWriter
 from coec.adapters.mcap.ros_channels import CDR, RosChannel
 from coec.adapters.ros.topics import Frame, FrameTopics, PairTopics, TopicMessage
@@ -53,7 +55,7 @@ def write_messages(path: Path, items: Iterable[TopicMessage]) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    with path.open("wb") as stream:
+    with os.fdopen(durable.create(path, durable.BY_UMASK), "wb") as stream:
         writer = ChunkWriter(stream)
         channels: dict[str, int] = {}
         for sequence, message in enumerate(items):

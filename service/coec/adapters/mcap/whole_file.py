@@ -33,7 +33,7 @@ class _HashingFile(io.BufferedWriter):
     """Hashes all bytes written. It must only be appended to."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path, "wb"))
+        super().__init__(io.FileIO(durable.create(path), "wb"))
         self.sha256 = hashlib.sha256()
 
     def write(self, data: Any, /) -> int:

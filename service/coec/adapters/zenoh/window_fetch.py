@@ -7,6 +7,7 @@ another process on another day, goes on from there, and pieces of two versions o
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from typing import Final
 
 import zenoh
 
+from coec.adapters.files import durable
 from coec.adapters.zenoh.client import ask_one
 from coec.errors import CoecError, NotFoundError, OutputError, RemoteError
 from coec.schemas.base import from_json
@@ -106,7 +108,7 @@ def _whole(
 ) -> bool:
     """Completes the part that is there; False if the result does not have the promised hash."""
     part.parent.mkdir(parents=True, exist_ok=True)
-    with part.open("a+b") as file:
+    with os.fdopen(durable.reopen(part), "a+b") as file:
         if file.tell() > info.size_bytes:
             file.truncate(0)
         file.seek(0)

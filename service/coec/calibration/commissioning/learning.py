@@ -10,6 +10,7 @@ where the rig has been. Moves are seeded, so the same windows give the same base
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import radians, sqrt
 
@@ -35,10 +36,10 @@ from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, 
 from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
 from coec.calibration.monitor.neighbourhood import POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import scene_baseline
-from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
+from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence, Step, Steps, run_to_end
 from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig
-from coec.errors import CalibrationError
+from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 
@@ -131,21 +132,62 @@ def commission(
             extrinsic is wrong.
     """
     heard = progress or Silence()
-    whole = _merged(windows)
+    steps = commission_in_steps(
+        windows,
+        depth,
+        images,
+        config,
+        sensors=sensors,
+        reference=reference,
+        false_alarm_rate=false_alarm_rate,
+        progress=heard,
+    )
+    return run_to_end(steps, heard)
+
+
+def commission_in_steps(
+    windows: Sequence[Window],
+    depth: DepthModel,
+    images: ImageReader,
+    config: CalibrationConfig,
+    *,
+    sensors: dict[str, str],
+    reference: Matrix4 | None = None,
+    false_alarm_rate: float = FALSE_ALARM_RATE,
+    progress: Progress | None = None,
+) -> Steps[Baseline]:
+    """The same, with a pause after every step, so that whoever commissions can do other work in between. The longest
+    step is one calibration of half of the pairs, or the preparation of the edges of all of them. `depth` should keep
+    `MAX_PAIRS` maps, because every pair is used many times. `progress` receives what happens within a step.
+
+    Raises:
+        CalibrationError: as `commission`.
+    """
+    whole, window_count = _merged(windows), len(windows)
+    del windows  # most of their pairs are not needed, and a pause may be long
     rig = whole.rig
     right = rig.T_camera_lidar_nominal if reference is None else reference
-    evidence = gather(sight_of(replace(whole, T_camera_lidar_start=right), depth, images, config, heard), FAR_RAD)
-    rotation, pose = _accuracies(evidence, right, heard)
+    for number, pair in enumerate(whole.pairs, start=1):
+        with suppress(DecodeError):  # whoever needs the depth reports that there is none
+            depth.infer(pair.camera)
+        yield Step("depth", number, len(whole.pairs))
+    sight = sight_of(replace(whole, T_camera_lidar_start=right), depth, images, config, progress or Silence())
+    yield Step("edges", 1, 2)
+    evidence = gather(sight, FAR_RAD)
+    yield Step("edges", 2, 2)
+    rotation, pose = yield from _accuracies(evidence, right)
     _check(rotation)
-    checks = _Checks(evidence, right, config, Expected(rotation.expected, pose.expected), heard)
-    clean = checks.left_out(rotation, pose, "right", CHECKS)
-    moved = {name: checks.moved(turn_rad, shift_m, name, CHECKS) for name, turn_rad, shift_m in MOVES}
-    far = checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS)
+    checks = _Checks(evidence, right, config, Expected(rotation.expected, pose.expected))
+    clean = yield from checks.left_out(rotation, pose, "right", CHECKS)
+    moved: dict[str, list[Check]] = {}
+    for name, turn_rad, shift_m in MOVES:
+        moved[name] = yield from checks.moved(turn_rad, shift_m, name, CHECKS)
+    far = yield from checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS)
     known_by = _known_by(len(evidence.pairs))
     monitor = _monitor_limits(clean, moved, far, rotation, pose, false_alarm_rate, known_by)
     accuracy = rotation if config.search.dof == ROTATION_DOF else pose
     expected = se3.perturb(right, accuracy.expected)
-    limits = verdict_limits(whole, right, expected, depth, images, config, heard)
+    limits = yield from verdict_limits(whole, right, expected, depth, images, config)
     return Baseline(
         pair=rig.pair,
         T_camera_lidar=right,
@@ -156,7 +198,7 @@ def commission(
         monitor=monitor,
         scene=scene_baseline(evidence.scenes),
         false_alarm_rate=false_alarm_rate,
-        windows=len(windows),
+        windows=window_count,
         pairs=len(evidence.pairs),
         detected={
             name: float(np.mean([opinion(seen, rotation, pose, monitor) is Opinion.FLAGGED for seen in seen_after]))
@@ -170,7 +212,7 @@ def commission(
 
 def learn_accuracy(evidence: CheckInput, right: Matrix4) -> tuple[Accuracy, Accuracy]:
     """How checks over three and over six degrees of freedom lie about the right pose (4, 4)."""
-    return _accuracies(evidence, right, Silence())
+    return run_to_end(_accuracies(evidence, right), Silence())
 
 
 def learn_limits(
@@ -178,12 +220,15 @@ def learn_limits(
 ) -> MonitorLimits:
     """The limits of checks for a false-alarm rate."""
     rotation, pose = accuracies
-    checks = _Checks(evidence, right, config, Expected(rotation.expected, pose.expected), Silence())
-    moved = {name: checks.moved(turn_rad, shift_m, name, CHECKS) for name, turn_rad, shift_m in MOVES[::3]}
+    checks = _Checks(evidence, right, config, Expected(rotation.expected, pose.expected))
+    moved = {
+        name: run_to_end(checks.moved(turn_rad, shift_m, name, CHECKS), Silence())
+        for name, turn_rad, shift_m in MOVES[::3]
+    }
     return _monitor_limits(
-        checks.left_out(rotation, pose, "right", CHECKS),
+        run_to_end(checks.left_out(rotation, pose, "right", CHECKS), Silence()),
         moved,
-        checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS),
+        run_to_end(checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS), Silence()),
         rotation,
         pose,
         rate,
@@ -204,7 +249,7 @@ def _merged(windows: Sequence[Window]) -> Window:
     return replace(windows[0], pairs=tuple(pairs))
 
 
-def _accuracies(evidence: CheckInput, right: Matrix4, heard: Progress) -> tuple[Accuracy, Accuracy]:
+def _accuracies(evidence: CheckInput, right: Matrix4) -> Steps[tuple[Accuracy, Accuracy]]:
     """The accuracies over three and six degrees of freedom: the bias from all pairs, the spread of one pair from checks
     of halves of them."""
     count = len(evidence.pairs)
@@ -213,7 +258,7 @@ def _accuracies(evidence: CheckInput, right: Matrix4, heard: Progress) -> tuple[
     of_halves = []
     for number, half in enumerate(halves, start=1):
         of_halves.append(check_at(evidence.of(half), right))
-        heard.step("spread", number, len(halves))
+        yield Step("spread", number, len(halves))
     at_rotation = np.array([seen.offset_rotation for seen in of_halves])
     at_pose = np.array([seen.offset_pose for seen in of_halves])
     # The mean of k of n pairs varies about the mean of all by 1/k - 1/n of the variance of one pair.
@@ -300,19 +345,18 @@ class _Checks:
         right: Matrix4,
         config: CalibrationConfig,
         expected: Expected,
-        heard: Progress,
     ) -> None:
         self._evidence = evidence
         self._right = right
         self._config = config
         self._expected = expected
-        self._heard = heard
 
-    def moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[Check]:
+    def moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> Steps[list[Check]]:
         """`count` checks after a turn and a shift."""
-        return [seen for _, seen in self._moved(turn_rad, shift_m, name, count)]
+        checks = yield from self._moved(turn_rad, shift_m, name, count)
+        return [seen for _, seen in checks]
 
-    def _moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[tuple[CheckInput, Check]]:
+    def _moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> Steps[list[tuple[CheckInput, Check]]]:
         rng = np.random.default_rng([SEED, round(turn_rad * 1e6), round(shift_m * 1e6)])
         pairs = len(self._evidence.pairs)
         size = min(CHECK_PAIRS, pairs - 1)
@@ -325,16 +369,17 @@ class _Checks:
             moved = se3.perturb(self._right, xi)
             part = self._evidence.of(indices)
             seen.append((part, check_at(part, moved, self._expected)))
-            self._heard.step(name, number, count)
+            yield Step(name, number, count)
         return seen
 
-    def left_out(self, rotation: Accuracy, pose: Accuracy, name: str, count: int) -> list[_LeftOut]:
+    def left_out(self, rotation: Accuracy, pose: Accuracy, name: str, count: int) -> Steps[list[_LeftOut]]:
         """`count` checks at the right pose, equally many in every block of time, compared with the bias that the other
         blocks show. With too few pairs for that, the checks include pairs from which the bias was learned."""
         pairs = len(self._evidence.pairs)
         blocks = [block.tolist() for block in np.array_split(np.arange(pairs), FOLDS)]
         if min(len(block) for block in blocks) < MIN_PAIRS:
-            return [self._against(part, seen, rotation, pose) for part, seen in self._moved(0.0, 0.0, name, count)]
+            checks = yield from self._moved(0.0, 0.0, name, count)
+            return [self._against(part, seen, rotation, pose) for part, seen in checks]
         rng = np.random.default_rng([SEED, pairs])
         found: list[_LeftOut] = []
         for fold, block in enumerate(blocks):
@@ -348,7 +393,7 @@ class _Checks:
                 part = self._evidence.of(block[first : first + size])
                 seen = check_at(part, self._right, Expected(of_rotation.expected, of_pose.expected))
                 found.append(self._against(part, seen, of_rotation, of_pose))
-                self._heard.step(name, len(found), count)
+                yield Step(name, len(found), count)
         return found
 
     def _against(self, part: CheckInput, seen: Check, rotation: Accuracy, pose: Accuracy) -> _LeftOut:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.calibrator import calibrate
-from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
+from coec.calibration.ports import DepthModel, ImageReader, Silence, Step, Steps
 from coec.calibration.types import Estimate, Matrix4, Window
 from coec.config import CalibrationConfig, VerdictConfig
 from coec.errors import CalibrationError
@@ -47,9 +47,9 @@ def verdict_limits(
     depth: DepthModel,
     images: ImageReader,
     config: CalibrationConfig,
-    heard: Progress,
-) -> dict[str, float]:
-    """Learned limits, by the names of `VerdictConfig`; those about which nothing was learned are absent.
+) -> Steps[dict[str, float]]:
+    """Learned limits, by the names of `VerdictConfig`; those about which nothing was learned are absent. A step is one
+    calibration.
 
     Args:
         window: all pairs.
@@ -71,10 +71,11 @@ def verdict_limits(
         try:
             estimate = calibrate(tried, depth, images, _astray(config) if astray else config, Silence())
         except CalibrationError:
-            continue
-        apart_rad = se3.rotation_angle_rad(estimate.optimum.T_camera_lidar @ se3.inverse(expected))
-        (near if apart_rad < RIGHT_RAD else lost).append(estimate)
-        heard.step("verdicts", number, 2 * SOLVES)
+            pass
+        else:
+            apart_rad = se3.rotation_angle_rad(estimate.optimum.T_camera_lidar @ se3.inverse(expected))
+            (near if apart_rad < RIGHT_RAD else lost).append(estimate)
+        yield Step("verdicts", number, 2 * SOLVES)
     return learned(near, lost) if near and lost else {}
 
 

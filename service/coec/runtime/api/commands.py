@@ -215,7 +215,12 @@ class Commands:
         return self._acknowledge(name, code, text, window_id=window_id)
 
     def _commission(self) -> Acknowledgement:
-        """Has the worker learn the baseline from the windows that agree with what is served."""
+        """Has the worker learn the baseline from the windows that agree with what is served. A pair has one
+        commissioning at a time; those of several pairs are done one after the other."""
+        reached = self._questions.commissioning
+        if reached is not None:
+            text = f"The rig is being commissioned already ({reached}); `history` will say how it went."
+            return self._acknowledge("commission", "commissioning_underway", text, accepted=False)
         pose = self._store.state.T_camera_lidar
         agreeing = [
             self._folder.path(result.window_id)
@@ -230,7 +235,10 @@ class Commands:
             return self._acknowledge("commission", "too_few_windows", text, accepted=False)
         done = partial(self._decider.commissioned, tuple(path.stem for path in paths))
         self._questions.commission(pose, paths, done)
-        text = f"The rig is being commissioned from {len(paths)} windows; `history` will say how it went."
+        text = (
+            f"The rig is being commissioned from {len(paths)} windows, between checks; `status` shows how far it is, "
+            "`history` will say how it went."
+        )
         return self._acknowledge("commission", "commissioning", text, window_id=paths[-1].stem)
 
     # --- on the stream's thread -------------------------------------------------------------------------------------

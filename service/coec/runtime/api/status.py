@@ -81,6 +81,7 @@ def worker_status_of(worker: Worker) -> replies.WorkerStatus:
         waiting=dict(status.waiting),
         job=None if job is None else job.kind,
         job_age_s=None if job is None else job.age_s,
+        commissioning=dict(status.commissionings),
         outcomes={fate.value: status.outcomes.get(fate, 0) for fate in Fate},
         losses=dict(status.losses),
         faults={fault.value: count for fault, count in status.faults.items()},

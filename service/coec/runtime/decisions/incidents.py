@@ -180,14 +180,21 @@ class Incidents:
         return event
 
     def flush(self) -> None:
-        """Writes to the disk what is not there yet, pictures before the events that name them; and removes dropped
-        events.
+        """Writes to the disk what is not there yet or not any more, pictures before the events that name them; and
+        removes dropped events. An event that somebody has removed has lost its pictures.
 
         Raises:
             StateError: the disk refuses; the next call tries again.
         """
         with self._writing:
             with self._lock:
+                on_disk = tuple(self._on_disk)
+            lost = [event_id for event_id in on_disk if not (self._folder / event_id / EVENT).exists()]
+            with self._lock:
+                for event_id in lost:
+                    if event_id in self._events:
+                        sides = tuple(side for of, side in self._pictures if of == event_id)
+                        self._keep(self._events[event_id].model_copy(update={"overlays": sides}))
                 pictures = dict(self._pictures)
                 events = {event_id: self._events[event_id] for event_id in sorted(self._unsaved)}
                 dropped = tuple(self._dropped)

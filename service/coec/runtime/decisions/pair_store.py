@@ -122,6 +122,8 @@ class PairStore:
         self.incidents = Incidents(config.directory / "evidence", rig.pair, config.evidence)
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
         self.protect()
+        scribe.keep(self.history, self.incidents, self._checks, store)
+        scribe.on_replaced(lambda text: self.history.append(_entry("chain", "rewritten", text)))
         if self.damage is not None:
             self.history.append(_entry("chain", self.damage.code, self.damage.text))
         if self.history.damage is not None:

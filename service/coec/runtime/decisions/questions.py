@@ -199,8 +199,23 @@ class Questions:
         self._worker.ask(jobs.comparison(self._pair.name, path, poses, names, self._post(done)))
 
     def commission(self, pose: Matrix4, paths: list[Path], done: Callable[[JobOutcome], None]) -> None:
-        """Has the baseline of the rig learned at an extrinsic (4, 4) from windows."""
-        self._worker.ask(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, self._post(done)))
+        """Has the baseline of the rig learned at an extrinsic (4, 4) from windows, which stay on the disk until that is
+        done."""
+        post = self._post(done)
+
+        def ended(outcome: JobOutcome) -> None:
+            for path in paths:
+                self._windows.release(path.stem)
+            post(outcome)
+
+        for path in paths:
+            self._windows.hold(path.stem)
+        self._worker.ask(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, ended))
+
+    @property
+    def commissioning(self) -> str | None:
+        """How far the commissioning of the pair is, in words; None: it has none."""
+        return self._worker.commissioning(self._pair.name)
 
     def _post(self, ended: Callable[[JobOutcome], None]) -> Callable[[JobOutcome], None]:
         return lambda outcome: self._mailbox.post(partial(ended, outcome))

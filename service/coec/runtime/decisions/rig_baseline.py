@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.baseline_file import baseline_of
+from coec.adapters.files.baseline_file import BASELINES, baseline_of, load_baseline, save_baseline
 from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Baseline, Drift, drift, learned_hash, mismatch
 from coec.calibration.types import Estimate, Matrix4, Reason, Rig
@@ -16,7 +16,7 @@ from coec.geometry import se3
 
 
 class RigBaseline:
-    """Belongs to the thread that decides about the pair.
+    """Belongs to the thread that decides about the pair; `flush` is for the scribe.
 
     Attributes:
         trouble: why an existing baseline is not used; else None.
@@ -27,6 +27,7 @@ class RigBaseline:
         self._rig = rig
         self._state = state
         self._baseline: Baseline | None = None
+        self._own: Baseline | None = None
         self.trouble: Reason | None = None
         self.load()
 
@@ -34,6 +35,7 @@ class RigBaseline:
         """Reads the baseline from the disk, where the worker writes it."""
         self._baseline, self.trouble = None, None
         try:
+            self._own = load_baseline(self._state.directory / BASELINES, self._rig.pair)
             baseline = baseline_of(self._rig, self._state)
         except StateError as error:
             self.trouble = Reason("baseline_damaged", f"The baseline of the rig cannot be used: {error}")
@@ -45,6 +47,20 @@ class RigBaseline:
             self._baseline = baseline
         else:
             self.trouble = _mismatched(wrong)
+
+    def flush(self) -> None:
+        """Writes the rig's own baseline again if somebody has removed it.
+
+        Raises:
+            StateError: it cannot be written; the next call tries again.
+        """
+        path, own = self._state.directory / BASELINES, self._own
+        try:
+            there = load_baseline(path, self._rig.pair)
+        except StateError:
+            return  # a damaged file stays, so that people can look into it
+        if own is not None and there is None:
+            save_baseline(path, own)
 
     def use(self, pair: PairConfig) -> None:
         """Goes on with other settings, which the baseline may not fit."""

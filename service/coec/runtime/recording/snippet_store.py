@@ -106,6 +106,7 @@ class SnippetStore:
         if size_bytes > self._max_bytes:
             raise RecordingError(f"a snippet of {size_bytes >> 20} MiB is more than snippets.max_bytes allows")
         try:
+            durable.make_folder(self._folder)
             while (oldest := self._oldest_beyond(size_bytes)) is not None:
                 durable.remove(self.path(oldest))
                 durable.remove(self._told(oldest))
@@ -119,6 +120,15 @@ class SnippetStore:
                 f"only {free >> 20} MiB are free on the disk of {self._folder}: a snippet of {size_bytes >> 20} MiB is "
                 f"not written beside the {self._min_free_bytes >> 20} MiB of state.min_free_bytes"
             )
+
+    def flush(self) -> None:
+        """Takes from the list what somebody has removed; for the scribe (`scribe.Book`)."""
+        with self._lock:
+            listed = tuple(self._found)
+        gone = [name for name in listed if not self.path(name).exists()]
+        with self._lock:
+            for name in gone:
+                self._found.pop(name, None)
 
     def take_up(self, pair: str, progress: Callable[[], None]) -> None:
         """Completes what earlier runs left of a pair: finishes files that were cut off, and reads those without a

@@ -101,6 +101,7 @@ class RigKeeper:
         self._links = tuple(links)
         self._scribe = scribe
         self._file = RigFile(folder)
+        scribe.keep(self._file)
         self._condition = threading.Condition()
         self._order: order.Order[Said | LidarsSaid | LidarsKnown | _Joined | _SteppedBack] = order.Order()
         self._corrections: dict[str, deque[Correction]] = {}

@@ -94,12 +94,14 @@ class RigFile:
         self._lock = threading.Lock()
         self._body: dict[str, Any] | None = None
         loaded = self._file.load()
+        self._on_disk = loaded.body
         damage = [*loaded.damage]
         self._edges: dict[str, StoredEdge] = {}
         self._event: StoredEvent | None = None
         refused = [] if loaded.body is None else self._read(loaded.body)
         if refused:
             self._file.distrust()
+            self._on_disk = None
             why = "not in the form of this version, or with a pose that is no rigid transform"
             damage.append(f"{FILE}: {', '.join(refused)} ({why})")
         text = (
@@ -163,13 +165,15 @@ class RigFile:
             self._body = {"edges": edges, "event": told}
 
     def flush(self) -> None:
-        """Writes what is kept to the disk.
+        """Writes what is kept to the disk, and what was written before if the file is gone.
 
         Raises:
             StateError: the disk refuses; the next call tries again.
         """
         with self._lock:
             body, self._body = self._body, None
+        if body is None and not self._file.exists():
+            body = self._on_disk
         if body is None:
             return
         try:
@@ -178,6 +182,7 @@ class RigFile:
             with self._lock:
                 self._body = body if self._body is None else self._body
             raise
+        self._on_disk = body
 
 
 def _sound_edge(edge: StoredEdge) -> StoredEdge:

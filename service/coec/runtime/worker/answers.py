@@ -1,7 +1,9 @@
 """The wire format of the worker's answers: the worker writes it, the service reads and checks it.
 
-An answer is `{"id": number, "result": {field: value}}` or `{"id": number, "refused": {"code", "text"}}`. A result has
-the fields of its dataclass. Arrays are an extension type of their shape and their doubles, so that every bit is kept.
+An answer is `{"id": number, "result": {field: value}}` or `{"id": number, "refused": {"code", "text"}}`. A slice of a
+commissioning is answered with `{"id": number, "underway": {"stage", "done", "total"}}` until it is complete. A result
+has the fields of its dataclass. Arrays are an extension type of their shape and their doubles, so that every bit is
+kept.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from coec.runtime.worker.jobs import (
     Kind,
     Registered,
     Solved,
+    Underway,
     WrittenFile,
 )
 from coec.schemas.base import from_msgpack, to_msgpack
@@ -59,6 +62,11 @@ def pack_refusal(number: int, reason: Reason) -> dict[str, Any]:
     return {"id": number, "refused": _packed(reason)}
 
 
+def pack_underway(number: int, underway: Underway) -> dict[str, Any]:
+    """The answer that the work of the question of this number is not complete."""
+    return {"id": number, "underway": _packed(underway)}
+
+
 def number_of(message: Mapping[str, Any]) -> int:
     """The number of the question that is answered.
 
@@ -71,9 +79,9 @@ def number_of(message: Mapping[str, Any]) -> int:
     return number
 
 
-def read_answer(message: Mapping[str, Any], kind: Kind | None) -> Answer | Reason | None:
-    """The answer to a question of a kind, or the reason why there is none. None for the kind None, which asks for
-    nothing.
+def read_answer(message: Mapping[str, Any], kind: Kind | None) -> Answer | Underway | Reason | None:
+    """The answer to a question of a kind, how far its work is, or the reason why there is no answer. None for the kind
+    None, which asks for nothing.
 
     Raises:
         MalformedAnswerError: the message is none of these.
@@ -82,6 +90,9 @@ def read_answer(message: Mapping[str, Any], kind: Kind | None) -> Answer | Reaso
     if content.keys() == {"refused"}:
         reason: Reason = _read(Reason, content["refused"])
         return reason
+    if content.keys() == {"underway"} and kind is Kind.COMMISSION:
+        underway: Underway = _read(Underway, content["underway"])
+        return underway
     if content.keys() != {"result"}:
         raise MalformedAnswerError("it is neither a result nor a refusal")
     if kind is None:
@@ -108,7 +119,8 @@ def _solved(wire: _SolvedOnTheWire) -> Solved:
 def _reader() -> TypeAdapter[Any]:
     """Reads a map into the dataclass with exactly its fields. Made at the first answer: only the service reads."""
     settings = ConfigDict(arbitrary_types_allowed=True, extra="forbid")
-    return TypeAdapter(_SolvedOnTheWire | Checked | Drawn | Commissioned | Registered | Reason, config=settings)
+    forms = _SolvedOnTheWire | Checked | Drawn | Commissioned | Underway | Registered | Reason
+    return TypeAdapter(forms, config=settings)
 
 
 def _read(form: type, value: Any) -> Any:

@@ -11,8 +11,8 @@ from coec.calibration.types import Reason
 from coec.config import CalibrationConfig
 from coec.errors import CoecError
 from coec.runtime.worker import jobs
-from coec.runtime.worker.answers import pack_answer, pack_refusal
-from coec.runtime.worker.jobs import Answer, Kind
+from coec.runtime.worker.answers import pack_answer, pack_refusal, pack_underway
+from coec.runtime.worker.jobs import Answer, Kind, Underway
 from coec.runtime.worker.tasks import Solver
 
 _log = logging.getLogger(__name__)
@@ -29,10 +29,12 @@ def answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
         end = solver.solve(Path(message["path"])) if message["kind"] == Kind.SOLVE else _errand(solver, message)
     except CoecError as error:
         end = Reason(error.reply_code, str(error))
-    return pack_refusal(number, end) if isinstance(end, Reason) else pack_answer(number, end)
+    if isinstance(end, Reason):
+        return pack_refusal(number, end)
+    return pack_underway(number, end) if isinstance(end, Underway) else pack_answer(number, end)
 
 
-def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
+def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Underway | Reason | None:
     """The answer to work that is tried only once. A fault of the program is an answer, too, because checks come every
     few seconds: if each of them ended the worker, it would solve no more windows.
 
@@ -54,7 +56,7 @@ def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
                 )
             case Kind.COMMISSION:
                 paths = [Path(path) for path in message["paths"]]
-                return solver.commission(_configuration(message), message["pose"], paths)
+                return solver.commission(message["run"], _configuration(message), message["pose"], paths)
             case Kind.REGISTER:
                 return solver.register(message["lidars"], message["frames"])
             case jobs.PREFETCH:

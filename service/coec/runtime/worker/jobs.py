@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,20 +55,22 @@ DEADLINE_S = {
     Kind.CHECK: 180.0,
     Kind.OVERLAY: 60.0,
     Kind.PICTURE: 60.0,
-    Kind.COMMISSION: 1800.0,
+    Kind.COMMISSION: 7200.0,
     Kind.REGISTER: 180.0,
 }
 """Time from asking until an answer is given up, s. For a live window: two attempts of 120 s, which `worker` allows by
 default, after another window that needs as long, and two minutes for new processes. For a check, and for the
 registration of two LiDARs: twice the first start of a worker, which compiles its kernels for a minute and a half on two
-busy cores. For a picture: six solves of 10 s. For a commissioning: twice `COMMISSIONING_TIMEOUT_S`."""
+busy cores. For a picture: six solves of 10 s. For a commissioning: those of eight pairs at once, of three minutes each,
+when checks and windows, which go first, leave a fifth of the worker's time. One slice of it may take no longer than any
+other job (`worker.timeout_s`)."""
 
 BACKLOG_DEADLINE_S = 86_400.0
 """The same for a window of an earlier run, s: it waits behind everything else, and is asked for again after the next
 start."""
 
-COMMISSIONING_TIMEOUT_S = 900.0
-"""Longest time of the worker with a commissioning, s: it calibrates its eight windows many times over."""
+_COMMISSIONINGS = count()
+"""Numbers the commissionings, so that the worker recognises the one that it has begun."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +118,19 @@ class Commissioned:
     baseline_hash: str
     windows: int
     pairs: int
+
+
+@dataclass(frozen=True, slots=True)
+class Underway:
+    """A commissioning is not complete: the worker has done a slice of it, up to `done` of `total` parts of a stage, and
+    is free for other work. It goes on when the same job is sent again."""
+
+    stage: str
+    done: int
+    total: int
+
+    def __str__(self) -> str:
+        return f"{self.stage} {self.done} of {self.total}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +196,7 @@ class Job:
         kind: what is asked.
         pair: the pair for which it is asked.
         subject: id of a window, or a word, for logs and status.
-        body: input of the work, in values that msgpack knows or lazy sequences of them. If the job is done at most
+        body: input of the work, in values that msgpack knows or lazy sequences of them. If the job is sent at most
             once, the body is emptied after sending.
         done: called once with the outcome, with no lock held, on the supervisor's thread or on the one that asks or
             stops.
@@ -256,9 +272,15 @@ def picture(
 
 
 def commission(pair: str, configuration: CalibrationConfig, pose: Matrix4, paths: Sequence[Path], done: Done) -> Job:
-    """Learns the rig's baseline at an extrinsic (4, 4) from windows' files; answered with `Commissioned`."""
-    body = {"configuration": _packed(configuration), "pose": pack_pose(pose), "paths": [str(path) for path in paths]}
-    return Job(Kind.COMMISSION, pair, "commissioning", body, done, timeout_s=COMMISSIONING_TIMEOUT_S)
+    """Learns the rig's baseline at an extrinsic (4, 4) from windows' files; answered with `Commissioned`. It takes
+    minutes, so it is done in slices: the worker answers `Underway` until it is complete."""
+    body = {
+        "run": next(_COMMISSIONINGS),
+        "configuration": _packed(configuration),
+        "pose": pack_pose(pose),
+        "paths": [str(path) for path in paths],
+    }
+    return Job(Kind.COMMISSION, pair, "commissioning", body, done)
 
 
 def register(edge: str, rig: LidarRig, pairs: Sequence[SweepPair], done: Done) -> Job:

@@ -62,6 +62,7 @@ def _serve(link: Link, config: Config) -> None:
             return
         link.send({"kind": "ready"})
         while (message := link.receive())["kind"] != START:
+            solver.forget_abandoned()
             link.send(answer(solver, message))
         config = Config.model_validate_json(message["settings"])
 

@@ -3,6 +3,8 @@
 Every job that comes in goes out exactly once, with its outcome. The number of waiting jobs is bounded per pair, so that
 pairs do not push each other out. If there are too many, the newest checks and live windows stay, and the oldest of the
 rest.
+
+A commissioning takes minutes and is done in slices: it comes back after each and goes on only when nothing else waits.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from coec.calibration.types import Reason
-from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, JobOutcome, Kind, Prefetch
+from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, JobOutcome, Kind, Prefetch, Underway
 
 
 class Lane(Enum):
@@ -24,12 +26,13 @@ class Lane(Enum):
     LIDARS = "lidars"
     ERRAND = "errand"
     BACKLOG = "backlog"
+    COMMISSIONING = "commissioning"
 
 
-WAITING = {Lane.CHECK: 4, Lane.LIVE: 2, Lane.LIDARS: 2, Lane.ERRAND: 8, Lane.BACKLOG: 64}
+WAITING = {Lane.CHECK: 4, Lane.LIVE: 2, Lane.LIDARS: 2, Lane.ERRAND: 8, Lane.BACKLOG: 64, Lane.COMMISSIONING: 1}
 """How many jobs may wait, per pair. Checks, windows and registrations of LiDARs are those of this run; the service
 waits for their answers before it asks more, so these limits matter only if the worker does not answer. Errands are
-pictures and commissionings, the backlog is unsolved windows of earlier runs."""
+pictures, the backlog is unsolved windows of earlier runs. A pair has one commissioning, waiting or begun."""
 
 SUPERSEDING = frozenset({Lane.CHECK, Lane.LIVE, Lane.LIDARS})
 """Lanes in which the newest job is worth most."""
@@ -69,13 +72,15 @@ class InProgress:
 
 @dataclass(slots=True, eq=False)
 class _Entry:
-    """A job on its way. `attempts`: how often a worker had it; `returned`: sending it has failed once."""
+    """A job on its way. `attempts`: how often a worker had it; `returned`: sending it has failed once; `reached`: how
+    far a commissioning is that has been begun."""
 
     job: Job
     asked_s: float
     attempts: int = 0
     returned: bool = False
     settled: bool = False
+    reached: Underway | None = None
 
     @property
     def deadline_s(self) -> float:
@@ -115,7 +120,7 @@ class JobQueue:
             self._end(entry, Fate.FAILED, STOPPING, now_s)
             return
         lane = _lane_of(job)
-        if self._is_full(lane, job.pair):
+        if self._is_full(lane, job.pair) or (lane is Lane.COMMISSIONING and job.pair in self.commissionings):
             if lane not in SUPERSEDING:
                 self._end(entry, Fate.FAILED, BUSY, now_s)
                 return
@@ -160,8 +165,9 @@ class JobQueue:
         if isinstance(hand.work, _Entry):
             hand.work.attempts += 1
 
-    def answered(self, answer: Answer | Reason | None, now_s: float) -> None:
-        """The work in hand has ended, with an answer or with the reason why there is none. None answers a prefetch."""
+    def answered(self, answer: Answer | Underway | Reason | None, now_s: float) -> None:
+        """The work in hand has ended, with an answer or with the reason why there is none. None answers a prefetch. A
+        job that is `Underway` goes back to the front of its lane."""
         work = self._hand().work
         self._in_hand = None
         if isinstance(work, Prefetch):
@@ -172,20 +178,27 @@ class JobQueue:
         self._check_was_fatal &= work.job.kind is not Kind.CHECK
         if work.settled:
             self._causes["late_answer"] += 1
+        elif isinstance(answer, Underway):
+            work.reached, work.returned = answer, False
+            self._lanes[_lane_of(work.job)].appendleft(work)
         else:
             self._end(work, Fate.FAILED if isinstance(answer, Reason) else Fate.RESULT, answer, now_s)
 
     def died(self, why: str, now_s: float) -> None:
         """The worker is being replaced because it `why` (a verb and what follows). If the work in hand had not reached
         it, the work goes back to the front, a window always, other work once. If it had, a window goes back until its
-        attempts are used up, and other work has failed."""
+        attempts are used up, and other work has failed. A commissioning that waits for its next slice begins again with
+        the next worker."""
         hand, self._in_hand = self._in_hand, None
+        for waiting in self._lanes[Lane.COMMISSIONING]:
+            waiting.reached = None
         if hand is None or isinstance(hand.work, Prefetch):
             return
         entry, kind = hand.work, hand.work.job.kind
         self._check_was_fatal |= hand.sent and kind is Kind.CHECK
         if entry.settled:
             return
+        entry.reached = None
         reason = Reason(WORKER_FAILED, f"The worker {why}.")
         if kind is Kind.SOLVE:
             again = not hand.sent or entry.attempts < self._attempts
@@ -250,6 +263,15 @@ class JobQueue:
         )
         return dict(Counter(names))
 
+    @property
+    def commissionings(self) -> Mapping[str, Underway | None]:
+        """How far the commissioning of each pair is that has one; None: not begun."""
+        entries = [*self._lanes[Lane.COMMISSIONING]]
+        in_hand = self._in_hand.work if self._in_hand else None
+        if isinstance(in_hand, _Entry) and in_hand.job.kind is Kind.COMMISSION and not in_hand.settled:
+            entries.append(in_hand)
+        return {entry.job.pair: entry.reached for entry in entries}
+
     def in_progress(self, now_s: float) -> InProgress | None:
         """The work in hand; None if there is none."""
         if self._in_hand is None:
@@ -268,8 +290,9 @@ class JobQueue:
         windows_turn = live and (self._check_was_fatal or now_s - live[0].asked_s > WINDOW_WAITS_S)
         if checks and not windows_turn:
             return checks.popleft()
-        lidars, errands, backlog = (self._lanes[lane] for lane in (Lane.LIDARS, Lane.ERRAND, Lane.BACKLOG))
-        for waiting in (live, lidars, errands, self._prefetches, backlog):
+        lidars, errands = self._lanes[Lane.LIDARS], self._lanes[Lane.ERRAND]
+        backlog, commissionings = self._lanes[Lane.BACKLOG], self._lanes[Lane.COMMISSIONING]
+        for waiting in (live, lidars, errands, self._prefetches, backlog, commissionings):
             if waiting:
                 return waiting.popleft()
         return None
@@ -314,5 +337,7 @@ def _lane_of(job: Job) -> Lane:
             return Lane.LIVE if job.live else Lane.BACKLOG
         case Kind.REGISTER:
             return Lane.LIDARS
-        case Kind.OVERLAY | Kind.PICTURE | Kind.COMMISSION:
+        case Kind.OVERLAY | Kind.PICTURE:
             return Lane.ERRAND
+        case Kind.COMMISSION:
+            return Lane.COMMISSIONING

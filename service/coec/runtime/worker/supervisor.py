@@ -26,7 +26,7 @@ from coec.runtime.timings import LONG_S, Histogram
 from coec.runtime.worker.answers import MalformedAnswerError, number_of, read_answer
 from coec.runtime.worker.child import Child, ChildError, Fault
 from coec.runtime.worker.costs import IDLE, START, Cost, cost_of
-from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, Kind, Prefetch
+from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, Kind, Prefetch, Underway
 from coec.runtime.worker.queue import WORKER_FAILED, InProgress, JobQueue, Ticket
 
 _log = logging.getLogger(__name__)
@@ -40,6 +40,14 @@ START_TIMEOUT_S = 300.0
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.5, 30.0
 """Pauses before a worker that could not start is started again, s; each is twice the one before. A worker that started
 and ended without a single answer is started again after the first pause."""
+
+
+SENT_AGAIN = (Kind.SOLVE, Kind.COMMISSION)
+"""Jobs that may be sent more than once: to another worker, or for the next slice."""
+
+
+NOT_BEGUN = "waiting for the worker"
+"""How far a commissioning is that was not begun."""
 
 
 class WorkerState(StrEnum):
@@ -62,6 +70,7 @@ class WorkerStatus:
         rss_bytes: resident memory of the process when it was last looked at.
         in_progress: the work that the process has.
         waiting: number of waiting jobs, by kind; see `JobQueue.waiting`.
+        commissionings: how far the commissioning of each pair is that has one, in words.
         outcomes: number of ended jobs, by fate.
         losses: number of jobs without a result by the code of their reason, and other losses; see `JobQueue.causes`.
             `done_raised`: outcomes on which the asking side raised an exception.
@@ -74,6 +83,7 @@ class WorkerStatus:
     rss_bytes: int
     in_progress: InProgress | None
     waiting: Mapping[str, int]
+    commissionings: Mapping[str, str]
     outcomes: Mapping[Fate, int]
     losses: Mapping[str, int]
     faults: Mapping[Fault, int]
@@ -151,6 +161,12 @@ class Worker:
             queue.ask(job, time.monotonic())
             self._condition.notify_all()
 
+    def commissioning(self, pair: str) -> str | None:
+        """How far the commissioning of a pair is, in words; None: it has none."""
+        with self._condition:
+            commissionings = self._queue.commissionings
+        return None if pair not in commissionings else str(commissionings[pair] or NOT_BEGUN)
+
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Queues the depth inference of a camera frame (native msgpack). It only saves time, so it may be dropped."""
         with self._held() as queue:
@@ -179,6 +195,7 @@ class Worker:
                 self._rss_bytes,
                 self._queue.in_progress(time.monotonic()),
                 self._queue.waiting,
+                {pair: str(reached or NOT_BEGUN) for pair, reached in self._queue.commissionings.items()},
                 self._queue.outcomes,
                 {**self._queue.causes, **raised},
                 dict(self._faults),
@@ -291,9 +308,18 @@ class Worker:
             return False
         self.work_took.add(time.monotonic() - sent_s, PREFETCH if kind is None else kind.value)
         answer = _checked_answer(message, ticket.number, kind)
+        if isinstance(answer, Underway):
+            self._log_progress(ticket.work.pair, answer)
         with self._held() as queue:
             queue.answered(answer, time.monotonic())
         return True
+
+    def _log_progress(self, pair: str, reached: Underway) -> None:
+        """Logs how far a commissioning is, once per stage."""
+        with self._condition:
+            before = self._queue.commissionings.get(pair)
+        if before is None or before.stage != reached.stage:
+            _log.info(f"commissioning: {reached}", extra={"fields": {"pair": pair}})
 
     def _take(self) -> Ticket | None:
         """The next job; None if there is none, after waiting for `POLL_S` at most."""
@@ -312,7 +338,7 @@ class Worker:
                 with self._held() as queue:
                     queue.answered(Reason("unsendable", f"The worker {error}."), time.monotonic())
             raise
-        if isinstance(ticket.work, Job) and ticket.work.kind is not Kind.SOLVE:
+        if isinstance(ticket.work, Job) and ticket.work.kind not in SENT_AGAIN:
             ticket.work.body.clear()  # frees the frames of a check, 15 MB, which are not sent twice
         with self._held() as queue:
             queue.sent(time.monotonic())
@@ -372,7 +398,7 @@ def _question(ticket: Ticket) -> dict[str, Any]:
     return {**work.body, "id": ticket.number, "kind": work.kind.value, "pair": work.pair}
 
 
-def _checked_answer(message: Mapping[str, Any], number: int, kind: Kind | None) -> Answer | Reason | None:
+def _checked_answer(message: Mapping[str, Any], number: int, kind: Kind | None) -> Answer | Underway | Reason | None:
     """The answer to the question of this number and kind.
 
     Raises:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,17 @@ from coec.adapters.images.range_colours import RangeScale, kept_or, scale_of
 from coec.adapters.registration.nearest import Trees, installed
 from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.baseline import Baseline, learned_hash, mismatch
-from coec.calibration.commissioning.learning import commission
+from coec.calibration.commissioning.learning import MAX_PAIRS, commission_in_steps
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.lidar_to_lidar.registration import register
 from coec.calibration.lidar_to_lidar.types import LidarEdge, LidarRig, SweepPair
 from coec.calibration.monitor.check_verdict import observe
-from coec.calibration.ports import Silence
+from coec.calibration.ports import Silence, Step, Steps
 from coec.calibration.types import (
     Estimate,
     FramePair,
     LidarFrame,
+    Matrix4,
     Reason,
     Rig,
     Window,
@@ -38,13 +40,36 @@ from coec.errors import CoecError, DecodeError, RecordingError, StateError, Wind
 from coec.geometry.vectors import lengths
 from coec.reports.instants import instant
 from coec.reports.overlay import draw, titled
-from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Registered, Solved, WrittenFile
+from coec.runtime.worker.jobs import (
+    DEADLINE_S,
+    Checked,
+    Commissioned,
+    Drawn,
+    Kind,
+    Registered,
+    Solved,
+    Underway,
+    WrittenFile,
+)
 from coec.runtime.worker.messages import unpack_lidars, unpack_pairs, unpack_sweeps
 from coec.runtime.worker.warm_up import invented_window, warm_up
 
 _log = logging.getLogger(__name__)
 
 OVERLAY_JPEG_QUALITY = 88
+
+SLICE_S = 0.5
+"""A slice of a commissioning ends with the first step that ends after this time, s. A check waits for one slice at
+most: this time and the longest step, which is as long as the solve of a window."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Commissioning:
+    """A commissioning that was begun: its number, its remaining steps, and when it was begun (steady clock, s)."""
+
+    run: int
+    steps: Steps[Baseline]
+    begun_s: float
 
 
 class Solver:
@@ -65,6 +90,7 @@ class Solver:
         self._images = GreyImages(config.limits)
         self._networks: dict[DepthConfig, CachedDepth] = {}
         self._scales: dict[str, RangeScale] = {}
+        self._commissioning: _Commissioning | None = None
         self.use(config)
 
     def use(self, config: Config) -> None:
@@ -215,27 +241,59 @@ class Solver:
         return self._drawn(self._rigs[pair], configuration, pose, drawn, title, self._scale(pair, drawn.lidar))
 
     def commission(
-        self, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
-    ) -> Commissioned:
-        """Learns the baseline of a rig at an extrinsic (rows of the (4, 4) matrix) from recorded windows and writes it.
+        self, run: int, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
+    ) -> Commissioned | Underway:
+        """Does the next slice of a commissioning: learns the baseline of a rig at an extrinsic (rows of the (4, 4)
+        matrix) from recorded windows, and writes it at the end. Begins anew if `run`, the number of the commissioning,
+        is not that of the one that was begun; an earlier one is given up.
 
         Raises:
             WindowError, CalibrationError, DecodeError, ModelError, StateError: there is no baseline.
         """
-        from coec.adapters.mcap.windows import read_window
-
-        start = np.array(pose, dtype=np.float64)
-        windows = [replace(read_window(path)[0], T_camera_lidar_start=start) for path in paths]
-        baseline = commission(
-            windows,
-            self._network(configuration.depth),
-            self._images,
-            configuration,
-            sensors={},
-            reference=start,
-        )
+        begun, self._commissioning = self._commissioning, None  # stays None if a step raises
+        end_s = time.monotonic() + SLICE_S
+        if begun is None or begun.run != run:
+            start = np.array(pose, dtype=np.float64)
+            begun = _Commissioning(run, self._commissioning_steps(configuration, start, paths), time.monotonic())
+        try:
+            step = next(begun.steps)
+            while time.monotonic() < end_s:
+                step = next(begun.steps)
+        except StopIteration as end:
+            baseline: Baseline = end.value
+        else:
+            self._commissioning = begun
+            return Underway(step.stage, step.done, step.total)
         saved = save_baseline(self._config.state.directory / BASELINES, baseline)
         return Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
+
+    def forget_abandoned(self) -> None:
+        """Frees the memory of a commissioning that was begun so long ago that its job has been given up."""
+        begun = self._commissioning
+        if begun is not None and time.monotonic() - begun.begun_s > DEADLINE_S[Kind.COMMISSION]:
+            self._commissioning = None
+
+    def _commissioning_steps(
+        self, configuration: CalibrationConfig, reference: Matrix4, paths: Sequence[Path]
+    ) -> Steps[Baseline]:
+        # A cache of its own, because checks in between would push the maps out of the common one.
+        depth = CachedDepth(self._network(configuration.depth), MAX_PAIRS)
+        windows = self._windows_of(paths, reference)
+        return (
+            yield from commission_in_steps(
+                (yield from windows), depth, self._images, configuration, sensors={}, reference=reference
+            )
+        )
+
+    @staticmethod
+    def _windows_of(paths: Sequence[Path], T_camera_lidar_start: Matrix4) -> Steps[list[Window]]:
+        from coec.adapters.mcap.windows import read_window
+
+        windows = []
+        for number, path in enumerate(paths, start=1):
+            windows.append(replace(read_window(path)[0], T_camera_lidar_start=T_camera_lidar_start))
+            yield Step("windows", number, len(paths))
+        return windows
 
     def register(self, lidars: Mapping[str, Any], frames: Sequence[Sequence[bytes | None]]) -> Registered:
         """Finds the pose of one LiDAR in another; both, and pairs of their sweeps, are packed as `messages` does.

@@ -1,0 +1,261 @@
+"""The state directory, when somebody removes it under the running service; and who may read what is in it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from baselines import a_baseline
+from coec.adapters.files.baseline_file import BASELINES, load_baseline, save_baseline
+from coec.adapters.files.scribe import Scribe
+from coec.daemon.state_folder import locked
+from coec.errors import UnavailableError
+from coec.runtime.decisions.rig_baseline import RigBaseline
+from coec.runtime.rig.rig_file import FILE as RIG_FILE
+from fakes import wait_until
+from pair_bench import BEGIN_S, END_S, RIG, STEP_S, Bench, configuration
+
+
+def books(folder: Path) -> dict[str, int]:
+    """The files of a state directory but for the windows: path below it, and size."""
+    found = (path for path in sorted(folder.rglob("*")) if path.is_file() and "windows" not in path.parts)
+    return {str(path.relative_to(folder)): path.stat().st_size for path in found}
+
+
+def remove(folder: Path, how: str) -> None:
+    if how == "content":
+        for path in folder.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        return
+    shutil.rmtree(folder)
+    if how == "made again":
+        folder.mkdir()
+
+
+@pytest.mark.fault("`rm -rf` of the state directory under the running service", "the next write completes all books")
+@pytest.mark.parametrize("how", ["made again", "content"])
+def test_books_that_somebody_removed_are_written_again_from_memory(tmp_path: Path, how: str) -> None:
+    bench = Bench(tmp_path / "state")
+    bench.drive(BEGIN_S, STEP_S + 60)
+    before, entries = books(bench.folder), bench.store.history.entries()
+    assert len(before) > 5
+    remove(bench.folder, how)
+    told = bench.acknowledged("hold")
+    assert (told.code, told.durable) == ("held", True)
+    (bench.folder / "windows").mkdir()  # as the recorder does, which the bench has none of
+    bench.drive(STEP_S + 60, STEP_S + 66)
+    after = books(bench.folder)
+    # The pictures of an event are in the files alone.
+    pictures = {name for name in before if name.endswith(".jpg")}
+    copies = {name for name in before if name.endswith(".previous")}
+    assert set(before) - pictures - copies <= set(after)
+    kept, served, hold = bench.store.history.entries(), bench.pose.copy(), bench.store.state.hold
+    assert kept[: len(entries)] == entries
+    rewritten = [entry.text for entry in bench.entries("chain")]
+    if how == "made again":
+        assert len(rewritten) == 1
+        assert "recordings" in rewritten[0]
+        assert "gone" in rewritten[0]
+    bench.restart()
+    assert bench.store.damage is None
+    assert bench.store.history.damage is None
+    assert [one.line for one in bench.store.history.entries()][: len(kept)] == [one.line for one in kept]
+    assert bench.pose.tobytes() == served.tobytes()
+    assert bench.store.state.hold == hold
+    assert all(event.overlays == () for event in bench.store.incidents.events())
+
+
+@pytest.mark.fault("the state directory is gone", "commands are acknowledged as not durable; `health` says why")
+def test_without_a_state_directory_nothing_counts_as_written(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "state")
+    bench.drive(BEGIN_S, BEGIN_S + 20)
+    remove(bench.folder, "gone")
+    told = bench.acknowledged("hold")
+    assert (told.code, told.durable) == ("held", False)
+    trouble = bench.outside.scribe.trouble
+    assert trouble is not None
+    assert trouble.code == "disk_failing"
+    bench.folder.mkdir()
+    told = bench.acknowledged("hold", release=True)
+    assert (told.code, told.durable) == ("released", True)
+    assert bench.outside.scribe.trouble is None
+    bench.restart()
+    assert [entry.code for entry in bench.entries("command")][-2:] == ["held", "released"]
+
+
+def test_the_scribe_notices_by_itself_that_the_folder_is_another_one(tmp_path: Path) -> None:
+    """Also when nobody notes anything; and once per time."""
+    folder, told = tmp_path / "state", list[str]()
+    folder.mkdir()
+
+    class Book:
+        written = 0
+
+        def flush(self) -> None:
+            self.written += 1
+
+    first, last = Book(), Book()
+    scribe = Scribe(folder)
+    scribe.keep(last, first)
+    scribe.keep(last)
+    scribe.on_replaced(told.append)
+    scribe.look()
+    scribe.write_due()
+    assert (first.written, last.written, scribe.has_written()) == (0, 0, True)
+    for time in (1, 2):
+        remove(folder, "made again")
+        scribe.look()
+        assert not scribe.has_written()
+        scribe.write_due()
+        assert (first.written, last.written, scribe.has_written(), len(told)) == (time, time, True, time)
+    assert list(scribe._kept) == [first, last]
+
+
+def test_what_is_written_while_the_folder_is_replaced_is_written_again(tmp_path: Path) -> None:
+    folder = tmp_path / "state"
+    folder.mkdir()
+
+    class Book:
+        def flush(self) -> None:
+            (folder / "book").touch()
+            if not list(tmp_path.glob("done")):
+                (tmp_path / "done").touch()
+                remove(folder, "made again")
+
+    scribe = Scribe(folder)
+    scribe.write(Book())
+    scribe.write_due()
+    assert not (folder / "book").exists()
+    assert not scribe.has_written()
+    scribe.write_due()
+    assert (folder / "book").exists()
+    assert scribe.has_written()
+
+
+def test_a_thread_writes_them_again_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("coec.adapters.files.scribe.RETRY_S", 0.01)
+    folder, written = tmp_path / "state", threading.Event()
+    folder.mkdir()
+
+    class Book:
+        def flush(self) -> None:
+            written.set()
+
+    scribe = Scribe(folder)
+    scribe.keep(Book())
+    scribe.thread.start()
+    try:
+        remove(folder, "made again")
+        wait_until(written.is_set, "the book")
+    finally:
+        scribe.request_stop()
+        assert scribe.thread.join(20.0)
+
+
+def test_a_baseline_that_somebody_removed_is_written_again(tmp_path: Path) -> None:
+    config = configuration(tmp_path)
+    save_baseline(tmp_path / BASELINES, a_baseline())
+    baseline = RigBaseline(config.pairs[0], RIG, config.state)
+    before = (tmp_path / BASELINES).read_bytes()
+    (tmp_path / BASELINES).unlink()
+    baseline.flush()
+    assert (tmp_path / BASELINES).read_bytes() == before
+    (tmp_path / BASELINES).write_bytes(b"damaged")
+    baseline.flush()
+    assert (tmp_path / BASELINES).read_bytes() == b"damaged", "it is left for people to look into"
+    assert load_baseline(tmp_path / "none", "front") is None
+
+
+# --- the lock ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("the state directory is made again under the running service", "a second daemon is still refused")
+def test_the_lock_is_taken_again_in_a_directory_that_was_made_again(tmp_path: Path) -> None:
+    folder = tmp_path / "state"
+    with locked(folder) as lock:
+        with pytest.raises(UnavailableError, match="in use by another daemon"), locked(folder):
+            pass
+        remove(folder, "made again")
+        lock.flush()
+        lock.flush()
+        with pytest.raises(UnavailableError, match="in use by another daemon"), locked(folder):
+            pass
+    with locked(folder):
+        pass
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.write_bytes(b"kept")
+    folder = tmp_path / "state"
+    folder.mkdir()
+    (folder / "lock").symlink_to(other)
+    with pytest.raises(UnavailableError, match="Too many levels of symbolic links"), locked(folder):
+        pass
+    assert other.read_bytes() == b"kept"
+
+
+# --- who may read it --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_umask() -> Iterator[None]:
+    before = os.umask(0)
+    try:
+        yield
+    finally:
+        os.umask(before)
+
+
+def open_to_others(folder: Path) -> list[str]:
+    """Files and folders below one, and itself, that the group may write or others may read."""
+    places = [folder, *folder.rglob("*")]
+    return sorted(str(path) for path in places if stat.S_IMODE(path.lstat().st_mode) & 0o027)
+
+
+@pytest.mark.fault("a umask that hides nothing", "other users of the machine can read nothing of the state")
+@pytest.mark.usefixtures("no_umask")
+def test_no_book_is_open_to_other_users(tmp_path: Path) -> None:
+    with locked(tmp_path / "state"):
+        bench = Bench(tmp_path / "state")
+        save_baseline(bench.folder / BASELINES, a_baseline())
+        bench.drive(BEGIN_S, END_S)
+        found = books(bench.folder)
+        assert {"lock", "state.json", "state.json.previous", BASELINES, "history-front.jsonl"} <= set(found)
+        assert any(name.startswith("evidence/") for name in found)
+        # The recorder of this bench makes empty files for windows, by itself.
+        shutil.rmtree(bench.folder / "windows")
+        assert open_to_others(bench.folder) == []
+
+
+def test_what_an_earlier_version_left_open_is_closed_at_the_start(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, other = tmp_path / "state", tmp_path / "other"
+    other.write_bytes(b"")
+    other.chmod(0o666)
+    for name in ("", "windows", "evidence", "evidence/front-1", "snippets", "mine"):
+        (folder / name).mkdir()
+        (folder / name).chmod(0o777)
+    files = ["state.json", RIG_FILE, "windows/front-1.mcap", "evidence/front-1/event.json", "mine/notes"]
+    for name in files:
+        (folder / name).write_bytes(b"")
+        (folder / name).chmod(0o666)
+    (folder / "windows" / "link.mcap").symlink_to(other)
+    with locked(folder):
+        assert stat.S_IMODE((folder / "state.json").stat().st_mode) == 0o640
+        assert stat.S_IMODE((folder / "windows").stat().st_mode) == 0o750
+        links = str(folder / "windows" / "link.mcap")
+        assert set(open_to_others(folder)) - {links} == {str(folder / "mine"), str(folder / "mine" / "notes")}
+        assert stat.S_IMODE(other.stat().st_mode) == 0o666, "a link is not followed"
+    assert "9 files and folders" in caplog.text
+    caplog.clear()
+    with locked(folder):
+        pass
+    assert caplog.text == ""

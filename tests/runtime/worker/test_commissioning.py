@@ -1,0 +1,127 @@
+"""A commissioning in slices, as the worker does it: it gives the same baseline as one without a pause."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.conftest import STREET, window_of
+from coec.adapters.files.baseline_file import BASELINES, baseline_hash, load_baseline
+from coec.adapters.images.codec import GreyImages
+from coec.adapters.mcap.windows import WindowWriter
+from coec.calibration.commissioning import learning, verdict_limits
+from coec.calibration.commissioning.learning import commission
+from coec.calibration.types import Window
+from coec.cli.convert import configuration_for
+from coec.config import CalibrationConfig, Config, DepthConfig, LimitsConfig, SearchConfig, StateConfig
+from coec.errors import CalibrationError
+from coec.runtime.worker import tasks
+from coec.runtime.worker.jobs import DEADLINE_S, Commissioned, Kind, Underway
+from coec.runtime.worker.messages import pack_pairs, pack_pose
+from coec.runtime.worker.tasks import Solver
+from drives import drawn_source
+
+CONFIG = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(reach_deg=8.0))
+
+
+@pytest.fixture(autouse=True)
+def small_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few of everything, and a slice for each step."""
+    monkeypatch.setattr(learning, "CHECKS", 4)
+    monkeypatch.setattr(learning, "FAR_CHECKS", 1)
+    monkeypatch.setattr(learning, "HALVES", 3)
+    monkeypatch.setattr(verdict_limits, "SOLVES", 1)
+    monkeypatch.setattr(tasks, "SLICE_S", 0.0)
+
+
+@pytest.fixture(scope="module")
+def street() -> Window:
+    return window_of(drawn_source(STREET))
+
+
+@pytest.fixture
+def solver(street: Window, tmp_path: Path) -> Solver:
+    pair = configuration_for(drawn_source(STREET), street.T_camera_lidar_start, None)
+    pair = pair.model_copy(update={"name": street.rig.pair, "calibration": CONFIG})
+    return Solver(Config(pairs=(pair,), state=StateConfig(directory=tmp_path)), 4)
+
+
+@pytest.fixture
+def paths(street: Window, tmp_path: Path) -> list[Path]:
+    """Two windows on the disk."""
+    written = []
+    for number in (0, 1):
+        path = tmp_path / f"{street.rig.pair}-{number}.mcap"
+        writer = WindowWriter(path, street.rig, street.T_camera_lidar_start, path.stem, CONFIG, {})
+        for pair in street.pairs[number::2]:
+            writer.add(pair)
+        writer.finish()
+        written.append(path)
+    return written
+
+
+def slices(solver: Solver, street: Window, paths: list[Path], run: int = 1) -> Iterator[Underway | Commissioned]:
+    while True:
+        told = solver.commission(run, CONFIG, pack_pose(street.T_camera_lidar_start), paths)
+        yield told
+        if isinstance(told, Commissioned):
+            return
+
+
+@pytest.mark.fault("`commission` between checks", "the baseline is that of one without a pause, to the byte")
+def test_a_baseline_learned_between_checks_is_the_one_learned_without_a_pause(
+    solver: Solver, street: Window, paths: list[Path], tmp_path: Path
+) -> None:
+    checked = pack_pairs(street.pairs[:5])
+    stages = []
+    for told in slices(solver, street, paths):
+        solver.observe(street.rig.pair, CONFIG, pack_pose(street.T_camera_lidar_start), checked)
+        if isinstance(told, Underway):
+            stages.append(str(told))
+    assert isinstance(told, Commissioned)
+    assert stages[:2] == ["windows 1 of 2", "windows 2 of 2"]
+    assert {"depth 8 of 8", "spread 3 of 3", "right 4 of 4", "far 1 of 1", "verdicts 2 of 2"} <= set(stages)
+    windows = [replace(street, pairs=street.pairs[number::2]) for number in (0, 1)]
+    depth, images = solver._network(CONFIG.depth), GreyImages(LimitsConfig())
+    whole = commission(windows, depth, images, CONFIG, sensors={}, reference=street.T_camera_lidar_start)
+    assert told.baseline_hash == baseline_hash(whole)
+    saved = load_baseline(tmp_path / BASELINES, street.rig.pair)
+    assert saved is not None
+    assert baseline_hash(saved) == told.baseline_hash
+
+
+def test_another_commissioning_takes_the_place_of_one_that_was_begun(
+    solver: Solver, street: Window, paths: list[Path]
+) -> None:
+    begun = slices(solver, street, paths, run=1)
+    assert [str(next(begun)), str(next(begun))] == ["windows 1 of 2", "windows 2 of 2"]
+    other = slices(solver, street, paths, run=2)
+    assert str(next(other)) == "windows 1 of 2"
+    assert str(next(begun)) == "windows 1 of 2", "the first one begins again"
+
+
+def test_after_an_error_nothing_is_left(solver: Solver, street: Window, paths: list[Path], tmp_path: Path) -> None:
+    turned = street.T_camera_lidar_start.copy()
+    turned[:3, :3] = turned[:3, :3] @ np.array([[0.999, -0.0447, 0], [0.0447, 0.999, 0], [0, 0, 1]])
+    at_turned = replace(street, T_camera_lidar_start=turned)
+    with pytest.raises(CalibrationError, match="away from the reference"):
+        list(slices(solver, at_turned, paths))
+    assert solver._commissioning is None
+    assert not (tmp_path / BASELINES).exists()
+
+
+def test_the_memory_of_a_commissioning_that_was_given_up_is_freed(
+    solver: Solver, street: Window, paths: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    next(slices(solver, street, paths))
+    solver.forget_abandoned()
+    assert solver._commissioning is not None
+    later_s = time.monotonic() + DEADLINE_S[Kind.COMMISSION] + 1.0
+    monkeypatch.setattr(time, "monotonic", lambda: later_s)
+    solver.forget_abandoned()
+    assert solver._commissioning is None
