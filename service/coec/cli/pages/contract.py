@@ -89,7 +89,7 @@ RESOURCES: Mapping[str, _Resource] = {
     "evidence_of": _Resource(f"{_model(replies.EvidenceEvent)}, or a JPEG", grammar.parse_evidence_selector),
     "command": _Resource(_model(replies.Acknowledgement), grammar.parse_command_selector),
     "alive": _Resource("liveliness token"),
-    "claims": _Resource("liveliness tokens"),
+    "claims": _Resource("liveliness tokens; each answered, without content, by its daemon"),
 }
 """Resources by the method of `Keys` that builds the key."""
 

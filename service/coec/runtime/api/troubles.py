@@ -162,6 +162,12 @@ TROUBLES: Mapping[str, Trouble] = {
         "Another daemon serves the vehicle; this one ends with exit code 75.",
         "End one of the two, or give them different vehicles.",
     ),
+    "rival_unproven": Trouble(
+        "A program holds the liveliness token of another daemon of this vehicle, but no daemon answers for it; the "
+        "token is ignored, and the calibration is served as before.",
+        "Find the program and end it. Let the router's rules allow tokens below `coec/@v1/<vehicle>` to the service "
+        "alone, as `deploy/router.json5` does.",
+    ),
     "no_look_yet": Trouble(
         "The service has not looked yet for what the configuration leaves out.",
         "Nothing; it looks four times a second.",
