@@ -54,7 +54,7 @@ from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutco
 from coec.runtime.worker.messages import unpack_pairs
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.keys import Keys
-from coec.schemas.replies import HistoryEntry
+from coec.schemas.replies import Acknowledgement, HistoryEntry
 from estimates import estimate
 
 S = 1_000_000_000
@@ -379,12 +379,15 @@ class Bench:
             self.worker.work(share=0.05)
 
     def do(self, name: str, **arguments: Any) -> str:
+        return self.acknowledged(name, **arguments).code
+
+    def acknowledged(self, name: str, **arguments: Any) -> Acknowledgement:
         with ThreadPoolExecutor(1) as other:
             told = other.submit(self.pair.commands.carry_out, name, arguments, "the test")
             while not told.done():
                 self.settle()
         self.settle()
-        return told.result().code
+        return told.result()
 
     @property
     def pose(self) -> Matrix4:
