@@ -95,7 +95,7 @@ RESOURCES: Mapping[str, _Resource] = {
 
 COMMANDS: Mapping[str, str] = {
     "calibrate": "the open window ends now and is solved, if it has pairs enough; else the latest one is solved again",
-    "apply": "the estimate that waits becomes what is served; with `candidate`, only if it is this one (its window's id, "
+    "apply": "the estimate that waits becomes what is served; with `candidate`, only if it is this one (window id, "
     "or the start of its sha256 in `extrinsic`)",
     "rollback": "what was served before is served again, or what window `to` gave (its id, or the start of a sha256)",
     "reset": "the workshop calibration is served; the next accepted window may move it",

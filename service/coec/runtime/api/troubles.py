@@ -23,8 +23,14 @@ TROUBLES: Mapping[str, Trouble] = {
         "Start it, or check the network; `coec doctor` says how far a connection gets. The service connects by itself.",
     ),
     "two_senders": Trouble(
-        "Two publishers send on one topic at the same time; their frames are taken as one sensor's.",
-        "End one of the two, or name the topic of the one that is meant; `coec doctor` lists topics and nodes.",
+        "Two publishers send on one topic or key at the same time. Nobody knows whose frames are the sensor's, so that "
+        "all are refused until only one has sent for 64 messages; nothing is checked or calibrated meanwhile.",
+        "End one of the two, or name the topic of the one that is meant; `coec doctor` lists topics and nodes. If the "
+        "other is of another vehicle, give each vehicle keys of its own.",
+    ),
+    "foreign_frames": Trouble(
+        "Frames with another frame id or image size come beside those of the sensor; they are refused and counted.",
+        "Find the program that sends them on this topic or key (another sensor, another vehicle), and end it.",
     ),
     "sender_clock": Trouble(
         "Messages of a stream have no stamp; the time at which they were sent replaces the sensor's.",
