@@ -126,8 +126,8 @@ def test_a_restart_is_on_trial_until_it_has_sent_some() -> None:
 
 def test_senders_without_numbers_are_told_apart_by_their_clocks() -> None:
     senders = Senders()
-    ours, theirs = ([(None, stamp_ns + index * P) for index in range(10)] for stamp_ns in (0, 10**12))
-    came(senders, *mixed(ours, theirs))
+    for index in range(10):
+        came(senders, (None, index * P), (None, 10**12 + index * P))
     assert len(senders.taking_turns) == 2
 
 
