@@ -164,7 +164,7 @@ def test_a_token_without_an_answer_ends_nothing(
     caplog: pytest.LogCaptureFixture,
     key: str,
 ) -> None:
-    monkeypatch.setattr(presence, "DECIDED_S", 0.2)
+    monkeypatch.setattr(presence, "PROOF_S", 0.2)
     one = daemon(sessions[0])
     with held(router, key):
         assert serves(one)
@@ -221,7 +221,7 @@ def test_a_wider_query_gets_no_claim(sessions: list[zenoh.Session], daemon: Made
 
 @pytest.mark.fault("a router whose rules let no daemon query another", "its tokens count without an answer, as before")
 def test_where_queries_are_forbidden_tokens_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(presence, "DECIDED_S", 0.2)
+    monkeypatch.setattr(presence, "PROOF_S", 0.2)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     file = tmp_path / "router.json5"
     settings = {"mode": "router", "listen": {"endpoints": [endpoint]}, "access_control": hiding("query")}

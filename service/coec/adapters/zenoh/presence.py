@@ -13,7 +13,7 @@ daemon that looks later sees it, too. Therefore, of two that start at the same t
 
 Another daemon counts only if it answers: a query for its claim, or, if it is of an earlier version, `status` with the
 time of its start. Any program that may declare tokens could hold the token of a daemon; a token for which nobody
-answers for `DECIDED_S` is ignored and reported. If a daemon gets no answer of its own, the router's rules forbid these
+answers for `PROOF_S` is ignored and reported. If a daemon gets no answer of its own, the router's rules forbid these
 queries. Then tokens count without an answer, and the same rules have to say who may declare them.
 """
 
@@ -54,8 +54,12 @@ SEEN_S = 5.0
 longer, access control hides the claim."""
 
 DECIDED_S = 5.0
-"""How long to wait for other starting daemons to leave or to serve, and for an answer of whoever holds a token. They
-need less; one that hangs is not waited for."""
+"""How long to wait for other starting daemons to leave or to serve. They need less; one that hangs is not waited
+for."""
+
+PROOF_S = 2.0
+"""How long to wait, at the start, for an answer of whoever holds a token. A daemon answers in milliseconds; one that is
+too busy for it is seen later, while both serve."""
 
 MAX_OTHERS = 64
 """Most tokens of others that are kept from one look. Anybody may declare any number; daemons that are there answer,
@@ -174,19 +178,20 @@ class Presence:
 
     def _decide(self, stop: threading.Event) -> None:
         seen = self._look_until_seen(stop)
-        deadline_s = time.monotonic() + DECIDED_S
+        begun_s = time.monotonic()
         while not stop.is_set():
-            late = time.monotonic() > deadline_s
-            rivals = self._rivals(seen, tokens_count=late and self._forbidden)
+            waited_s = time.monotonic() - begun_s
+            silent = waited_s > PROOF_S
+            rivals = self._rivals(seen, tokens_count=silent and self._forbidden)
             step = next_step(self._daemon, rivals)
-            if step == "leave" or (step == "wait" and late):
+            if step == "leave" or (step == "wait" and waited_s > DECIDED_S):
                 raise UnavailableError(told(self._keys.vehicle, min(rivals, key=lambda claim: not claim.serving)))
             unproven = self._unproven(seen, rivals)
-            if late and unproven and self._forbidden:
+            if silent and unproven and self._forbidden:
                 raise UnavailableError(
                     f"vehicle {self._keys.vehicle!r} is served already: somebody holds the token {unproven[0]!a}"
                 )
-            if step == "serve" and (late or not unproven):
+            if step == "serve" and (silent or not unproven):
                 self._report(unproven)
                 # The first claim stays until the second is there, so that others always find one of them.
                 self._declare(serving=True)
