@@ -13,6 +13,7 @@ import zenoh
 import coec
 from coec import client
 from coec.adapters.zenoh.bus import MSGPACK, Answer, Bus, Lane, Request, Route, open_session
+from coec.adapters.zenoh.client import OF_ONE_KEY
 from coec.client import WAITING, Change, Vehicle
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConnectionFailedError, DecodeError, NotFoundError, RemoteError, UsageError
@@ -41,6 +42,25 @@ def bus(endpoint: str) -> Iterator[Bus]:
     bus = Bus(open_session(ZenohConfig(connect=(endpoint,)), LimitsConfig()))
     yield bus
     assert bus.close(PATIENCE_S)
+
+
+@pytest.mark.fault("a program that answers with more replies than a service", "an error of coec that names the bound")
+def test_a_flood_of_replies_is_an_error(router: Router) -> None:
+    keys, bound = Keys("coec", "flooded"), OF_ONE_KEY.replies
+
+    def flood(query: zenoh.Query) -> None:
+        with query:
+            for _ in range(bound + 1):
+                query.reply(keys.health("a"), b"")
+
+    async def asked() -> None:
+        async with Vehicle("flooded", connect=router.endpoint, timeout_s=PATIENCE_S) as vehicle:
+            with pytest.raises(RemoteError, match=f"more than {bound} replies"):
+                await vehicle.health("a")
+
+    queryable = router.session.declare_queryable(keys.health("a"), flood)
+    asyncio.run(asked())
+    queryable.undeclare()
 
 
 @pytest.fixture

@@ -36,16 +36,15 @@ from coec.adapters.tls.conversation import Speaker
 from coec.adapters.zenoh.bus import MSGPACK
 from coec.adapters.zenoh.changes import Change, listening
 from coec.adapters.zenoh.client import (
-    JSON,
+    GRACE_S,
+    Replies,
     Reply,
     Way,
-    answered,
     connected_by,
     myself,
     nobody,
     patience_ms,
     single_key,
-    target_of,
     too_late,
 )
 from coec.adapters.zenoh.proven import give
@@ -55,22 +54,13 @@ from coec.config import Config, ZenohConfig
 from coec.errors import UsageError
 from coec.schemas.base import from_msgpack
 from coec.schemas.commands import NAMES, CommandName
-from coec.schemas.keys import MAX_LENGTH, Keys
+from coec.schemas.keys import Keys
 from coec.schemas.replies import Acknowledgement, ExtrinsicReply, HealthReply, HistoryReply, StatusReply, WindowsReply
 
 __all__ = ["Change", "Vehicle"]
 
 WAITING = 1024
 """Changes that may wait until the program takes them, some 10 MB. Beyond that the oldest are dropped and counted."""
-
-MAX_MESSAGE_BYTES = 2 * MAX_LENGTH
-"""Largest message that the session accepts, bytes."""
-
-MAX_REPLIES = 16
-"""Replies that are kept for one question to one service; further ones are ignored."""
-
-GRACE_S = 1.0
-"""Waited beyond the timeout of a question, s. Zenoh ends the question at the timeout, unless its session hangs."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -133,7 +123,7 @@ class Vehicle:
         """
         if self._connection is not None:
             raise UsageError("the vehicle is connected already: a second connection is a second Vehicle")
-        connection = connected_by(self._way, self._timeout_s, MAX_MESSAGE_BYTES)
+        connection = connected_by(self._way, self._timeout_s)
         opening = asyncio.get_running_loop().run_in_executor(None, connection.__enter__)
         try:
             self._open = await asyncio.shield(opening)
@@ -296,38 +286,24 @@ class Vehicle:
     ) -> Reply:
         loop = asyncio.get_running_loop()
         ended = asyncio.Event()
-        replies: list[zenoh.Reply] = []
-
-        def hear(reply: zenoh.Reply) -> None:
-            if len(replies) < MAX_REPLIES:
-                replies.append(reply)
 
         def end() -> None:
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(ended.set)
 
-        given_up = zenoh.CancellationToken()
-        self._session.get(
-            selector,
-            zenoh.handlers.Callback(hear, end, indirect=False),
-            target=target_of(selector),
-            timeout=timeout_s,
-            payload=payload,
-            encoding=None if payload is None else JSON,
-            attachment=attachment,
-            cancellation_token=given_up,
-        )
+        replies = Replies(selector, timeout_s, end)
         try:
+            replies.query(self._session, payload, attachment)
             async with asyncio.timeout(timeout_s + GRACE_S):
                 await ended.wait()
         except TimeoutError:
             raise too_late(selector, timeout_s) from None
         finally:
-            given_up.cancel()
-        came = answered(selector, timeout_s, replies)
-        if not came:
+            replies.close()
+        answers = replies.result()
+        if not answers:
             raise nobody(selector)
-        return came[0]
+        return answers[0]
 
 
 class _Waiting:

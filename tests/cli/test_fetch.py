@@ -8,7 +8,8 @@ import re
 from collections.abc import Callable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from coec.adapters.images.codec import encode_jpeg
 from coec.adapters.mcap.windows import WindowWriter, write_result
 from coec.adapters.zenoh.bus import Answer
 from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.window_fetch import PIECE_BYTES, Recording, fetch_window
+from coec.adapters.zenoh.window_fetch import PIECE_BYTES, SPARE_BYTES, NoRoomError, Recording, fetch_window
+from coec.cli import fetch as cli_fetch
 from coec.config import UplinkConfig, ZenohConfig
 from coec.errors import NotFoundError, RemoteError, UsageError
 from coec.runtime.api.uplink import BURST_BYTES
@@ -27,7 +29,7 @@ from coec.runtime.recording.digests import DigestReader
 from coec.schemas.base import to_json
 from coec.schemas.incident import IncidentReport
 from coec.schemas.keys import Keys, parse_range_selector
-from coec.schemas.replies import WindowInfo, WindowsReply
+from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
 from e2e.processes import Router
 from fakes import wait_until
 from last_words import a_word, packed
@@ -201,6 +203,38 @@ def test_of_a_vehicle_that_is_parked_its_last_word_is_told(coec: Coec, router: R
     assert re.search(r"truck-3 does not answer; it took its leave \d+ d ago \(front: miscalibrated\)", outcome.err)
 
 
+@pytest.mark.fault(
+    "a vehicle that lists more recordings of an event than are fetched", "what is left out is listed, and how to get it"
+)
+@pytest.mark.usefixtures("vehicle")
+def test_recordings_beyond_the_limit_are_left_out(
+    coec: Coec, router: Router, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_fetch, "MAX_RECORDED_BYTES", 1)
+    outcome = coec("fetch", VEHICLE, "latest", "--connect", router.endpoint, "--output", tmp_path, "--json")
+    report = IncidentReport.model_validate(outcome.document)
+    assert (outcome.status, report.windows) == (1, ())
+    assert ["and 1 may be fetched: nothing of it was" in absent.why for absent in report.absent] == [True, True]
+    assert list((tmp_path / "windows").glob("*")) == []
+
+
+@pytest.mark.fault(
+    "a vehicle that lists thousands of snippets of one event", "the nearest are fetched, the rest is counted"
+)
+def test_snippets_of_an_event_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = cli_fetch._Fetch(cast(Any, None), KEYS, PAIR, tmp_path, cast(Any, None))
+    file: dict[str, Any] = {"size_bytes": 1, "sha256": SHA256, "event": "suspect", "recorded_ns": 8}
+    snippets = tuple(SnippetInfo(snippet_id=f"front-{n}.snippet", stamp_ns=n, **file) for n in range(1000))
+    listed = WindowsReply(vehicle=VEHICLE, pair=PAIR, windows=(), snippets=snippets)
+    monkeypatch.setattr(cli_fetch._Fetch, "_document", lambda *_: listed)
+    monkeypatch.setattr(cli_fetch._Fetch, "_recording", lambda *_: snippets[0])
+    found = sorted(bench._snippets(cast(Any, SimpleNamespace(stamp_ns=100))))
+    nearest = sorted(f"front-{n}.snippet" for n in range(92, 108))
+    assert (found, len(found)) == (nearest, cli_fetch.MAX_SNIPPETS)
+    (absent,) = bench.absent
+    assert (absent.what, "lists 1000" in absent.why) == ("984 snippets", True)
+
+
 # ------------------------------------------------------------------------------------------------ pieces of a window
 
 
@@ -273,6 +307,21 @@ def test_a_window_goes_on_where_the_link_broke(
     assert [each.name for each in tmp_path.iterdir()] == ["w.mcap"]
 
 
+@pytest.mark.fault("a disk with too little room for a window", "nothing is fetched, and how much is needed is said")
+def test_a_window_for_which_there_is_no_room_is_not_begun(
+    router: Router, far: Keys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sender = Sender(router.session, far, whole)
+    free = SPARE_BYTES + len(DATA) - 1
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+    with pytest.raises(NoRoomError, match=f"{len(DATA)} bytes are to be fetched, {free} are free"):
+        fetch(router, far, tmp_path / "w.mcap")
+    assert (sender.asked, list(tmp_path.iterdir())) == ([], [])
+    free += 1
+    fetch(router, far, tmp_path / "w.mcap")
+    sender.end()
+
+
 @pytest.mark.fault("the vehicle's uplink is busy", "the piece is asked for again until it comes, or patience ends")
 def test_who_is_told_to_wait_waits(router: Router, far: Keys, tmp_path: Path) -> None:
     refusals = iter(["uplink_busy", "busy"])
@@ -294,10 +343,11 @@ def test_who_is_told_to_wait_waits(router: Router, far: Keys, tmp_path: Path) ->
         (lambda _, n: bytes(n), {}, "checksum"),
         (lambda at, n: whole(at, n) + b"x", {}, "checksum"),
         (lambda *_: b"", {}, "checksum"),
+        (lambda at, n: whole(at, min(n, 1)), {}, "checksum"),
         (whole, {"size_bytes": 2**40}, "too_large"),
         (whole, {"sha256": "../../../etc/x"}, "malformed"),
     ],
-    ids=["others", "more", "none", "too large", "a path"],
+    ids=["others", "more", "none", "a byte at a time", "too large", "a path"],
 )
 def test_what_is_not_what_was_promised_is_no_window(
     router: Router, far: Keys, tmp_path: Path, answer: Callable[[int, int], bytes], told: dict[str, Any], code: str

@@ -130,7 +130,7 @@ def no_event(_: str) -> Sequence[Route]:
         (("health", "--to", "x"), "health is no command"),
         (("health", "--payload", "{}"), "health is no command"),
         (("command/hold", "--to", "x"), "It takes --release: "),
-        (("command/apply", "--release"), "It takes --reason: "),
+        (("command/apply", "--release"), "It takes --candidate: "),
         (("command/rollback", "--to", "x", "--sensor", "roof"), "command/rollback of the rig does not take it"),
         (("command/hold", "--release", "--payload", "{}"), "leave --release out, or --payload"),
         (("command/explode", "--release"), "known: calibrate, apply"),
@@ -296,6 +296,7 @@ def test_several_pairs_answer_in_one_document_by_pair_and_a_table_each(coec: Coe
     ("typed", "key", "payload"),
     [
         (("command/rollback", "--to", "ab12"), KEYS.command("front", "rollback"), {"to": "ab12"}),
+        (("command/apply", "--candidate", "ab12cd34"), KEYS.command("front", "apply"), {"candidate": "ab12cd34"}),
         (("command/hold", "--reason", "a new lens"), KEYS.command("front", "hold"), {"reason": "a new lens"}),
         (("command/hold", "--release"), KEYS.command("front", "hold"), {"release": True}),
         (("command/hold", "--sensor", "roof"), KEYS.command(RIG, "hold"), {"sensor": "roof"}),

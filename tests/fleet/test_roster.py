@@ -109,6 +109,19 @@ def test_who_floods_takes_no_more_memory_than_a_fleet_does() -> None:
     assert now.pairs[0].word.state == "suspect", "those that are known are heard"
 
 
+@pytest.mark.fault("a flood of words of the largest size", "their bytes are bounded as their number is")
+def test_words_of_the_largest_size_take_no_more_memory_than_a_fleet_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = len(packed(a_word("v0", "front")))
+    monkeypatch.setattr("coec.fleet.roster.MAX_WORD_BYTES", 3 * size)
+    roster = Roster()
+    for index in range(10):
+        said(roster, 0.0, f"v{index}")
+    said(roster, 1.0, "v0")
+    assert (roster.now(1.0).known, roster.now(1.0).refused) == (3, {"too_many_pairs": 7})
+    said(roster, 2.0, "v0", reasons=({"code": "suspect", "text": "x" * 300},))
+    assert roster.now(2.0).refused == {"too_many_pairs": 7, "word_too_large": 1}
+
+
 def test_what_is_no_word_is_counted() -> None:
     roster = Roster()
     roster.hear("coec/@v1/a/last/front", b"\xc1", 0.0)

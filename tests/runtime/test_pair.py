@@ -3,6 +3,7 @@ on restarts, and people have the last word."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -227,6 +228,32 @@ def test_with_never_the_candidate_waits_until_a_person_applies_it(tmp_path: Path
     assert bench.do("apply") == "nothing_pending"
     bench.drive(END_S, END_S + 10)
     assert bench.health == "healthy"
+
+
+@pytest.mark.fault(
+    "the candidate that a person looked at was replaced by another",
+    "`apply` that names it is refused, and says which waits",
+)
+def test_apply_takes_the_named_candidate_and_no_other(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "state", apply="never")
+    bench.drive(BEGIN_S, STEP_S)
+    seen = bench.answers.extrinsic_reply.pending
+    bench.drive(STEP_S, END_S)
+    waits = bench.answers.extrinsic_reply.pending
+    assert seen is not None
+    assert waits is not None
+    content = waits.window_id.encode() + b"\n" + np.array(waits.camera_from_lidar.matrix, "<f8").tobytes()
+    assert waits.sha256 == hashlib.sha256(content).hexdigest() != seen.sha256
+    for other in (str(seen.sha256), seen.window_id, waits.sha256[:4], ""):
+        done = bench.acknowledged("apply", candidate=other)
+        assert (done.accepted, done.code) == (False, "other_candidate")
+        assert waits.sha256[:16] in done.text
+        assert waits.window_id in done.text
+    np.testing.assert_array_equal(bench.pose, NOMINAL)
+    done = bench.acknowledged("apply", candidate=waits.sha256[:16])
+    assert (done.code, done.window_id, waits.sha256[:16] in done.text) == ("applied", waits.window_id, True)
+    np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
+    assert bench.do("apply", candidate=waits.window_id) == "nothing_pending"
 
 
 def test_a_roll_back_returns_to_any_accepted_calibration(bench: Bench) -> None:

@@ -153,7 +153,7 @@ def test_the_conversation_of_a_command_is_named_by_32_digits() -> None:
 
 
 def test_claims_of_daemons_are_read_back_and_nothing_else_is() -> None:
-    for claim in (Claim("1a", 5, serving=True), Claim("f" * 32, 0, serving=False)):
+    for claim in (Claim("1a", 5, serving=True), Claim("f" * 32, 1, serving=False)):
         key = KEYS.claim(claim)
         assert KEYS.parse_claim(key) == claim
         assert zenoh.KeyExpr(KEYS.claims).intersects(zenoh.KeyExpr(key))

@@ -22,7 +22,7 @@ from coec.adapters.files import output
 from coec.adapters.images.codec import decode_bgr, probe
 from coec.adapters.mcap.windows import read_result
 from coec.adapters.zenoh.client import ask, ask_one, connected_by, nobody
-from coec.adapters.zenoh.window_fetch import Recording, fetch_window
+from coec.adapters.zenoh.window_fetch import MAX_WINDOW_BYTES, Recording, fetch_window
 from coec.cli.commands.fetch import Options
 from coec.cli.query import OF_PAIR, asked_of
 from coec.config import LimitsConfig
@@ -32,7 +32,7 @@ from coec.reports.fleet_board import duration
 from coec.reports.page import render
 from coec.schemas.base import SCHEMA_VERSION, Message, from_json, json_value, to_json
 from coec.schemas.incident import Absent, FetchedFile, FetchedWindow, IncidentReport
-from coec.schemas.keys import MAX_LENGTH, Keys
+from coec.schemas.keys import Keys
 from coec.schemas.last_word import read as read_word
 from coec.schemas.replies import (
     ChainedEntry,
@@ -55,6 +55,13 @@ AROUND_NS: Final = 600 * 1_000_000_000
 
 SNIPPET_NS: Final = 60 * 1_000_000_000
 """Most sensor time between an event and its snippet: a suspicion comes up to a minute before the event."""
+
+MAX_SNIPPETS: Final = 16
+"""Most snippets of one event. A suspicion, the event, and its end within a minute make three."""
+
+MAX_RECORDED_BYTES: Final = MAX_WINDOW_BYTES
+"""Most bytes of the recordings of one event together, two windows and its snippets, as the vehicle claims them: as much
+as is fetched of one window. Two windows and three snippets have some 500 MB."""
 
 ENTRIES: Final = 300
 """Most entries of the history, some 6 kB each."""
@@ -90,7 +97,7 @@ def run(options: Options) -> int:
         raise UsageError(f"{options.event!a} is no red event: `coec fetch {options.vehicle}` lists them")
     asked = asked_of(None, options.vehicle, options.prefix, options.connect, options.zenoh)
     keys = Keys(asked.prefix, asked.vehicle)
-    with connected_by(asked.way, options.timeout_s, 2 * MAX_LENGTH) as session:
+    with connected_by(asked.way, options.timeout_s) as session:
         events = _events(session, keys, options)
         if options.event is None:
             return _list(events, options)
@@ -172,6 +179,7 @@ class _Fetch:
     options: Options
     files: dict[str, FetchedFile] = field(default_factory=dict)
     absent: list[Absent] = field(default_factory=list)
+    recorded_bytes: int = 0
 
     def fetch(self, event_id: str) -> IncidentReport:
         keys, pair = self.keys, self.pair
@@ -257,9 +265,19 @@ class _Fetch:
         """Ids of the snippets that were recorded at full rate about the event."""
         listed: list[WindowsReply] = []
         self._try("snippets", lambda: listed.append(self._document(WindowsReply, self.keys.windows(self.pair))))
-        for snippet in listed[0].snippets if listed else ():
-            if abs(snippet.stamp_ns - event.stamp_ns) <= SNIPPET_NS and self._recording(snippet.snippet_id) is not None:
+        near = [
+            snippet
+            for snippet in (listed[0].snippets if listed else ())
+            if abs(snippet.stamp_ns - event.stamp_ns) <= SNIPPET_NS
+        ]
+        near.sort(key=lambda snippet: abs(snippet.stamp_ns - event.stamp_ns))
+        for snippet in near[:MAX_SNIPPETS]:
+            if self._recording(snippet.snippet_id) is not None:
                 yield snippet.snippet_id
+        if len(near) > MAX_SNIPPETS:
+            why = f"the vehicle lists {len(near)} about this event, and the {MAX_SNIPPETS} nearest in time were fetched"
+            how = "`coec query windows` lists all, and `coec query windows/ID --output FILE` fetches one"
+            self.absent.append(Absent(what=f"{len(near) - MAX_SNIPPETS} snippets", why=f"{why}; {how}"))
 
     def _recording(self, recording_id: str) -> Recording | None:
         if (named := OF_PAIR.fullmatch(recording_id)) is None or named["pair"] != self.pair:
@@ -267,6 +285,12 @@ class _Fetch:
             return None
         name = _recorded(recording_id)
         found: list[Recording] = []
+        left = MAX_RECORDED_BYTES - self.recorded_bytes
+        if left <= 0:
+            how = f"`coec query windows/{recording_id} --output FILE` fetches it"
+            why = f"the other recordings of the event have {self.recorded_bytes} bytes, as much as is fetched; {how}"
+            self.absent.append(Absent(what=name, why=why))
+            return None
 
         def fetch() -> None:
             with console.progress(counted=False) as bars:
@@ -279,7 +303,9 @@ class _Fetch:
                     self.options.timeout_s,
                     self.options.patience_s,
                     bars.add_download(recording_id),
+                    left,
                 )
+            self.recorded_bytes += info.size_bytes
             self.files[name] = FetchedFile(name=name, sha256=str(info.sha256), size_bytes=info.size_bytes)
             found.append(info)
 

@@ -36,7 +36,7 @@ from coec.config import Config, ZenohConfig, load_config
 from coec.errors import DecodeError, NotFoundError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json, json_value
-from coec.schemas.commands import NAMES, REASON, RELEASE, SENSOR, TO, arguments_of
+from coec.schemas.commands import CANDIDATE, NAMES, REASON, RELEASE, SENSOR, TO, arguments_of
 from coec.schemas.keys import RIG, VERSION_CHUNK, Keys
 from coec.schemas.replies import Acknowledgement, StatusReply
 from coec.untrusted import Untrusted
@@ -220,7 +220,7 @@ def _payload(options: Options) -> bytes | None:
     Raises:
         UsageError: what was given does not fit the command; the message says what does.
     """
-    typed = {argument.name: getattr(options, argument.name) for argument in (TO, RELEASE, REASON, SENSOR)}
+    typed = {argument.name: getattr(options, argument.name) for argument in (TO, CANDIDATE, RELEASE, REASON, SENSOR)}
     given = {name: value for name, value in typed.items() if value not in (None, False)}
     chunks = options.key.split("/")
     command = chunks[-1] if len(chunks) > 1 and chunks[-2] == "command" else None

@@ -24,7 +24,7 @@ from coec.reports import console, fleet_board, half_blocks
 from coec.reports.replies import results_table
 from coec.schemas.base import from_msgpack
 from coec.schemas.fleet_now import FleetNow, PairNow
-from coec.schemas.keys import MAX_LENGTH, Keys
+from coec.schemas.keys import Keys
 from coec.schemas.replies import HistoryReply
 
 FRAME_S = 0.5
@@ -40,9 +40,6 @@ RESULTS = 10
 
 ANSWER_S = 10.0
 """Timeout for the answer to a key press; a picture takes so long over a bad link."""
-
-MAX_MESSAGE = 2 * MAX_LENGTH
-"""Most bytes of an accepted message."""
 
 PANE_ROWS = 16
 """Lines for the details of one pair."""
@@ -66,8 +63,8 @@ def run(options: Options, asked: Asked) -> int:
     chosen = Filter(of_states(options.states or (), UsageError), options.find or "")
     with (
         until_signal() as stop,
-        connected_by(asked.way, options.timeout_s, MAX_MESSAGE) as session,
-        connected_by(asked.way, options.timeout_s, MAX_MESSAGE) as of_tokens,
+        connected_by(asked.way, options.timeout_s) as session,
+        connected_by(asked.way, options.timeout_s) as of_tokens,
     ):
         words = Words(session, of_tokens, Keys(asked.prefix, asked.vehicle), options.timeout_s)
         with words.listening():

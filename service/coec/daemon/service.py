@@ -20,7 +20,7 @@ from coec.adapters.system.threads import ServiceThread
 from coec.adapters.tls.conversation import Listener, credentials_of
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.endpoints import redacted
-from coec.adapters.zenoh.presence import Presence, told
+from coec.adapters.zenoh.presence import Presence, told, unproven_text
 from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.ros_publisher import RosPublishers
 from coec.adapters.zenoh.ros_side import RosSide
@@ -432,7 +432,9 @@ class Daemon:
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
         hidden = TOKENS_HIDDEN if self._presence.hidden else None
-        own = (self._scribe.trouble, self._insecure, hidden, self._router.trouble, self._door.insecure)
+        tokens = self._presence.unproven
+        unproven = Reason("rival_unproven", unproven_text(tokens)) if tokens else None
+        own = (self._scribe.trouble, self._insecure, hidden, unproven, self._router.trouble, self._door.insecure)
         return tuple(reason for reason in (self._fault, failing, *own) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------

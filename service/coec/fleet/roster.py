@@ -23,6 +23,10 @@ AXES: Final = ("rx", "ry", "rz", "tx", "ty", "tz")
 MAX_PAIRS: Final = 200_000
 """How many pairs are kept, some 3 kB each. So a flood of words takes no more memory than a fleet does."""
 
+MAX_WORD_BYTES: Final = 2**28
+"""Most bytes of their last words together, as these came: as many words of the usual 1 kB have less. A word may have
+16 kB."""
+
 OVERDUE_PERIODS: Final = 2.5
 """After so many of its own periods without a word a pair is silent: one word may be lost on the way."""
 
@@ -39,12 +43,13 @@ _Place = tuple[int, float, float, Name]
 @dataclass(slots=True)
 class _Heard:
     """A word; when it was said, by the watcher's steady clock; which axis drifted furthest and how far, in multiples of
-    the drift that a monitor has to detect; and whether its vehicle has gone since."""
+    the drift that a monitor has to detect; its size as it came, bytes; and whether its vehicle has gone since."""
 
     word: LastWord
     said_s: float
     axis: int | None
     urgency: float
+    size: int
     gone: bool = False
 
 
@@ -69,6 +74,7 @@ class Roster:
 
     def __init__(self, most: int = MAX_PAIRS) -> None:
         self._most = most
+        self._bytes = 0
         self._heard: dict[Name, _Heard] = {}
         self._refused: Counter[str] = Counter()
 
@@ -76,7 +82,7 @@ class Roster:
         """Takes in a word as it is said, at `now_s` by the steady clock. Invalid words are counted."""
         word = self._read(key, payload)
         if word is not None:
-            self._take(word, now_s)
+            self._take(word, len(payload), now_s)
 
     def recall(self, key: str, payload: bytes, now_s: float, wall_ns: int) -> None:
         """Takes in a word that was kept or asked for, unless a later one is known."""
@@ -85,7 +91,7 @@ class Roster:
             return
         known = self._heard.get((word.vehicle, word.pair))
         if known is None or word.said_ns > known.word.said_ns:
-            self._take(word, now_s - max((wall_ns - word.said_ns) * 1e-9, 0.0))
+            self._take(word, len(payload), now_s - max((wall_ns - word.said_ns) * 1e-9, 0.0))
 
     def present(self, vehicle: str, pair: str, *, is_there: bool) -> None:
         """The liveliness token of a pair came or went. A token that came does not say what the pair's state is."""
@@ -135,12 +141,18 @@ class Roster:
             self._refused[error.reason] += 1
             return None
 
-    def _take(self, word: LastWord, said_s: float) -> None:
+    def _take(self, word: LastWord, size: int, said_s: float) -> None:
         name = (word.vehicle, word.pair)
-        if name not in self._heard and len(self._heard) >= self._most:
+        before = self._heard.get(name)
+        total = self._bytes + size - (0 if before is None else before.size)
+        if before is None and (len(self._heard) >= self._most or total > MAX_WORD_BYTES):
             self._refused["too_many_pairs"] += 1
             return
-        self._heard[name] = _Heard(word, said_s, *_drift(word))
+        if total > max(MAX_WORD_BYTES, self._bytes):
+            self._refused["word_too_large"] += 1
+            return
+        self._bytes = total
+        self._heard[name] = _Heard(word, said_s, *_drift(word), size)
 
 
 def of_states(names: Iterable[str], refuse: Callable[[str], Exception]) -> frozenset[str]:

@@ -41,7 +41,9 @@ def extrinsic(payload: bytes) -> None:
         console.show(f"nothing is applied: {told}", "bold yellow")
     if reply.pending is not None:
         waits = f": {reply.pending.waits.text}" if reply.pending.waits else ""
-        console.show(f"a candidate from window {reply.pending.window_id} waits for `command/apply`{waits}", "yellow")
+        named = f"{reply.pending.sha256[:16]} " if reply.pending.sha256 else ""
+        of = f"a candidate {named}from window {reply.pending.window_id}"
+        console.show(f"{of} waits for `command/apply`{waits}", "yellow")
         if reply.pending.step is not None:
             console.show(
                 "  step "

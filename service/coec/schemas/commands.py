@@ -31,12 +31,21 @@ TO: Final = Argument(
     str,
     "id of an accepted window, or the beginning of a sha256 of `history`: what was served then is served again",
 )
+CANDIDATE: Final = Argument(
+    "candidate",
+    str,
+    "id of a window, or the beginning of the sha256 of the candidate in `extrinsic`: only this candidate is applied",
+)
 REASON: Final = Argument(
     "reason", str, "why, for whoever asks later: stands in `history`, that of a `hold` in `extrinsic` and `health`"
 )
 SENSOR: Final = Argument("sensor", str, "of the rig: all pairs of this sensor, and no others")
 
-OF_PAIR: Final[Mapping[str, tuple[Argument, ...]]] = {"rollback": (TO,), "hold": (RELEASE,)}
+OF_PAIR: Final[Mapping[str, tuple[Argument, ...]]] = {
+    "apply": (CANDIDATE,),
+    "rollback": (TO,),
+    "hold": (RELEASE,),
+}
 """What the payload of each command may hold beside the reason, which all commands take."""
 
 MAX_REASON: Final = 200
@@ -44,10 +53,10 @@ MAX_REASON: Final = 200
 
 
 def arguments_of(command: str, *, for_rig: bool) -> tuple[Argument, ...]:
-    """What the payload of a command may hold, for a pair or for the rig. For the rig there is no `to`, because a window
-    belongs to one pair."""
+    """What the payload of a command may hold, for a pair or for the rig. For the rig there is neither `to` nor
+    `candidate`, because a window belongs to one pair."""
     own = (*OF_PAIR.get(command, ()), REASON)
-    return (*(argument for argument in own if argument is not TO), SENSOR) if for_rig else own
+    return (*(argument for argument in own if argument not in (TO, CANDIDATE)), SENSOR) if for_rig else own
 
 
 class ProvenCommand(Message):

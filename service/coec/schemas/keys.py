@@ -138,11 +138,11 @@ class Keys:
 
     @property
     def claims(self) -> str:
-        """Liveliness tokens of the vehicle's daemons, all of them."""
+        """Liveliness tokens of the vehicle's daemons, all of them; each daemon answers a query for its own."""
         return f"{self.root}/alive/*/*/*"
 
     def claim(self, claim: Claim) -> str:
-        """Liveliness token of a daemon: `alive/<starting or serving>/<daemon>/<since_ns>`."""
+        """Liveliness token of a daemon, and queryable: `alive/<starting or serving>/<daemon>/<since_ns>`."""
         return f"{self.root}/alive/{'serving' if claim.serving else 'starting'}/{claim.daemon}/{claim.since_ns}"
 
     def parse_claim(self, key: str) -> Claim:
@@ -151,7 +151,7 @@ class Keys:
         Raises:
             UsageError: not the token of a daemon of this vehicle.
         """
-        form = re.escape(f"{self.root}/alive/") + r"(starting|serving)/([0-9a-f]{1,32})/([0-9]{1,19})"
+        form = re.escape(f"{self.root}/alive/") + r"(starting|serving)/([1-9a-f][0-9a-f]{0,31})/([1-9][0-9]{0,18})"
         match = re.fullmatch(form, key)
         if match is None:
             raise UsageError("not the token of a daemon of this vehicle")

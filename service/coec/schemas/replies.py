@@ -182,6 +182,11 @@ class Candidate(Part):
     """A result that waits for `apply`."""
 
     window_id: Text
+    sha256: Text | None = Field(
+        default=None,
+        description="of the window's id, a line feed, and the matrix as 16 little-endian doubles row by row: names the "
+        "candidate for `apply`; null: the service is of an earlier version",
+    )
     data_stamp_ns: int
     camera_from_lidar: Transform
     step: Vector6 | None = Field(default=None, description="from the served extrinsic: rx ry rz (deg), tx ty tz (m)")

@@ -117,13 +117,13 @@ def test_a_key_without_a_type_still_comes_in_to_be_counted(session: zenoh.Sessio
 def test_a_bridge_puts_a_topic_on_its_name(session: zenoh.Session, heard: Heard, namespace: str, key: str) -> None:
     got = heard(configured("ros2dds", "/front/image_raw", namespace=namespace))
     session.put(key, b"\0\1\0\0")
-    assert got.get(timeout=DEADLINE_S) == Sample(b"\0\1\0\0", "zenoh/bytes", None)
+    assert got.get(timeout=DEADLINE_S) == Sample(b"\0\1\0\0", "zenoh/bytes", None, origin=str(session.zid()).encode())
 
 
 def test_keys_stay_keys_beside_topics(session: zenoh.Session, heard: Heard) -> None:
     got = heard(configured("rmw_zenoh", {"key": "front/camera"}))
     session.put("front/camera", b"x", encoding="application/msgpack", attachment=b"of the sender's own")
-    assert got.get(timeout=DEADLINE_S) == Sample(b"x", "application/msgpack", None)
+    assert got.get(timeout=DEADLINE_S) == Sample(b"x", "application/msgpack", None, origin=str(session.zid()).encode())
 
 
 def test_keys_are_read_and_written_alike() -> None:

@@ -6,7 +6,7 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,9 +17,11 @@ from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.presence import Presence, next_step, outranking
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import UnavailableError
+from coec.schemas.base import to_json
 from coec.schemas.keys import Claim, Keys
 from fakes import wait_until
 from ports import free_port
+from statuses import a_status
 
 KEYS = Keys("coec", "vehicle")
 LIMITS = LimitsConfig()
@@ -122,18 +124,120 @@ def test_who_comes_later_says_who_is_there_and_is_no_matter_to_another_vehicle(
     assert serves(daemon(two, Keys("coec", "other")))
 
 
-def test_the_token_of_a_pair_tells_of_a_daemon_too(
-    router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made
+@contextmanager
+def held(session: zenoh.Session, *keys: str) -> Iterator[None]:
+    """Liveliness tokens that any program could declare."""
+    tokens = [session.liveliness().declare_token(key) for key in keys]
+    yield
+    for token in tokens:
+        token.undeclare()
+
+
+@contextmanager
+def answering_status(session: zenoh.Session, started_ns: int) -> Iterator[None]:
+    """What a service of an earlier version answers."""
+    payload = to_json(a_status(vehicle=KEYS.vehicle, started_ns=started_ns))
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(KEYS.status, payload)
+
+    queryable = session.declare_queryable(KEYS.status, zenoh.handlers.Callback(answer, indirect=False), complete=True)
+    yield
+    queryable.undeclare()
+
+
+FAKED = KEYS.claim(Claim("1", 1, serving=True))
+"""The smallest id of a daemon, so that every other daemon would have to leave."""
+
+
+@pytest.mark.fault(
+    "a program holds the token of another daemon, or of a pair, but answers no query",
+    "the daemon serves after a bounded wait, and reports the token",
+)
+@pytest.mark.parametrize("key", [FAKED, KEYS.claim(Claim("1", 7, serving=False)), KEYS.alive("front")])
+def test_a_token_without_an_answer_ends_nothing(
+    router: zenoh.Session,
+    sessions: list[zenoh.Session],
+    daemon: Made,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    key: str,
 ) -> None:
-    token = router.liveliness().declare_token(KEYS.alive("front"))
-    with pytest.raises(UnavailableError, match=r"somebody holds the token coec/@v1/vehicle/front/alive"):
+    monkeypatch.setattr(presence, "PROOF_S", 0.2)
+    one = daemon(sessions[0])
+    with held(router, key):
+        assert serves(one)
+    assert one.unproven == (key,)
+    assert [key in record.getMessage() for record in caplog.records] == [True]
+
+
+@pytest.mark.fault(
+    "a program declares the token of another daemon while the service runs", "it goes on, and reports the token"
+)
+def test_a_token_without_an_answer_ends_no_service_that_runs(
+    router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(presence, "WATCH_S", 0.02)
+    one = daemon(sessions[0])
+    assert serves(one)
+    one.thread.start()
+    copied = KEYS.claim(Claim("2", STARTED_NS, serving=True))
+    with held(router, FAKED, copied, KEYS.alive("front")), answering_status(sessions[0], STARTED_NS):
+        wait_until(lambda: set(one.unproven) == {FAKED, copied}, "the tokens are reported")
+        assert one.rival is None, "the answer of the service itself proves no token that copies its start"
+    wait_until(lambda: one.unproven == (), "the tokens are gone")
+    with held(router, FAKED), answering_status(sessions[1], 1):
+        wait_until(lambda: one.rival == Claim("1", 1, serving=True), "a service of an earlier version")
+
+
+@pytest.mark.fault(
+    "a daemon of an earlier version, which answers `status` only, serves the vehicle", "the new one leaves"
+)
+@pytest.mark.parametrize("token", [FAKED, KEYS.alive("front")])
+def test_a_service_of_an_earlier_version_is_seen_by_its_status(
+    router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made, token: str
+) -> None:
+    with held(router, token), answering_status(router, 1), pytest.raises(UnavailableError, match="another daemon"):
         daemon(sessions[0]).claim(threading.Event())
-    token.undeclare()
+
+
+@pytest.mark.fault("more tokens of daemons than are kept", "a daemon that is there is seen all the same")
+def test_tokens_hide_no_daemon(router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made) -> None:
     assert serves(daemon(sessions[0]))
+    flood = [KEYS.claim(Claim(f"{number:x}", 1, serving=True)) for number in range(1, 3 * presence.MAX_OTHERS)]
+    with held(router, *flood), pytest.raises(UnavailableError, match=r"started 2023-11-14 22:13:20 UTC"):
+        daemon(sessions[1]).claim(threading.Event())
+
+
+def test_a_wider_query_gets_no_claim(sessions: list[zenoh.Session], daemon: Made) -> None:
+    assert serves(daemon(sessions[0]))
+
+    def replies(key: str) -> list[zenoh.Reply]:
+        return list(sessions[0].get(key, target=zenoh.QueryTarget.ALL, timeout=DEADLINE_S))
+
+    assert (len(replies(f"{KEYS.root}/**")), len(replies(KEYS.claims))) == (0, 1)
+
+
+@pytest.mark.fault("a router whose rules let no daemon query another", "its tokens count without an answer, as before")
+def test_where_queries_are_forbidden_tokens_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(presence, "PROOF_S", 0.2)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    file = tmp_path / "router.json5"
+    settings = {"mode": "router", "listen": {"endpoints": [endpoint]}, "access_control": hiding("query")}
+    file.write_text(json.dumps(settings))
+    config = ZenohConfig(connect=(endpoint,))
+    with open_session(ZenohConfig(file=file), LIMITS), open_session(config, LIMITS) as here:
+        wait_until(lambda: bool(list(here.info.routers_zid())), "the router is there")
+        for key, said in ((FAKED, "by another daemon"), (KEYS.alive("front"), "somebody holds the token")):
+            one = Presence(here, config, LIMITS, KEYS, STARTED_NS)
+            with held(here, key), pytest.raises(UnavailableError, match=said):
+                one.claim(threading.Event())
+            assert one.close(DEADLINE_S)
 
 
 def test_a_token_of_another_form_is_nobody(router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made) -> None:
-    ends = ("serving/zz/1", "serving/1/" + "9" * 40, "gone/1/1")
+    ends = ("serving/zz/1", "serving/1/" + "9" * 40, "gone/1/1", "serving/0/1", "serving/1/0")
     tokens = [router.liveliness().declare_token(f"{KEYS.root}/alive/{end}") for end in ends]
     assert serves(daemon(sessions[0]))
     for token in tokens:

@@ -72,16 +72,19 @@ def test_a_publisher_that_is_started_again_is_a_new_one(desk: Desk) -> None:
     assert desk.decoder.counts().taking_turns == ()
 
 
-@pytest.mark.fault("two publishers on one topic of ROS", "their losses are counted apart, and health names them")
+@pytest.mark.fault(
+    "two publishers on one topic of ROS",
+    "their losses are counted apart, health names them, and no frame of either is used until one ends",
+)
 def test_two_publishers_at_a_time_are_told_apart_until_one_ends(desk: Desk) -> None:
     for number in range(1, 11):
         desk.take(beside(number, 1))
         desk.take(beside(500 + number, 2))
     assert set(desk.decoder.counts().taking_turns) == {b"\1" * 16, b"\2" * 16}
-    for number in range(11, 80):
-        desk.take(beside(number, 1))
+    frames = [desk.take(beside(number, 1)) for number in range(11, 80)]
     assert not desk.decoder.counts().taking_turns
-    assert desk.losses.snapshot() == {}
+    assert (frames[0], frames[-1]) == (None, FRAME)
+    assert set(desk.losses.snapshot()) == {(CAMERA, "two_senders")}
 
 
 @pytest.mark.fault("a publisher whose numbers step back or are absurd", "frames are taken, no loss is invented")

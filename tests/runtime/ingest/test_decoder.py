@@ -13,6 +13,7 @@ from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import outgoing
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import (
@@ -26,8 +27,12 @@ from coec.config import (
     PairingConfig,
     PointTimeConfig,
 )
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
+from coec.runtime.api.streams import troubles_of
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame
+from coec.runtime.ingest.frame_budget import FrameBudget
 from coec.runtime.ingest.inbox import Call, Inbox, Parcel
+from coec.runtime.ingest.senders import RECENT
+from coec.runtime.ingest.sensor import SensorStream
 from ros_messages import packed, transforms
 from sweeps import ROOF, a_sweep, in_frame
 
@@ -215,9 +220,85 @@ def test_a_fault_of_a_decoder_costs_the_message_only(desk: Desk, monkeypatch: py
 
 
 def test_gaps_in_the_numbers_are_loss_but_a_new_count_is_not(desk: Desk) -> None:
-    for sequence in (7, 8, 11, 11, 0, 1, 2_000_000):
+    for sequence in (7, 8, 11, 11, 0, 1, 2_000_000, 2_000_001, 2_000_002):
         assert desk.take(CAMERA, msgpack_frames.encode_camera(camera(sequence)), MSGPACK) is not None
     assert desk.losses.snapshot() == {(CAMERA, "sequence_gap"): 2}
+
+
+@pytest.mark.fault(
+    "another sensor, with its own frame id or image size, sends on a native key",
+    "its frames are refused, those of the stream are used, and health says so",
+)
+@pytest.mark.parametrize("odd", [camera(5000, frame_id="other"), camera(5000, width=6)], ids=["frame id", "size"])
+def test_frames_of_another_sensor_are_not_mixed_in(desk: Desk, odd: CameraFrame) -> None:
+    frames = []
+    for number in range(20):
+        frames.append(desk.take(CAMERA, msgpack_frames.encode_camera(camera(number)), MSGPACK))
+        theirs = replace(odd, sequence=5000 + number)
+        assert desk.take(CAMERA, msgpack_frames.encode_camera(theirs), MSGPACK) is None
+    counts = desk.decoders[CAMERA].counts()
+    assert (None in frames, counts.foreign, counts.taking_turns) == (False, True, ())
+    assert {reason for _, reason in desk.losses.snapshot()} <= {"frame_id", "image_size"}
+    (trouble,) = troubles_of({CAMERA: counts}, PAIR, Topics())
+    assert trouble.code == "foreign_frames"
+    for number in range(20, 20 + RECENT):
+        desk.take(CAMERA, msgpack_frames.encode_camera(camera(number)), MSGPACK)
+    assert not desk.decoders[CAMERA].counts().foreign
+
+
+@pytest.mark.fault("two sources of ego-motion, each in a frame of its own", "one of them is used until it ends")
+def test_ego_motion_keeps_to_the_frame_that_it_began_with(desk: Desk) -> None:
+    def taken(frame_id: str, number: int) -> bool:
+        motion = replace(MOTION, frame_id=frame_id, sequence=number)
+        return desk.take(EGO, msgpack_frames.encode_ego(motion), MSGPACK) is not None
+
+    assert [(taken("base", n), taken("other", 900 + n)) for n in range(100)] == [(True, False)] * 100
+    assert [taken("other", 1000 + n) for n in range(RECENT)] == [*[False] * (RECENT - 2), True, True]
+
+
+@pytest.mark.fault(
+    "a second vehicle sends on the same native keys, with the same frame ids and numbers of its own",
+    "no frame of either is used until one ends, and health says so",
+)
+def test_frames_of_two_vehicles_are_not_mixed() -> None:
+    stream = SensorStream(CAMERA, "camera-0", PAIR.camera, LimitsConfig())
+    used: list[Frame] = []
+    stream.takers = (used.append,)
+    budget = FrameBudget(2**30)
+
+    def put(number: int, stamp_ns: int) -> None:
+        frame = replace(camera(number), stamp_ns=stamp_ns)
+        stream.take(Sample(msgpack_frames.encode_camera(frame), MSGPACK), budget)
+
+    for index in range(30):
+        put(index, index * 10**8)
+    assert len(used) == 30
+    put(7000, 29 * 10**8 + 10**7)
+    assert len(used) == 30, "the first frame of another is kept back"
+    for index in range(30, 60):
+        put(index, index * 10**8)
+        put(6971 + index, index * 10**8 + 10**7)
+    counts = stream.decoder.counts()
+    assert (len(counts.taking_turns), len(used)) == (2, 30)
+    (trouble,) = troubles_of({CAMERA: counts}, PAIR, Topics())
+    assert (trouble.code, "refused until only one sends" in trouble.text) == ("two_senders", True)
+    assert stream.losses.snapshot() == {(CAMERA, "two_senders"): 61}
+    for index in range(60, 60 + RECENT + 10):
+        put(index, index * 10**8)
+    assert len(used) > 30
+    assert all(frame.sequence is not None and frame.sequence < 7000 for frame in used)
+    assert stream.decoder.counts().taking_turns == ()
+
+
+def test_a_sensor_that_is_started_again_loses_no_frame() -> None:
+    stream = SensorStream(CAMERA, "camera-0", PAIR.camera, LimitsConfig())
+    used: list[Frame] = []
+    stream.takers = (used.append,)
+    for number in (*range(1000, 1030), *range(30)):
+        payload = msgpack_frames.encode_camera(replace(camera(number), stamp_ns=5 + len(used)))
+        stream.take(Sample(payload, MSGPACK), FrameBudget(2**30))
+    assert [frame.sequence for frame in used] == [*range(1000, 1030), *range(30)]
+    assert stream.losses.snapshot() == {}
 
 
 @pytest.mark.fault("a frame that is overtaken by another", "it is counted once")

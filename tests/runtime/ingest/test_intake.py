@@ -198,8 +198,9 @@ def test_what_is_lost_of_a_stream_is_counted_once_and_every_pair_of_it_tells() -
     vehicle.put("camera/0", image(0, sequence=0))
     vehicle.put("camera/0", image(20, sequence=20))
     vehicle.put("camera/0", image(40, sequence=40))
+    vehicle.put("camera/0", image(60, sequence=60))
     vehicle.settle()
-    assert vehicle.streams["0-0"].losses() == {(LIDAR, "message_malformed"): 1, (CAMERA, "sequence_gap"): 22}
+    assert vehicle.streams["0-0"].losses() == {(LIDAR, "message_malformed"): 1, (CAMERA, "sequence_gap"): 41}
     assert vehicle.streams["1-0"].losses() == {(LIDAR, "message_malformed"): 1}
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 import zenoh
 
-from coec.adapters.zenoh.client import JSON
+from coec.adapters.zenoh.client import JSON, is_later
 from coec.errors import DecodeError
 from coec.schemas.base import from_json, from_msgpack
 from coec.schemas.keys import Keys
@@ -57,10 +57,11 @@ def listening(
     begins before the answers about the current state are there; they come within `timeout_s` or not at all. A pair that
     appears later is queried, too, because its first words may have been sent before it knew of this subscriber."""
     heard: set[str] = set()
+    answers: dict[str, tuple[object, zenoh.Timestamp | None]] = {}
     order = threading.Lock()
     given_up = zenoh.CancellationToken()
 
-    def give(sample: zenoh.Sample) -> None:
+    def give(sample: zenoh.Sample) -> bool:
         key = str(sample.key_expr)
         try:
             if key not in heard and len(heard) >= MAX_KEYS:
@@ -68,32 +69,43 @@ def listening(
             change = _change(sample)
         except DecodeError:
             refuse()
-        else:
-            heard.add(key)
-            take(change)
+            return False
+        heard.add(key)
+        take(change)
+        return True
 
-    def hear(sample: zenoh.Sample) -> None:
+    def hear(sample: zenoh.Sample) -> bool:
         with order:
-            give(sample)
-
-    def answered(reply: zenoh.Reply) -> None:
-        with order:
-            # A change that was heard meanwhile is as new as this answer, or newer.
-            if reply.ok is not None and str(reply.ok.key_expr) not in heard:
-                give(reply.ok)
+            answers.pop(str(sample.key_expr), None)
+            return give(sample)
 
     def ask(told: Iterable[str]) -> None:
+        query = object()
+
+        def answered(reply: zenoh.Reply) -> None:
+            if reply.ok is None:
+                return
+            with order:
+                key, stamp = str(reply.ok.key_expr), reply.ok.timestamp
+                asked, before = answers.get(key, (None, None))
+                # A change that was heard meanwhile is as new as this answer, or newer. Of several answers to one query
+                # the latest counts.
+                if (key not in heard or (asked is query and is_later(stamp, before))) and give(reply.ok):
+                    answers[key] = (query, stamp)
+
         for key in told:
             session.get(
                 key,
                 zenoh.handlers.Callback(answered, indirect=False),
                 target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,  # else Zenoh keeps all answers until the query ends
                 timeout=timeout_s,
                 cancellation_token=given_up,
             )
 
     def come_or_gone(sample: zenoh.Sample) -> None:
-        hear(sample)
+        if not hear(sample):
+            return
         of_pair = str(sample.key_expr).removesuffix("alive")
         told = (f"{of_pair}health", f"{of_pair}extrinsic")
         if sample.kind == zenoh.SampleKind.PUT:

@@ -6,7 +6,8 @@ import getpass
 import json
 import re
 import socket
-from collections.abc import Iterable, Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.settings_file import read_settings
 from coec.errors import ConnectionFailedError, DecodeError, NotFoundError, RemoteError, UsageError
 from coec.schemas.base import from_json, from_msgpack
-from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, Keys
+from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, Keys
 from coec.schemas.replies import ErrorReply
 
 JSON = "application/json"
@@ -30,6 +31,44 @@ back."""
 
 TIMEOUT_PAYLOAD = b"Timeout"
 """Zenoh's own reply if nobody finished the query in time."""
+
+GRACE_S = 1.0
+"""Waited beyond the timeout of a query, s. Zenoh ends the query at the timeout, unless its session hangs."""
+
+MAX_MESSAGE_BYTES = 2 * MAX_LENGTH
+"""Largest message that a client accepts, bytes: as much as a service and the shipped router accept by default. Zenoh's
+own default is a gigabyte. It drops a larger message while that comes in, and says nothing about it."""
+
+MAX_ERROR_BYTES = 2**16
+"""Largest error reply that is read; ours have some hundred bytes."""
+
+MAX_SHOWN_KEY = 160
+"""Most characters of a key that an error shows, since a sender chose it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Most that the replies to one query may bring. Anybody whom the router lets answer may send any number of replies
+    of any size.
+
+    Attributes:
+        replies: number of replies.
+        total_bytes: bytes of all replies together.
+        reply_bytes: bytes of one reply.
+    """
+
+    replies: int
+    total_bytes: int
+    reply_bytes: int = MAX_MESSAGE_BYTES
+
+
+OF_ONE_KEY = Bounds(16, MAX_MESSAGE_BYTES)
+"""Of a query for one key. One program answers, or two while a storage keeps last words; more than some are no service
+of ours."""
+
+OF_MANY_KEYS = Bounds(4096, 2 * MAX_MESSAGE_BYTES)
+"""Of a query for many keys: as many replies as `watch` follows keys. The history of 32 pairs has 20 MB at its default
+length."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +97,9 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
 
 
 @contextmanager
-def connected_by(way: Way, wait_s: float, max_message_bytes: int | None = None) -> Iterator[zenoh.Session]:
+def connected_by(way: Way, wait_s: float, max_message_bytes: int = MAX_MESSAGE_BYTES) -> Iterator[zenoh.Session]:
     """A client session with the first router that answers, closed at the end. `max_message_bytes` is the largest
-    message that it receives; None: as the file says, or a gigabyte.
+    message that it receives, whatever the file says.
 
     Raises:
         UsageError: an endpoint is malformed.
@@ -79,8 +118,7 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int | None = None) 
     settings.insert_json5("scouting/multicast/enabled", "false")
     settings.insert_json5("connect/timeout_ms", str(round(wait_s * 1000)))
     settings.insert_json5("connect/exit_on_failure", "true")
-    if max_message_bytes is not None:
-        settings.insert_json5("transport/link/rx/max_message_size", str(max_message_bytes))
+    settings.insert_json5("transport/link/rx/max_message_size", str(max_message_bytes))
     # Publishers that keep their last message for late subscribers need timestamps.
     settings.insert_json5("timestamping/enabled", "true")
     try:
@@ -143,17 +181,18 @@ def ask(
 
     Raises:
         UsageError: the selector does not begin with a key expression.
-        RemoteError: somebody replied with an error, or somebody timed out and nobody else answered.
+        RemoteError: as `Replies.result`.
     """
-    asked = session.get(
-        selector,
-        target=target_of(selector),
-        timeout=timeout_s,
-        payload=payload,
-        encoding=JSON if payload is not None else None,
-        attachment=attachment,
-    )
-    return answered(selector, timeout_s, asked)
+    ended = threading.Event()
+    replies = Replies(selector, timeout_s, ended.set)
+    try:
+        replies.query(session, payload, attachment)
+        in_time = ended.wait(timeout_s + GRACE_S)
+    finally:
+        replies.close()
+    if not in_time:
+        raise too_late(selector, timeout_s)
+    return replies.result()
 
 
 def target_of(selector: str) -> zenoh.QueryTarget:
@@ -166,26 +205,124 @@ def target_of(selector: str) -> zenoh.QueryTarget:
     return zenoh.QueryTarget.ALL if "*" in key else zenoh.QueryTarget.BEST_MATCHING
 
 
-def answered(selector: str, timeout_s: float, asked: Iterable[zenoh.Reply]) -> list[Reply]:
-    """The answers to a query, in the order of their keys.
+class Replies:
+    """The replies to one query, within bounds. Zenoh's threads add them, one thread queries and takes the result.
 
-    Raises:
-        RemoteError: somebody replied with an error, or somebody timed out and nobody else answered.
+    Replies are copied as they come and Zenoh keeps none, so that no more memory is used than the bounds allow. At the
+    first error reply, or beyond a bound, the query ends at once. Of several replies with the same key, the one with the
+    latest timestamp counts.
     """
-    replies: list[Reply] = []
-    timed_out = False
-    for reply in asked:
-        if reply.ok is not None:
-            sample = reply.ok
-            replies.append(Reply(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)))
-        elif reply.err is not None:
-            content = reply.err.payload.to_bytes()
-            if content != TIMEOUT_PAYLOAD:
-                raise _remote_error(content, str(reply.err.encoding))
-            timed_out = True
-    if timed_out and not replies:
-        raise too_late(selector, timeout_s)
-    return sorted(replies, key=lambda reply: reply.key)
+
+    def __init__(
+        self, selector: str, timeout_s: float, ended: Callable[[], None], bounds: Bounds | None = None
+    ) -> None:
+        """`ended` is called on Zenoh's thread when no more replies are needed. `bounds` None: by whether the selector
+        stands for one key.
+
+        Raises:
+            UsageError: the selector does not begin with a key expression.
+        """
+        self._selector = selector
+        self._timeout_s = timeout_s
+        self._ended = ended
+        self._target = target_of(selector)
+        self._key = selector.partition("?")[0]
+        self._bounds = bounds or (OF_MANY_KEYS if "*" in self._key else OF_ONE_KEY)
+        self._given_up = zenoh.CancellationToken()
+        self._replies: dict[str, tuple[Reply, zenoh.Timestamp | None]] = {}
+        self._received = self._bytes = 0
+        self._timed_out = False
+        self._error: RemoteError | None = None
+
+    def query(self, session: zenoh.Session, payload: bytes | None = None, attachment: bytes | None = None) -> None:
+        """Sends the query and returns at once."""
+        session.get(
+            self._selector,
+            zenoh.handlers.Callback(self.add, self._ended, indirect=False),
+            target=self._target,
+            # Any other mode keeps all replies in Zenoh until the query ends.
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=self._timeout_s,
+            payload=payload,
+            encoding=JSON if payload is not None else None,
+            attachment=attachment,
+            cancellation_token=self._given_up,
+        )
+
+    def close(self) -> None:
+        """Ends the query; further replies are dropped."""
+        self._given_up.cancel()
+
+    def add(self, reply: zenoh.Reply) -> None:
+        """Takes the next reply, on Zenoh's thread."""
+        if self._error is not None:
+            return
+        self._error = self._refusal(reply) if reply.ok is None else self._excess(reply.ok)
+        if self._error is not None:
+            self._ended()
+        elif reply.ok is not None:
+            self._store(reply.ok)
+
+    def result(self) -> list[Reply]:
+        """The replies, in the order of their keys.
+
+        Raises:
+            RemoteError: somebody replied with an error, or with more than the bounds allow, or somebody timed out and
+                nobody else answered.
+        """
+        if self._error is not None:
+            raise self._error
+        if self._timed_out and not self._replies:
+            raise too_late(self._selector, self._timeout_s)
+        return [self._replies[key][0] for key in sorted(self._replies)]
+
+    def _store(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        before = self._replies.get(key)
+        if before is not None:
+            if not is_later(sample.timestamp, before[1]):
+                return
+            self._bytes -= len(before[0].payload)
+        payload = sample.payload.to_bytes()
+        self._bytes += len(payload)
+        self._replies[key] = (Reply(key, payload, str(sample.encoding)), sample.timestamp)
+
+    def _refusal(self, reply: zenoh.Reply) -> RemoteError | None:
+        """The error in an error reply; None if it only says that the time is up."""
+        assert reply.err is not None
+        if len(reply.err.payload) > MAX_ERROR_BYTES:
+            return RemoteError("unknown", f"an error reply of {len(reply.err.payload)} bytes: it is not ours")
+        content = reply.err.payload.to_bytes()
+        if content == TIMEOUT_PAYLOAD:
+            self._timed_out = True
+            return None
+        return _remote_error(content, str(reply.err.encoding))
+
+    def _excess(self, sample: zenoh.Sample) -> RemoteError | None:
+        """The error if this reply exceeds a bound; None if it does not."""
+        bounds, size = self._bounds, len(sample.payload)
+        self._received += 1
+        advice = "name one vehicle and one pair instead of `*`"
+        if "*" not in self._key:
+            advice = "one program answers for a key: find the others, and see the router's rules (docs/security.md)"
+        if self._received > bounds.replies:
+            text = f"more than {bounds.replies} replies to {self._key}, the rest was left out: {advice}"
+            return RemoteError("too_many_replies", text)
+        if size > bounds.reply_bytes:
+            key = f"{str(sample.key_expr)[:MAX_SHOWN_KEY]!a}"
+            text = f"the reply of {key} has {size} bytes, and {bounds.reply_bytes} are accepted: ask for less of it"
+            return RemoteError("reply_too_large", f"{text} (history: --param limit=N), or find out what answers there")
+        if self._bytes + size > bounds.total_bytes:
+            text = (
+                f"the replies to {self._key} have more than {bounds.total_bytes} bytes after {self._received} replies"
+            )
+            return RemoteError("replies_too_large", f"{text}, the rest was left out: {advice}")
+        return None
+
+
+def is_later(timestamp: zenoh.Timestamp | None, before: zenoh.Timestamp | None) -> bool:
+    """Whether a reply with this timestamp replaces one with the timestamp `before`; None: a reply without one."""
+    return timestamp is not None and (before is None or timestamp.get_time() > before.get_time())
 
 
 def too_late(selector: str, timeout_s: float) -> RemoteError:
@@ -221,8 +358,18 @@ def ask_one(session: zenoh.Session, selector: str, timeout_s: float, payload: by
 
 def is_alive(session: zenoh.Session, keys: Keys, timeout_s: float) -> bool:
     """Whether somebody serves a pair of the vehicle, by its liveliness token."""
-    held = session.liveliness().get(keys.alive("*"), timeout=timeout_s)
-    return any(reply.ok is not None for reply in held)
+    held, ended, given_up = threading.Event(), threading.Event(), zenoh.CancellationToken()
+
+    def add(reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            held.set()
+            ended.set()
+
+    handler = zenoh.handlers.Callback(add, ended.set, indirect=False)
+    session.liveliness().get(keys.alive("*"), handler, timeout=timeout_s, cancellation_token=given_up)
+    ended.wait(timeout_s + GRACE_S)
+    given_up.cancel()  # however many tokens there are, the first one says it
+    return held.is_set()
 
 
 def nobody(selector: str, *, service_is_there: bool = False) -> NotFoundError:
@@ -231,7 +378,8 @@ def nobody(selector: str, *, service_is_there: bool = False) -> NotFoundError:
     if service_is_there:
         return NotFoundError(
             f"no answer to {selector.partition('?')[0]}, though the service is there (its liveliness token is seen): "
-            "the router's rules may not allow it to you, or the pair is not one of the vehicle's (`coec query status`)"
+            "the router's rules may not allow it to you, the pair is not one of the vehicle's (`coec query status`), "
+            f"or the answer has more than {MAX_MESSAGE_BYTES} bytes: ask for less"
         )
     return NotFoundError(
         f"nobody answered {selector.partition('?')[0]}: check that `coec run` is up (it answers a second or two after "

@@ -25,11 +25,14 @@ class Sample:
         encoding: as the sender gives it, for example `application/cdr;TYPE`.
         attachment: bytes beside the message in which the sender should give a sequence number and its id; empty if they
             cannot be that. None: messages of this stream have no attachment.
+        origin: id of the session that stamped the message for Zenoh: the sender's, or that of the first router on its
+            way. Empty if nobody did.
     """
 
     payload: bytes
     encoding: str
     attachment: bytes | None = None
+    origin: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +63,9 @@ def on_key(key: str) -> Input:
 
 
 def _as_it_is(sample: zenoh.Sample) -> Sample:
-    return Sample(sample.payload.to_bytes(), str(sample.encoding))
+    stamp = sample.timestamp
+    origin = b"" if stamp is None else str(stamp.get_id()).encode()
+    return Sample(sample.payload.to_bytes(), str(sample.encoding), origin=origin)
 
 
 def _typed_by_key(sample: zenoh.Sample) -> Sample:

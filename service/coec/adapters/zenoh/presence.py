@@ -1,15 +1,20 @@
 """Ensures one daemon per vehicle: daemons show themselves by liveliness tokens and look for others, and only one stays.
 
-A daemon holds a claim from before it looks for others until it stops answering: first `starting`, then `serving`.
-Routers forward nothing between two peers, so that a peer looks through a separate client session, which sees what the
-router holds. Once a daemon sees its own claim there, every daemon that looks later sees it, too. Therefore, of two that
-start at the same time, at least one sees the other:
+A daemon holds a claim from before it looks for others until it stops answering: first `starting`, then `serving`. A
+claim is a liveliness token, and a queryable on the same key. Routers forward nothing between two peers, so that a peer
+looks through a separate client session, which sees what the router holds. Once a daemon sees its own claim there, every
+daemon that looks later sees it, too. Therefore, of two that start at the same time, at least one sees the other:
 
 - A daemon leaves if it sees another that serves, or one that starts with a smaller Zenoh id.
 - A daemon waits if it sees others that start with larger ids. Either they leave, or they had looked before it started
   and are about to serve.
 - A daemon that sees nobody serves, and goes on looking. Two daemons that started on different sides of a broken
   network, or before their router, see each other once it is there; then the one with the larger id leaves.
+
+Another daemon counts only if it answers: a query for its claim, or, if it is of an earlier version, `status` with the
+time of its start. Any program that may declare tokens could hold the token of a daemon; a token for which nobody
+answers for `PROOF_S` is ignored and reported. If a daemon gets no answer of its own, the router's rules forbid these
+queries. Then tokens count without an answer, and the same rules have to say who may declare them.
 """
 
 from __future__ import annotations
@@ -17,19 +22,24 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from typing import Literal
 
 import zenoh
 
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import closed
+from coec.adapters.zenoh.client import GRACE_S
 from coec.adapters.zenoh.settings import beside, mode_of, settings_of
 from coec.config import LimitsConfig, ZenohConfig
-from coec.errors import UnavailableError, UsageError
+from coec.errors import DecodeError, UnavailableError, UsageError
+from coec.schemas.base import from_json
 from coec.schemas.keys import Claim, Keys
+from coec.schemas.replies import StatusReply
 
 _log = logging.getLogger(__name__)
 
@@ -47,8 +57,22 @@ DECIDED_S = 5.0
 """How long to wait for other starting daemons to leave or to serve. They need less; one that hangs is not waited
 for."""
 
+PROOF_S = 2.0
+"""How long to wait, at the start, for an answer of whoever holds a token. A daemon answers in milliseconds; one that is
+too busy for it is seen later, while both serve."""
+
+MAX_OTHERS = 64
+"""Most tokens of others that are kept from one look. Anybody may declare any number; daemons that are there answer,
+whatever tokens are left out."""
+
 POLL_S = 0.05
 """Pause between two looks while waiting."""
+
+MAX_STATUS_BYTES = 2**20
+"""Largest answer to `status` that is read, as for other documents; one of a vehicle with many pairs has some 100 kB."""
+
+FORBIDDEN = 2
+"""So many looks without an answer of its own, and a daemon takes its queries for forbidden."""
 
 WATCH_S = 5.0
 """Pause between two looks while serving."""
@@ -74,14 +98,22 @@ class Seen:
     Attributes:
         routed: whether there is a router that can hold anything; False if the daemon itself is the router.
         own: whether the daemon's own claim is there.
-        others: claims of other daemons.
+        others: claims of other daemons that have a token.
         tokens: liveliness tokens of pairs, whoever holds them.
+        answers: claims of other daemons that answered.
     """
 
-    routed: bool
-    own: bool
-    others: tuple[Claim, ...]
-    tokens: tuple[str, ...]
+    routed: bool = False
+    own: bool = False
+    others: tuple[Claim, ...] = ()
+    tokens: tuple[str, ...] = ()
+    answers: tuple[Claim, ...] = ()
+
+    @property
+    def silent(self) -> tuple[Claim, ...]:
+        """Claims of other daemons that have a token, but did not answer."""
+        answering = {claim.daemon for claim in self.answers}
+        return tuple(claim for claim in self.others if claim.daemon not in answering)
 
 
 class Presence:
@@ -90,6 +122,7 @@ class Presence:
     Attributes:
         rival: another daemon to which this one has to leave the vehicle.
         hidden: whether the router does not show the tokens, so that no daemon sees another.
+        unproven: keys of tokens that claim the vehicle, though nobody answers for them.
     """
 
     def __init__(
@@ -104,13 +137,18 @@ class Presence:
         self.thread = ServiceThread("look-out", self._watch)
         self.rival: Claim | None = None
         self.hidden = False
+        self.unproven: tuple[str, ...] = ()
         self._session = session
         self._config, self._limits = config, limits
         self._keys = keys
         self._daemon = str(session.info.zid())
         self._since_ns = since_ns
         self._through: zenoh.Session | None = None
-        self._tokens: list[zenoh.LivelinessToken] = []
+        self._claimed: list[tuple[zenoh.LivelinessToken, zenoh.Queryable[None]]] = []
+        self._unanswered = 0
+        self._answered = False
+        self._sightings = 0
+        self._serving = False
         self._stop = threading.Event()
 
     def claim(self, stop: threading.Event) -> None:
@@ -140,40 +178,94 @@ class Presence:
 
     def _decide(self, stop: threading.Event) -> None:
         seen = self._look_until_seen(stop)
-        deadline_s = time.monotonic() + DECIDED_S
+        begun_s = time.monotonic()
         while not stop.is_set():
-            if seen.tokens and not seen.others:
+            waited_s = time.monotonic() - begun_s
+            silent = waited_s > PROOF_S
+            rivals = self._rivals(seen, tokens_count=silent and self._forbidden)
+            step = next_step(self._daemon, rivals)
+            if step == "leave" or (step == "wait" and waited_s > DECIDED_S):
+                raise UnavailableError(told(self._keys.vehicle, min(rivals, key=lambda claim: not claim.serving)))
+            unproven = self._unproven(seen, rivals)
+            if silent and unproven and self._forbidden:
                 raise UnavailableError(
-                    f"vehicle {self._keys.vehicle!r} is served already: somebody holds the token {seen.tokens[0]}"
+                    f"vehicle {self._keys.vehicle!r} is served already: somebody holds the token {unproven[0]!a}"
                 )
-            step = next_step(self._daemon, seen.others)
-            if step == "serve":
-                # The first token stays until the second is there, so that others always find one of them.
+            if step == "serve" and (silent or not unproven):
+                self._report(unproven)
+                # The first claim stays until the second is there, so that others always find one of them.
                 self._declare(serving=True)
-                self._tokens.pop(0).undeclare()
+                self._undeclare_first()
                 return
-            if step == "leave" or time.monotonic() > deadline_s:
-                raise UnavailableError(told(self._keys.vehicle, min(seen.others, key=lambda claim: not claim.serving)))
             stop.wait(POLL_S)
             seen = self._look()
 
+    def _rivals(self, seen: Seen, *, tokens_count: bool) -> tuple[Claim, ...]:
+        """Claims of the other daemons that are there. `tokens_count`: a token suffices, because the router's rules
+        forbid the queries."""
+        if tokens_count:
+            return tuple({*seen.answers, *seen.others})
+        if not seen.silent and (seen.answers or not seen.tokens or self._serving):
+            return seen.answers
+        started = self._started_by_status()
+        known = [claim for claim in seen.silent if claim.since_ns in started]
+        nameless = started - {claim.since_ns for claim in known}
+        # While this daemon does not serve, whoever answers `status` is another.
+        unnamed = () if self._serving or known else tuple(Claim("", since_ns, serving=True) for since_ns in nameless)
+        return (*seen.answers, *known, *unnamed)
+
+    def _unproven(self, seen: Seen, rivals: tuple[Claim, ...]) -> tuple[str, ...]:
+        """Keys of tokens that claim the vehicle and belong to none of the rivals."""
+        there = {claim.daemon for claim in rivals}
+        keys = tuple(self._keys.claim(claim) for claim in seen.silent if claim.daemon not in there)
+        # While a daemon serves, the tokens of its pairs may be its own.
+        return keys if keys or rivals or self._serving else seen.tokens
+
+    def _report(self, unproven: tuple[str, ...]) -> None:
+        """Notes the tokens for which nobody answers; the first and then every 2^n-th sighting is logged."""
+        self.unproven = unproven
+        if not unproven:
+            return
+        self._sightings += 1
+        if self._sightings & (self._sightings - 1) == 0:
+            _log.warning(unproven_text(unproven), extra={"fields": {"vehicle": self._keys.vehicle}})
+
     def _declare(self, *, serving: bool) -> None:
         key = self._keys.claim(Claim(self._daemon, self._since_ns, serving))
-        self._tokens.append(self._session.liveliness().declare_token(key))
+        all_claims = zenoh.KeyExpr(self._keys.claims)
+
+        def answer(query: zenoh.Query) -> None:
+            with query, suppress(zenoh.ZError):  # the one who asked is gone
+                if all_claims.includes(query.key_expr):  # a wider query asks for what the service has to say
+                    query.reply(key, b"")
+
+        # Whoever sees the token must get an answer, so that the queryable comes first.
+        queryable = self._session.declare_queryable(key, zenoh.handlers.Callback(answer, indirect=False))
+        self._claimed.append((self._session.liveliness().declare_token(key), queryable))
+        self._serving = serving
+
+    def _undeclare_first(self) -> None:
+        token, queryable = self._claimed.pop(0)
+        token.undeclare()
+        queryable.undeclare()
 
     def _withdraw(self) -> None:
-        for token in self._tokens:
-            token.undeclare()
-        self._tokens.clear()
+        while self._claimed:
+            self._undeclare_first()
 
     # --- looking ----------------------------------------------------------------------------------------------------
 
     def _watch(self, thread: ServiceThread) -> None:
-        unseen = 0
+        unseen, before = 0, self.unproven
         while not self._stop.wait(WATCH_S):
             thread.beat()
             seen = self._look()
-            rival = outranking(self._daemon, seen.others)
+            rivals = self._rivals(seen, tokens_count=self._forbidden)
+            unproven = self._unproven(seen, rivals)
+            # A daemon that leaves withdraws its token and its answer one after the other.
+            self._report(tuple(key for key in unproven if key in before))
+            before = unproven
+            rival = outranking(self._daemon, rivals)
             if rival is not None:
                 self.rival = rival
             if seen.routed:
@@ -199,14 +291,69 @@ class Presence:
         if self._through is None:
             self._through = self._looking_glass()
         if self._through is None:
-            return Seen(False, False, (), ())
-        claims = {claim for key in _tokens(self._through, self._keys.claims) if (claim := self._claim_of(key))}
-        return Seen(
-            routed=bool(list(self._through.info.routers_zid())),
-            own=any(claim.daemon == self._daemon for claim in claims),
-            others=tuple(claim for claim in claims if claim.daemon != self._daemon),
-            tokens=tuple(_tokens(self._through, self._keys.alive("*"))),
+            return Seen()
+        routed = bool(list(self._through.info.routers_zid()))
+        held, answered, tokens = set[Claim](), set[Claim](), set[str]()
+
+        def add(claims: set[Claim], sample: zenoh.Sample) -> None:
+            with suppress(UsageError):  # anybody may hold a token of any name
+                claim = self._keys.parse_claim(str(sample.key_expr))
+                if claim.daemon == self._daemon or len(claims) <= MAX_OTHERS:
+                    claims.add(claim)
+
+        def add_token(sample: zenoh.Sample) -> None:
+            if len(tokens) < MAX_OTHERS:
+                tokens.add(str(sample.key_expr))
+
+        self._each_token(self._keys.claims, partial(add, held))
+        self._each_token(self._keys.alive("*"), add_token)
+        self._each_reply(self._keys.claims, partial(add, answered))
+        own = any(claim.daemon == self._daemon for claim in held)
+        self._answered |= any(claim.daemon == self._daemon for claim in answered)
+        self._unanswered += own
+        others, answers = (
+            tuple(claim for claim in claims if claim.daemon != self._daemon) for claims in (held, answered)
         )
+        return Seen(routed, own, others, tuple(sorted(tokens)), answers)
+
+    @property
+    def _forbidden(self) -> bool:
+        """Whether the router's rules seem to forbid the query for claims: not even the own one was answered."""
+        return not self._answered and self._unanswered >= FORBIDDEN
+
+    def _started_by_status(self) -> set[int]:
+        """When the services of the vehicle that answer `status` were started, ns, except this one."""
+        started: set[int] = set()
+
+        def add(sample: zenoh.Sample) -> None:
+            if len(sample.payload) > MAX_STATUS_BYTES or len(started) >= MAX_OTHERS:
+                return
+            with suppress(DecodeError):
+                status = from_json(StatusReply, sample.payload.to_bytes())
+                if status.vehicle == self._keys.vehicle:
+                    started.add(status.started_ns)
+
+        self._each_reply(self._keys.status, add, "?format=json")
+        return started - {self._since_ns}
+
+    def _each_token(self, key: str, take: Callable[[zenoh.Sample], None]) -> None:
+        """Calls `take`, on Zenoh's thread, for each token that is held; for none while the router is away."""
+        if self._through is not None:
+            with suppress(zenoh.ZError), _within(take) as (handler, given_up):
+                self._through.liveliness().get(key, handler, timeout=LOOK_S, cancellation_token=given_up)
+
+    def _each_reply(self, key: str, take: Callable[[zenoh.Sample], None], parameters: str = "") -> None:
+        """Calls `take`, on Zenoh's thread, for each answer to a query; for none while the router is away."""
+        if self._through is not None:
+            with suppress(zenoh.ZError), _within(take) as (handler, given_up):
+                self._through.get(
+                    f"{key}{parameters}",
+                    handler,
+                    target=zenoh.QueryTarget.ALL,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    timeout=LOOK_S,
+                    cancellation_token=given_up,
+                )
 
     def _looking_glass(self) -> zenoh.Session | None:
         """The session to look through: the daemon's own, or, if that is a peer, a client session, which sees the tokens
@@ -219,27 +366,37 @@ class Presence:
         except zenoh.ZError:
             return None
 
-    def _claim_of(self, key: str) -> Claim | None:
-        try:
-            return self._keys.parse_claim(key)
-        except UsageError:  # anybody may hold a token of any name
-            return None
+
+@contextmanager
+def _within(
+    take: Callable[[zenoh.Sample], None],
+) -> Iterator[tuple[zenoh.handlers.Callback[zenoh.Reply], zenoh.CancellationToken]]:
+    """Handler and token of a query that is sent within the block; the block ends when all its replies have come, or
+    after its time."""
+    ended, given_up = threading.Event(), zenoh.CancellationToken()
+
+    def receive(reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            take(reply.ok)
+
+    yield zenoh.handlers.Callback(receive, ended.set, indirect=False), given_up
+    ended.wait(LOOK_S + GRACE_S)
+    given_up.cancel()
 
 
 def told(vehicle: str, other: Claim) -> str:
     """A sentence for people that says which daemon has the vehicle."""
     since = datetime.fromtimestamp(other.since_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     does = "is served" if other.serving else "is about to be served"
+    who = f"another daemon, started {since}, Zenoh id {other.daemon or 'unknown'}"
+    return f"vehicle {vehicle!r} {does} by {who}: end one of the two, or give them different vehicles"
+
+
+def unproven_text(unproven: Sequence[str]) -> str:
+    """A sentence for people about tokens for which nobody answers."""
+    more = f" and {len(unproven) - 1} more" if len(unproven) > 1 else ""
     return (
-        f"vehicle {vehicle!r} {does} by another daemon, started {since}, Zenoh id {other.daemon}: end one of the two, "
-        "or give them different vehicles"
+        f"A program holds the liveliness token {unproven[0]!a}{more}, which says that another daemon serves the "
+        "vehicle, but no daemon answers for it; it is ignored. Find that program and end it, and let the router's "
+        "rules allow such tokens to the service alone."
     )
-
-
-def _tokens(session: zenoh.Session, key: str) -> list[str]:
-    """Keys of the tokens that are held; none while the router is away."""
-    try:
-        replies = list(session.liveliness().get(key, timeout=LOOK_S))
-    except zenoh.ZError:
-        return []
-    return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,6 +30,9 @@ PIECE_BYTES: Final = 2**19
 MAX_WINDOW_BYTES: Final = 2**32
 """Largest window that is fetched: as much as a vehicle keeps of all windows by default (`state.max_bytes`)."""
 
+SPARE_BYTES: Final = 2**28
+"""Room that a fetched window must leave on the disk, for what else is written there meanwhile."""
+
 DIGEST_POLL_S: Final = 0.2
 """Pause between queries whether the service has read a window; its recorder looks for windows as often."""
 
@@ -48,6 +52,12 @@ BLOCK_BYTES: Final = 2**20
 Recording = WindowInfo | SnippetInfo
 
 
+class NoRoomError(CoecError):
+    """The disk has no room for a window that is to be fetched."""
+
+    reply_code = "no_room"
+
+
 def fetch_window(
     session: zenoh.Session,
     keys: Keys,
@@ -57,6 +67,7 @@ def fetch_window(
     timeout_s: float,
     patience_s: float,
     heard: Callable[[int, int], None],
+    max_bytes: int = MAX_WINDOW_BYTES,
 ) -> Recording:
     """Fetches a window or snippet into a file, which gets its final name only if its sha256 is right.
 
@@ -67,23 +78,27 @@ def fetch_window(
         timeout_s: for one answer.
         patience_s: time without any new piece after which to give up.
         heard: called with the number of bytes that are there, and the total.
+        max_bytes: largest size that the vehicle may claim; nothing is fetched of a larger one.
 
     Raises:
         NotFoundError: nobody answered.
-        RemoteError: there is no such window, or its bytes do not have the promised hash.
+        RemoteError: there is no such window, it is larger than `max_bytes`, or its bytes do not have the promised hash.
+        NoRoomError: the disk has no room for it.
         OutputError: the file cannot be written. The received part stays for the next attempt.
     """
     info = _digested(session, keys, pair, window_id, timeout_s)
     for attempt in (1, 2):
         if info.sha256 is None or not SHA256.fullmatch(info.sha256):
             raise RemoteError("malformed", f"the list does not say which sha256 window {window_id} has")
-        if info.size_bytes > MAX_WINDOW_BYTES:
-            raise RemoteError("too_large", f"window {window_id} is said to have {info.size_bytes} bytes: not fetched")
+        if not 0 <= info.size_bytes <= max_bytes:
+            text = f"window {window_id} is said to have {info.size_bytes} bytes, and {max_bytes} may be fetched"
+            raise RemoteError("too_large", f"{text}: nothing of it was")
         try:
             if _is_there(path, info):
                 heard(info.size_bytes, info.size_bytes)
                 return info
             part = path.with_name(f"{path.name}.{info.sha256[:16]}.part")
+            _require_room(part, info, window_id)
             if _whole(session, keys.window(pair, window_id), info, part, timeout_s, patience_s, heard):
                 part.replace(path)
                 return info
@@ -120,13 +135,24 @@ def _whole(
         while done < info.size_bytes:
             wanted = min(PIECE_BYTES, info.size_bytes - done)
             piece = _piece(session, f"{key}?offset={done};length={wanted}", timeout_s, patience_s)
-            if not 0 < len(piece) <= wanted:
+            if len(piece) != wanted:
                 return False
             file.write(piece)
             digest.update(piece)
             done += len(piece)
             heard(done, info.size_bytes)
     return digest.hexdigest() == info.sha256
+
+
+def _require_room(part: Path, info: Recording, window_id: str) -> None:
+    part.parent.mkdir(parents=True, exist_ok=True)
+    missing = info.size_bytes - (part.stat().st_size if part.exists() else 0)
+    free = shutil.disk_usage(part.parent).free
+    if missing + SPARE_BYTES > free:
+        raise NoRoomError(
+            f"no room for window {window_id} in {part.parent}: {missing} bytes are to be fetched, {free} are free, and "
+            f"{SPARE_BYTES} of these stay free; make room, or name another place with --output"
+        )
 
 
 def _piece(session: zenoh.Session, selector: str, timeout_s: float, patience_s: float) -> bytes:

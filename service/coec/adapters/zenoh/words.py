@@ -17,8 +17,11 @@ from coec.schemas.keys import Keys
 from coec.schemas.last_word import MAX_BYTES
 
 WAITING: Final = 32_768
-"""Most words that wait to be read, 1 kB each and at most 16 kB: enough for a fleet that answers all at once. Words
-beyond this are counted as lost, and repeated by their pairs within a period."""
+"""Most words that wait to be read, 1 kB each: enough for a fleet that answers all at once. Words beyond this are
+counted as lost, and repeated by their pairs within a period."""
+
+WAITING_BYTES: Final = 2**26
+"""Most bytes of all these words together, because a word may have 16 kB: twice what as many usual words have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +47,7 @@ class Words:
         self._keys = keys
         self._timeout_s = timeout_s
         self._waiting: queue.Queue[Came] = queue.Queue(WAITING)
+        self._waiting_bytes = 0
         self._lock = threading.Lock()
         self._refused: Counter[str] = Counter()
         self.told = threading.Event()
@@ -53,9 +57,12 @@ class Words:
         """The words and tokens that wait, at most `WAITING`."""
         for _ in range(WAITING):
             try:
-                yield self._waiting.get_nowait()
+                came = self._waiting.get_nowait()
             except queue.Empty:
                 return
+            with self._lock:
+                self._waiting_bytes -= len(came.payload)
+            yield came
 
     def refused(self) -> Counter[str]:
         """Number of words lost or refused since the last call, by cause."""
@@ -88,7 +95,9 @@ class Words:
 
     def _get(self, key: str, done: threading.Event) -> None:
         handler = zenoh.handlers.Callback(self._kept, done.set, indirect=False)
-        self._session.get(key, handler, target=zenoh.QueryTarget.ALL, timeout=self._timeout_s)
+        # Any other mode of consolidation keeps all words in Zenoh until the query ends. The roster takes the latest.
+        of_all, none = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
+        self._session.get(key, handler, target=of_all, consolidation=none, timeout=self._timeout_s)
 
     def _said(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
@@ -106,12 +115,21 @@ class Words:
         if len(payload) > MAX_BYTES:
             self._refuse("word_too_large")
             return
+        with self._lock:
+            is_full = self._waiting_bytes + len(payload) > WAITING_BYTES
+        if is_full:
+            self._refuse("too_many_at_once")
+            return
         self._add(Came(kind, key, payload.to_bytes(), time.monotonic()))
 
     def _add(self, came: Came) -> None:
+        with self._lock:
+            self._waiting_bytes += len(came.payload)
         try:
             self._waiting.put_nowait(came)
         except queue.Full:
+            with self._lock:
+                self._waiting_bytes -= len(came.payload)
             self._refuse("too_many_at_once")
 
     def _refuse(self, cause: str) -> None:

@@ -79,6 +79,13 @@ class Options:
             help="For command/rollback: window or sha256 from `query history` to serve again.", metavar="HASH"
         ),
     ] = None
+    candidate: Annotated[
+        str | None,
+        typer.Option(
+            help="For command/apply: window or sha256 of the candidate from `query extrinsic`; another one is refused.",
+            metavar="HASH",
+        ),
+    ] = None
     release: Annotated[bool, typer.Option("--release", help="For command/hold: end the hold.")] = False
     reason: Annotated[
         str | None,

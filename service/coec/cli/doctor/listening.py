@@ -24,6 +24,9 @@ SAMPLES_WAITING = 8
 
 MOTIONS_WAITING = 512
 
+SAMPLES_COUNTED = 200_000
+"""Most samples of a stream whose arrival and size are noted: a minute at 3 kHz. A flood beyond that is not counted."""
+
 POLL_S = 0.01
 
 _SILENT = logging.Logger("doctor")
@@ -138,7 +141,7 @@ class _Ear:
         heard, waiting = self.heard[name], self._waiting[name]
 
         def receive(sample: zenoh.Sample) -> None:
-            if sample.kind != zenoh.SampleKind.PUT:
+            if sample.kind != zenoh.SampleKind.PUT or len(heard.arrivals_s) >= SAMPLES_COUNTED:
                 return
             heard.arrivals_s.append(time.monotonic())
             came = read(sample)

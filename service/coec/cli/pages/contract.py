@@ -89,13 +89,14 @@ RESOURCES: Mapping[str, _Resource] = {
     "evidence_of": _Resource(f"{_model(replies.EvidenceEvent)}, or a JPEG", grammar.parse_evidence_selector),
     "command": _Resource(_model(replies.Acknowledgement), grammar.parse_command_selector),
     "alive": _Resource("liveliness token"),
-    "claims": _Resource("liveliness tokens"),
+    "claims": _Resource("liveliness tokens; each answered, without content, by its daemon"),
 }
 """Resources by the method of `Keys` that builds the key."""
 
 COMMANDS: Mapping[str, str] = {
     "calibrate": "the open window ends now and is solved, if it has pairs enough; else the latest one is solved again",
-    "apply": "the estimate that waits becomes what is served",
+    "apply": "the estimate that waits becomes what is served; with `candidate`, only if it is this one (window id, "
+    "or the start of its sha256 in `extrinsic`)",
     "rollback": "what was served before is served again, or what window `to` gave (its id, or the start of a sha256)",
     "reset": "the workshop calibration is served; the next accepted window may move it",
     "commission": "the limits of the rig are learned from the windows that agree with what is served",

@@ -29,7 +29,7 @@ MAX_BYTES = 2**20
 """Most bytes of a document of the service; they have some 10 kB."""
 
 WAITING = 64
-"""Documents that may wait to be read; the oldest are dropped."""
+"""Documents that may wait to be read, of at most `MAX_BYTES` each; the oldest are dropped."""
 
 HEALTH, EXTRINSIC = "health", "extrinsic"
 
@@ -87,7 +87,9 @@ class ServiceWatch:
         if now_s - self._asked_s >= ASK_S:
             self._asked_s = now_s
             for kind, key in self._keys.items():
-                self._session.get(key, _directly(self._replies(self._listener(kind, now_s))), timeout=ASK_S)
+                handler = _directly(self._replies(self._listener(kind, now_s)))
+                # Any other mode of consolidation keeps the answers in Zenoh until the query ends.
+                self._session.get(key, handler, consolidation=zenoh.ConsolidationMode.NONE, timeout=ASK_S)
         while self._heard:
             self._take(self._heard.popleft())
         return Said(

@@ -19,18 +19,19 @@ from coec.calibration import lifecycle
 from coec.calibration.types import Rig
 from coec.config import PairConfig
 from coec.errors import CoecError, NotFoundError
+from coec.runtime.api.extrinsic import candidate_of
 from coec.runtime.api.rate_limit import PER_S, RateLimit
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.mailbox import Mailbox
-from coec.runtime.decisions.pair_store import PairStore
+from coec.runtime.decisions.pair_store import MIN_HASH, PairStore
 from coec.runtime.decisions.questions import Questions
 from coec.runtime.handover import BusyError
 from coec.runtime.ingest.chooser import Chooser
 from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
-from coec.schemas.commands import NAMES, REASON
-from coec.schemas.replies import Acknowledgement
+from coec.schemas.commands import CANDIDATE, NAMES, REASON
+from coec.schemas.replies import Acknowledgement, Candidate
 
 _log = logging.getLogger(__name__)
 
@@ -98,7 +99,7 @@ class Commands:
         (steady clock), at which its sender gives up, is not carried out."""
         reason = arguments.get(REASON.name) or None
         decided: dict[str, Callable[[], Acknowledgement]] = {
-            "apply": self._apply,
+            "apply": partial(self._apply, arguments.get(CANDIDATE.name)),
             "rollback": partial(self._roll_back, arguments.get("to")),
             "reset": self._reset,
             "commission": self._commission,
@@ -183,9 +184,25 @@ class Commands:
         self._store.save()
         self._decider.tell_now()
 
-    def _apply(self) -> Acknowledgement:
-        self._store.update(partial(lifecycle.apply_pending, rules=self._rules), None, completed=False)
-        return self._replaced("apply", "applied", "The candidate is served from now on.")
+    def _apply(self, name: str | None) -> Acknowledgement:
+        """Applies the candidate that waits. `name`: id of its window, or the beginning of its sha256; another one that
+        waits is not applied. None: whichever waits."""
+        waits = candidate_of(self._store.state)
+
+        def applied(state: lifecycle.PairState) -> lifecycle.PairState:
+            after = lifecycle.apply_pending(state, self._rules)
+            if waits is not None and name is not None and not _is_named(waits, name):
+                raise lifecycle.CommandRefusedError(
+                    "other_candidate",
+                    f"Another candidate waits, {str(waits.sha256)[:16]} from window {waits.window_id}; nothing was "
+                    "done. Look at it (`extrinsic`), and name it.",
+                )
+            return after
+
+        self._store.update(applied, None, completed=False)
+        assert waits is not None  # `apply_pending` refuses
+        text = f"The candidate {str(waits.sha256)[:16]} is served from now on."
+        return self._replaced("apply", "applied", text, waits.window_id)
 
     def _roll_back(self, to: str | None) -> Acknowledgement:
         kept, result = self._store.served_before(to)
@@ -268,3 +285,9 @@ class Commands:
             text=text,
             window_id=window_id,
         )
+
+
+def _is_named(candidate: Candidate, name: str) -> bool:
+    """As `rollback` names what was served: by the id of a window, or by the beginning of a sha256."""
+    by_hash = len(name) >= MIN_HASH and str(candidate.sha256).startswith(name)
+    return name == candidate.window_id or by_hash

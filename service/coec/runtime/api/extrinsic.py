@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from math import degrees
 from typing import Literal
 
@@ -92,8 +93,11 @@ def candidate_of(state: PairState) -> replies.Candidate | None:
     if state.pending is None:
         return None
     pending = state.pending
+    window_id = pending.estimate.window_id
+    content = f"{window_id}\n".encode() + pending.T_camera_lidar.astype("<f8").tobytes()
     return replies.Candidate(
-        window_id=pending.estimate.window_id,
+        window_id=window_id,
+        sha256=hashlib.sha256(content).hexdigest(),
         data_stamp_ns=pending.estimate.data_stamp_ns,
         camera_from_lidar=transform_of(pending.T_camera_lidar),
         step=degrees_and_metres(step_between(state.T_camera_lidar, pending.T_camera_lidar)),

@@ -18,6 +18,10 @@ from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.schemas import replies
 
+HARMLESS = frozenset({HELD, "rival_unproven"})
+"""Codes of troubles that leave a healthy pair healthy: a hold, and a token that any program could declare. Else that
+program could take the calibration away from all consumers."""
+
 OLD_S = 5.0
 """Oldest reply that is still true, s. The thread that makes one every second must be stuck if the reply is older."""
 
@@ -97,11 +101,11 @@ def _alarms_of(record: AlarmRecord) -> replies.Alarms:
 
 
 def with_troubles(health: Health, troubles: tuple[Reason, ...]) -> Health:
-    """The health with troubles of the service added to its reasons. They make a healthy pair degraded, except for a
-    hold."""
+    """The health with troubles of the service added to its reasons. They make a healthy pair degraded, except for
+    those that say nothing about its calibration."""
     if not troubles:
         return health
-    worse = health.state is HealthState.HEALTHY and any(reason.code != HELD for reason in troubles)
+    worse = health.state is HealthState.HEALTHY and any(reason.code not in HARMLESS for reason in troubles)
     return Health(HealthState.DEGRADED if worse else health.state, (*health.reasons, *troubles))
 
 

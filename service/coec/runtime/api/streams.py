@@ -1,4 +1,5 @@
-"""Troubles with the senders of a pair's streams: two senders at once, stamps by the wrong clock, no sender at all."""
+"""Troubles with the senders of a pair's streams: two senders at once, another sensor's frames, stamps by the wrong
+clock, no sender at all."""
 
 from __future__ import annotations
 
@@ -24,8 +25,13 @@ def troubles_of(streams: Mapping[str, StreamCounts], pair: PairConfig, topics: T
         if counts.taking_turns:
             known = topics.nodes_of(counts.taking_turns)
             who = f": {listed(known)}" if known else ""
-            text = f"{len(counts.taking_turns)} publishers send on {stream.place} at the same time{who}."
-            found.append(Reason("two_senders", f"{text} Their frames are taken as one sensor's."))
+            # Senders without names are told apart by what they send, which does not count them.
+            several = f"{len(counts.taking_turns)} publishers" if known else "Several programs"
+            text = f"{several} send on {stream.place} at the same time{who}."
+            found.append(Reason("two_senders", f"{text} Their frames are refused until only one sends."))
+        if counts.foreign:
+            text = f"On {stream.place} come frames with another frame id or image size beside those of the sensor"
+            found.append(Reason("foreign_frames", f"{text}; they are refused."))
         if counts.stamped_by_sender:
             text = f"Messages on {stream.place} have no stamp: each has the stamp from the sender's clock."
             found.append(Reason("sender_clock", text))

@@ -23,8 +23,14 @@ TROUBLES: Mapping[str, Trouble] = {
         "Start it, or check the network; `coec doctor` says how far a connection gets. The service connects by itself.",
     ),
     "two_senders": Trouble(
-        "Two publishers send on one topic at the same time; their frames are taken as one sensor's.",
-        "End one of the two, or name the topic of the one that is meant; `coec doctor` lists topics and nodes.",
+        "Two publishers send on one topic or key at the same time. Nobody knows whose frames are the sensor's, so that "
+        "all are refused until only one has sent for 64 messages; nothing is checked or calibrated meanwhile.",
+        "End one of the two, or name the topic of the one that is meant; `coec doctor` lists topics and nodes. If the "
+        "other is of another vehicle, give each vehicle keys of its own.",
+    ),
+    "foreign_frames": Trouble(
+        "Frames with another frame id or image size come beside those of the sensor; they are refused and counted.",
+        "Find the program that sends them on this topic or key (another sensor, another vehicle), and end it.",
     ),
     "sender_clock": Trouble(
         "Messages of a stream have no stamp; the time at which they were sent replaces the sensor's.",
@@ -170,6 +176,12 @@ TROUBLES: Mapping[str, Trouble] = {
     "two_daemons": Trouble(
         "Another daemon serves the vehicle; this one ends with exit code 75.",
         "End one of the two, or give them different vehicles.",
+    ),
+    "rival_unproven": Trouble(
+        "A program holds the liveliness token of another daemon of this vehicle, but no daemon answers for it; the "
+        "token is ignored, and the calibration is served as before.",
+        "Find the program and end it. Let the router's rules allow tokens below `coec/@v1/<vehicle>` to the service "
+        "alone, as `deploy/router.json5` does.",
     ),
     "no_look_yet": Trouble(
         "The service has not looked yet for what the configuration leaves out.",

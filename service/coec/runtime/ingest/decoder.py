@@ -30,7 +30,7 @@ from coec.config import (
 )
 from coec.errors import DecodeError
 from coec.geometry.edges.scan_lines import telling
-from coec.runtime.ingest.senders import Senders
+from coec.runtime.ingest.senders import RECENT, Senders
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +63,13 @@ in the largest message. A frame that is not recognised is also counted as lost o
 NOBODY = b""
 """Id of a sender that does not name itself."""
 
+TWO_SENDERS = "two_senders"
+"""Cause of a loss: several senders send on the stream at the same time, and nobody knows whose frames are the
+sensor's."""
+
+OTHERS = frozenset({"frame_id", "image_size"})
+"""Causes of the refusal of frames that are another sensor's, or of a sensor with other settings."""
+
 Frame = CameraFrame | LidarFrame | EgoMotion
 
 
@@ -71,7 +78,9 @@ class StreamCounts:
     """Samples that came, and frames that were made of them.
 
     Attributes:
-        taking_turns: ids of the senders if several send at the same time; else empty, also if none names itself.
+        taking_turns: ids of the senders if several send at the same time, whose frames are refused; else empty. Some
+            are made up, for senders that do not name themselves.
+        foreign: whether frames of `OTHERS` come beside the stream's own.
         stamped_by_sender: the latest frame came without a stamp and got the time at which it was sent, by the sender's
             clock.
     """
@@ -79,6 +88,7 @@ class StreamCounts:
     received: int
     accepted: int
     taking_turns: tuple[bytes, ...] = ()
+    foreign: bool = False
     stamped_by_sender: bool = False
 
 
@@ -140,6 +150,9 @@ class Decoder:
         self._senders = Senders()
         self._overruns: deque[bytes] = deque()
         self._stamped_by_sender = False
+        self._own: deque[bool] = deque(maxlen=RECENT)
+        self._moving_frame: str | None = None
+        self._moved_otherwise = 0
         self._received = self._accepted = 0
         lidar = stream if isinstance(stream, LidarConfig) else None
         self._T_cloud_lidar = np.array(IDENTITY if lidar is None else lidar.T_cloud_lidar, dtype=np.float64)
@@ -150,7 +163,20 @@ class Decoder:
 
     def counts(self) -> StreamCounts:
         """Counters since the start."""
-        return StreamCounts(self._received, self._accepted, self._senders.taking_turns, self._stamped_by_sender)
+        own = tuple(self._own)
+        foreign = any(own) and not all(own)
+        turns = self._senders.taking_turns
+        return StreamCounts(self._received, self._accepted, turns, foreign, self._stamped_by_sender)
+
+    @property
+    def on_trial(self) -> bool:
+        """Whether the latest frame is of a new sender, so that the one before may come back."""
+        return self._senders.on_trial
+
+    @property
+    def contested(self) -> bool:
+        """Whether several senders send at the same time."""
+        return bool(self._senders.taking_turns)
 
     def overrun(self, sample: Sample) -> None:
         """A sample was dropped before it was decoded. For any thread."""
@@ -175,10 +201,16 @@ class Decoder:
             if frame is None:
                 return None
             self._check_times(frame)
-            if told is None and frame.sequence is not None:
-                self._number(NOBODY, frame.sequence)
+            sender = self._sender(sample, frame) if told is None else told.gid
             frame = self._checked(self._stamped(frame, told))
+            self._own.append(True)
+            if sender is not None:
+                self._senders.took(sender)
+            if self.contested:
+                raise DecodeError(TWO_SENDERS, "several senders send at the same time")
         except DecodeError as error:
+            if error.reason in OTHERS:
+                self._own.append(False)
             self._losses.add(self._kind, error.reason, detail=str(error) if error.reason in EXPLAINED else "")
             return None
         except Exception:
@@ -206,6 +238,16 @@ class Decoder:
         if lost:
             self._losses.add(self._kind, "sequence_gap", lost)
 
+    def _sender(self, sample: Sample, frame: Frame) -> bytes | None:
+        """The id that stands for the sender of a message without a readable attachment; its number is counted. None: an
+        attachment should name the sender, but cannot be read."""
+        if sample.attachment is not None:
+            return None
+        sender, lost = self._senders.unnamed(sample.origin, frame.sequence, frame.stamp_ns)
+        if lost:
+            self._losses.add(self._kind, "sequence_gap", lost)
+        return sender
+
     def _stamped(self, frame: Frame, told: Attachment | None) -> Frame:
         """A frame without a stamp gets the time at which it was sent, instead of that of the measurement."""
         without = frame.stamp_ns == 0 and told is not None and told.source_ns > 0
@@ -218,7 +260,19 @@ class Decoder:
             _check_camera(frame, stream)
         elif isinstance(frame, LidarFrame) and isinstance(stream, LidarConfig):
             return self._from_origin(frame, stream)
+        elif isinstance(frame, EgoMotion):
+            self._check_motion(frame)
         return frame
+
+    def _check_motion(self, motion: EgoMotion) -> None:
+        """Ego-motion keeps to one frame, that of the first message, until `RECENT` in a row have another."""
+        if motion.frame_id == self._moving_frame:
+            self._moved_otherwise = 0
+            return
+        self._moved_otherwise += 1
+        if self._moving_frame is not None and self._moved_otherwise < RECENT:
+            raise DecodeError("frame_id", "not the frame id of the messages before")
+        self._moving_frame, self._moved_otherwise = motion.frame_id, 0
 
     def _from_origin(self, cloud: LidarFrame, lidar: LidarConfig) -> LidarFrame:
         """The sweep in the LiDAR's own frame, after checking that its ranges were measured from the origin of that

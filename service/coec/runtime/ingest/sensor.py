@@ -9,7 +9,7 @@ from collections.abc import Callable
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import Sample
 from coec.config import KnownStreamConfig, LimitsConfig
-from coec.runtime.ingest.decoder import EGO, Decoder, Frame
+from coec.runtime.ingest.decoder import EGO, TWO_SENDERS, Decoder, Frame
 from coec.runtime.ingest.frame_budget import FrameBudget
 from coec.runtime.timings import QUICK_S, Histogram
 
@@ -48,6 +48,7 @@ class SensorStream:
         self.decoder = Decoder(kind, config, limits, self.losses)
         self.took = Histogram(QUICK_S)
         self.takers: tuple[Callable[[Frame], None], ...] = ()
+        self._on_trial: list[Frame] = []
 
     @property
     def depth(self) -> int:
@@ -55,14 +56,26 @@ class SensorStream:
         return MOTIONS_WAITING if self.kind == EGO else FRAMES_WAITING
 
     def take(self, sample: Sample, budget: FrameBudget) -> None:
-        """Decodes a sample and hands the same frame to every taker."""
+        """Decodes a sample and hands the same frame to every taker. The first frames of a new sender are kept back
+        until it has sent some in a row: if the sender before comes back, two are sending, and the frames of neither may
+        be used."""
         begun_s = time.monotonic()
         frame = self.decoder.frame(sample)
         self.took.add(time.monotonic() - begun_s, self.kind)
+        if self.decoder.contested:
+            if self._on_trial:
+                self.losses.add(self.kind, TWO_SENDERS, len(self._on_trial))
+                self._on_trial.clear()
+            return
         if frame is None:
             return
-        if not budget.admit(frame):
-            self.losses.add(self.kind, "memory_full")
+        self._on_trial.append(frame)
+        if self.decoder.on_trial:
             return
-        for taker in self.takers:
-            taker(frame)
+        frames, self._on_trial = self._on_trial, []
+        for each in frames:
+            if not budget.admit(each):
+                self.losses.add(self.kind, "memory_full")
+                continue
+            for taker in self.takers:
+                taker(each)
