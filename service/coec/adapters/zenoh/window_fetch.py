@@ -122,7 +122,6 @@ def _whole(
     heard: Callable[[int, int], None],
 ) -> bool:
     """Completes the part that is there; False if the result does not have the promised hash."""
-    part.parent.mkdir(parents=True, exist_ok=True)
     with os.fdopen(durable.reopen(part), "a+b") as file:
         if file.tell() > info.size_bytes:
             file.truncate(0)
