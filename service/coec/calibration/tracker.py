@@ -38,7 +38,10 @@ Matrix6 = NDArray[np.float64]
 NS_PER_H = 3_600_000_000_000
 """Nanoseconds in an hour."""
 
-IMPROBABLE, EXPLAINED = 0.01, 0.1
+IMPROBABLE = 0.01
+"""Chance of a window below which it does not vouch for what is served."""
+
+DOUBTFUL, EXPLAINED = 0.1, 0.5
 """Chance of a window below which the mount drifts faster than configured, if the monitor doubts what is served, and the
 chance that the window has once the covariance has grown."""
 
@@ -192,7 +195,7 @@ def absorb(track: Track, measurement: Measurement, config: TrackerConfig, *, dou
     stamp_ns = max(track.stamp_ns, measurement.stamp_ns)
     heard = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
     if chance >= config.step_false_alarm:
-        if doubted and chance < IMPROBABLE:
+        if doubted and chance < DOUBTFUL:
             slow = _grown(slow, measurement, axes)
         return replace(heard, slow=_updated(slow, measurement, axes), step=StepState.NONE, candidate=None)
     alone = _restarted(track, measurement, axes)
@@ -204,6 +207,15 @@ def absorb(track: Track, measurement: Measurement, config: TrackerConfig, *, dou
         if chance_of_fast >= config.step_false_alarm:
             return replace(heard, slow=_updated(fast, measurement, axes), step=StepState.CONFIRMED, candidate=None)
     return replace(heard, step=StepState.SUSPECTED, candidate=alone)
+
+
+def fits(T_camera_lidar: Matrix4, measurement: Measurement) -> bool:
+    """Whether a window vouches for a pose (4, 4): the pose is not improbable if the window is right."""
+    axes = measurement.told_axes()
+    if not axes:
+        return True
+    exact = Belief(T_camera_lidar, np.zeros((6, 6)), {}, np.zeros(6, np.bool_), 0)
+    return _disagreement(exact, measurement, axes)[1] >= IMPROBABLE
 
 
 def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belief:

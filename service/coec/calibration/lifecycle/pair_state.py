@@ -33,7 +33,7 @@ from coec.calibration.monitor.change_detector import (
 )
 from coec.calibration.monitor.change_detector import after_observation as check_taken
 from coec.calibration.monitor.sensor_faults import CAUSES, Cause
-from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
+from coec.calibration.tracker import Measurement, StepState, Track, absorb, fits, prior_sigma
 from coec.calibration.types import INTRINSICS_OFF, Decision, Estimate, Matrix4, MovedWithin, Reason, Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import CoecError
@@ -51,8 +51,9 @@ LAST_KNOWN = "last_known"
 RESTARTED = Reason("restarted", "The service was started again; nothing has been looked at since.")
 
 SETTLING_NS = 60_000_000_000
-"""Sensor time, a minute, for which a pair stays degraded at least once its data could not be judged. Poor stretches
-that follow each other then count as one, and readers of health do not see two changes a minute."""
+"""Sensor time, a minute, for which a pair stays degraded or suspect at least once its data could not be judged, or no
+check acquitted it. Poor stretches that follow each other then count as one, and readers of health do not see two
+changes a minute."""
 
 SETTLING = Reason("settling", "The data can be judged again, after a stretch where they could not.")
 
@@ -344,7 +345,8 @@ def _tracked(state: PairState, estimate: Estimate, rules: Rules) -> Track:
     track = state.track
     if track is None or _accused_elsewhere(state, estimate, rules):
         track = Track.initial(pose, prior_sigma(rules.tracker), estimate.data_stamp_ns)
-    return absorb(track, measurement, rules.tracker, doubted=state.monitor.unacquitted > 0)
+    doubted = state.monitor.unacquitted > 0 or state.seen in (HealthState.SUSPECT, HealthState.MISCALIBRATED)
+    return absorb(track, measurement, rules.tracker, doubted=doubted)
 
 
 def _accused_elsewhere(state: PairState, estimate: Estimate, rules: Rules) -> bool:
@@ -394,9 +396,12 @@ def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
 def _confirmed(
     state: PairState, T_before: Matrix4, estimate: Estimate, stamp_ns: int, rules: Rules, now_ns: int | None
 ) -> PairState:
-    """The state after a window with data up to the sensor time `stamp_ns` vouches for the served extrinsic, which was
-    `T_before` (4, 4) before. What the monitor had against it is dropped, as far as the window could judge it; causes in
-    the data stay."""
+    """The state after a window with data up to the sensor time `stamp_ns` was accepted, and its combination with
+    earlier ones is served, or agrees with what is served; `T_before` (4, 4) was served before. If the window vouches
+    for that, what the monitor had against it is dropped, as far as the window could judge it; causes in the data stay.
+    A window that lies beside it, as while the mount drifts, renews and clears nothing."""
+    if not fits(state.T_camera_lidar, replace(Measurement.of(estimate), stamp_ns=stamp_ns)):
+        return replace(state, proven=True)
     monitor = after_window(
         state.monitor,
         stamp_ns,
@@ -471,16 +476,17 @@ def _not_renewed(state: PairState, observation: Observation, rules: Rules) -> Pa
     cause = leading_cause(monitor.blind)
     if cause is not None and cause.code == BENT_MOUNT:
         text = "The latest checks accuse the mount, and none acquits it."
-        return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
+        return _poor(state, Event.SUSPECTED, observation.stamp_ns, Reason("monitor_suspects", text))
     text = "No check of the latest pairs can confirm the extrinsic: their edges are faint, or do not fit well enough."
     why = cause.as_reason() if cause is not None else Reason(NOT_ACQUITTED, text)
     return _poor(state, Event.NOT_ACQUITTED, observation.stamp_ns, why)
 
 
 def _poor(state: PairState, event: Event, stamp_ns: int, why: Reason) -> PairState:
-    """The state after an event because of which the data cannot be judged at this sensor time."""
+    """The state after an event because of which the data cannot be judged, or the mount cannot be acquitted, at this
+    sensor time."""
     after = _unless_red(state, event, why)
-    goes_on = state.seen is HealthState.DEGRADED and state.poor_since_ns is not None
+    goes_on = state.seen in _DOUBTED and state.poor_since_ns is not None
     return after if goes_on else replace(after, poor_since_ns=stamp_ns)
 
 
@@ -488,7 +494,7 @@ def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason)
     """The state after an event at this sensor time that makes a pair healthy, unless its poor stretch began less than
     `SETTLING_NS` before."""
     since_ns = state.poor_since_ns
-    if state.seen is HealthState.DEGRADED and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
+    if state.seen in _DOUBTED and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
         return replace(_seen_again(state), reasons=(SETTLING,))
     return replace(happened(state, event, *reasons), poor_since_ns=None)
 
@@ -634,6 +640,9 @@ def _unless_red(state: PairState, event: Event, *reasons: Reason) -> PairState:
         return replace(after, reasons=(*red, *reasons))
     return after
 
+
+_DOUBTED = (HealthState.DEGRADED, HealthState.SUSPECT)
+"""States in which a stretch that cannot be judged goes on."""
 
 _RED = (BENT_MOUNT, "candidate_waits")
 """Codes of the reasons for which a pair is miscalibrated."""
