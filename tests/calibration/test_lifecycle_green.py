@@ -190,10 +190,10 @@ def tried(seeds: range) -> int:
     return greens
 
 
-RULE = "`healthy` implies an acquitting check of what is served within three periods, or of the place where it stands"
-
-
-@pytest.mark.fault("any sequence of checks, windows, commands, silence, restarts and steps of the clock", RULE)
+@pytest.mark.fault(
+    "any sequence of checks, windows, commands, silence, restarts and steps of the clock",
+    "`healthy` implies a check that acquits what is served, within three periods or in the place where it stands",
+)
 def test_green_means_acquitted(record_property: Callable[[str, object], None]) -> None:
     greens = tried(range(400))
     record_property("figure", f"400 sequences of {STEPS} steps, healthy after {greens}")
@@ -201,7 +201,10 @@ def test_green_means_acquitted(record_property: Callable[[str, object], None]) -
 
 
 @pytest.mark.slow
-@pytest.mark.fault("20,000 such sequences", RULE)
+@pytest.mark.fault(
+    "20,000 such sequences",
+    "`healthy` implies a check that acquits what is served, within three periods or in the place where it stands",
+)
 def test_green_means_acquitted_in_twenty_thousand_sequences(record_property: Callable[[str, object], None]) -> None:
     greens = tried(range(1000, 21_000))
     record_property("figure", f"healthy after {greens} of {20_000 * STEPS} steps")

@@ -18,6 +18,7 @@ from coec.calibration.tracker import (
     Track,
     absorb,
     chi_square_tail,
+    fits,
     prior_sigma,
     track_from_dict,
     track_to_dict,
@@ -302,3 +303,29 @@ def test_a_broken_document_is_refused(broken: str) -> None:
 def test_a_track_starts_at_a_rigid_pose_with_a_spread(pose: Array, sigma: Array) -> None:
     with pytest.raises(ValueError, match="of a track must be"):
         Track.initial(pose, sigma)
+
+
+# ------------------------------------------------------------------------------------------------------- a drift
+def test_a_drift_is_followed_while_the_monitor_doubts_and_averaged_away_otherwise() -> None:
+    settled = after(track_at(TRUTH), [about(TRUTH, np.zeros(6), SIGMA, k * PERIOD_NS) for k in range(5)])
+    aside = about(TRUTH, yaw(0.18), SIGMA, 5 * PERIOD_NS)
+    assert absorb(settled, aside, STILL).step is StepState.NONE
+    calm, doubted = (degrees(error(absorb(settled, aside, STILL, doubted=doubted))[1]) for doubted in (False, True))
+    assert calm < 0.04
+    assert 0.09 < doubted < 0.18
+
+
+def test_a_doubt_changes_nothing_about_a_window_that_is_probable() -> None:
+    settled = after(track_at(TRUTH), [about(TRUTH, np.zeros(6), SIGMA, k * PERIOD_NS) for k in range(5)])
+    near = about(TRUTH, yaw(0.03), SIGMA, 5 * PERIOD_NS)
+    one, other = (absorb(settled, near, STILL, doubted=doubted) for doubted in (False, True))
+    np.testing.assert_array_equal(one.T_camera_lidar, other.T_camera_lidar)
+
+
+def test_a_window_vouches_for_what_it_finds_probable() -> None:
+    window = about(TRUTH, yaw(0.0))
+    assert fits(TRUTH, window)
+    assert fits(se3.perturb(TRUTH, yaw(0.08)), window)
+    assert not fits(se3.perturb(TRUTH, yaw(0.2)), window)
+    blind = about(TRUTH, yaw(0.0), np.full(6, np.nan))
+    assert fits(se3.perturb(TRUTH, yaw(3.0)), blind), "it determines no axis"

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import pytest
+
 from coec.calibration.frames.sampling import CheckSampler, drives, stands
 from coec.calibration.types import EgoMotion, FramePair, Window
 from coec.config import MonitorConfig, WindowConfig
@@ -32,11 +34,16 @@ def test_a_stream_that_begins_in_the_middle_makes_the_same_checks_from_then_on(s
     assert checks(street, stamps[73:])[-2:] == checks(street, stamps)[-2:]
 
 
-def test_a_slow_stream_collects_until_there_is_enough(street: Window) -> None:
-    assert checks(street, [100.0 + 3 * i for i in range(10)]) == [
+@pytest.mark.fault("one frame pair in a period of the monitor", "a check in every period; checks share pairs")
+def test_checks_of_a_slow_stream_share_pairs_so_that_one_ends_in_every_period(street: Window) -> None:
+    assert checks(street, [100.0 + 3 * i for i in range(8)]) == [
         [100.0, 103.0, 106.0, 109.0],
-        [112.0, 115.0, 118.0, 121.0, 124.0],
+        [100.0, 103.0, 106.0, 109.0, 112.0],
+        [106.0, 109.0, 112.0, 115.0, 118.0],
     ]
+    one_a_period = checks(street, [100.0 + 5 * i for i in range(12)])
+    assert [check[-1] for check in one_a_period] == [115.0 + 5 * i for i in range(8)]
+    assert {len(check) for check in one_a_period[1:]} == {5}
 
 
 def test_a_standing_vehicle_is_checked_like_any_other(street: Window) -> None:

@@ -17,11 +17,22 @@ from coec.calibration.monitor.change_detector import (
     MonitorState,
     Observation,
     after_observation,
+    after_window,
     alarm_levels,
     diagnose,
+    is_acquitted,
 )
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, observe
-from coec.calibration.monitor.sensor_faults import BENT_MOUNT, DARK, LENS_DIRTY, TIME_OFFSET, Cause
+from coec.calibration.monitor.mount_scatter import LOOSE_AT
+from coec.calibration.monitor.sensor_faults import (
+    BENT_MOUNT,
+    DARK,
+    EGO_MOTION_WRONG,
+    LENS_DIRTY,
+    MOUNT_LOOSE,
+    TIME_OFFSET,
+    Cause,
+)
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import Window
 from coec.config import CalibrationConfig, LimitsConfig, MonitorConfig
@@ -122,6 +133,7 @@ class TestEvidence:
         assert after_observation(again, fresh(4), LEVELS).outcome is Finding.CONFIRMED
 
     def test_of_one_place_there_is_one_check_however_long_the_vehicle_stands_there(self) -> None:
+        """As long as no check contradicts it: here the vehicle stops where its mount has already moved."""
         state = after(fresh(0, flagged=False), *(fresh(n, standing=True) for n in range(1, 10)))
         assert state.outcome is Finding.CLEAR
         assert state.evidence == after(fresh(0, flagged=False), fresh(1, standing=True)).evidence
@@ -208,6 +220,115 @@ class TestEvidence:
         assert form.validate_json(form.dump_json(state)) == state
 
 
+class TestStandstill:
+    def standing(self, number: int, **how: object) -> Observation:
+        return fresh(number, standing=True, **how)
+
+    def test_the_acquitting_check_of_a_place_holds_until_another_contradicts_it(self) -> None:
+        arrived = after(fresh(0, flagged=False), self.standing(1, flagged=False))
+        parked = after(fresh(0, flagged=False), *(self.standing(n, flagged=False) for n in range(1, 700)))
+        hour_ns = 3_600_000_000_000
+        assert is_acquitted(parked, hour_ns, MonitorConfig())
+        assert parked.evidence == arrived.evidence
+        faint = replace(self.standing(700, flagged=False), has_power=False, weak=True)
+        assert is_acquitted(after_observation(parked, faint, LEVELS), hour_ns, MonitorConfig())
+        assert not is_acquitted(after_observation(parked, self.standing(700), LEVELS), hour_ns, MonitorConfig())
+        assert not is_acquitted(after_observation(parked, fresh(700), LEVELS), hour_ns, MonitorConfig())
+
+    def test_checks_that_contradict_it_count_but_confirm_nothing(self) -> None:
+        moved = [fresh(0, flagged=False), *(self.standing(n, flagged=n > 3) for n in range(1, 60))]
+        assert after(*moved[:6]).outcome is Finding.SUSPECT
+        assert after(*moved).evidence == LEVELS.suspect
+        assert after(*moved, *(fresh(60 + n) for n in range(2))).outcome is Finding.CONFIRMED
+
+    def test_a_lorry_that_leaves_again_is_forgotten(self) -> None:
+        lorry = [fresh(0, flagged=False), *(self.standing(n, flagged=3 < n < 8) for n in range(1, 14))]
+        state = after(*lorry)
+        assert state.outcome is Finding.CLEAR
+        assert is_acquitted(state, 10**15, MonitorConfig()), "the place has an acquitting check again"
+
+    def test_another_offset_contradicts_though_neither_check_is_flagged(self) -> None:
+        near = turned(0.5, 0.0, 0.0)
+        state = after(fresh(0, flagged=False), self.standing(1, flagged=False))
+        apart = replace(self.standing(2, flagged=False), offset=near, sigma=np.full(6, 0.01))
+        assert after_observation(state, apart, LEVELS).evidence > state.evidence
+
+
+class TestAcquittal:
+    def test_a_check_that_could_not_have_noticed_acquits_nothing(self) -> None:
+        assert fresh(0, flagged=False).acquits
+        assert not replace(fresh(0, flagged=False), has_power=False).acquits
+        assert not replace(fresh(0, flagged=False), undecided=True).acquits
+        assert not fresh(0, flagged=False, causes=(DARK,)).acquits
+
+    def test_lasts_for_three_periods_or_three_checks(self) -> None:
+        config = MonitorConfig(period_s=5.0)
+        state = after(fresh(0, flagged=False))
+        assert state.acquitted_ns is not None
+        assert is_acquitted(state, state.acquitted_ns + 15_000_000_000, config)
+        assert not is_acquitted(state, state.acquitted_ns + 15_000_000_001, config)
+        open_still = [replace(fresh(1 + n, flagged=False), undecided=True) for n in range(3)]
+        states = [after(fresh(0, flagged=False), *open_still[:count]) for count in (1, 2, 3)]
+        assert [is_acquitted(one, 0, config) for one in states] == [True, True, False]
+
+    def test_a_check_beside_where_the_mount_has_been_acquits_nothing_though_it_is_within_the_limits(self) -> None:
+        """Ten centimetres are within what estimators are off on other rigs, but not within what this one was off."""
+        rig, noise, place = 0.03, 0.012, 0.01
+        aside = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+
+        def at(number: int, offset: NDArray[np.float64]) -> Observation:
+            sigma = np.full(6, float(np.hypot(rig, noise)))
+            one = fresh(number, flagged=False, offset=offset)
+            return replace(one, sigma=sigma, noise=np.full(6, noise), place=np.full(6, place))
+
+        learned = after(*(at(n, RIGHT) for n in range(12)))
+        assert learned.unacquitted == 0
+        assert [after_observation(learned, at(12, offset), LEVELS).unacquitted for offset in (RIGHT, aside)] == [0, 1]
+        kept = after_window(learned, 10**9, LEVELS, solved_translation=False, agrees=False)
+        assert after_observation(kept, at(12, aside), LEVELS).unacquitted == 1, "a window without translation is blind"
+        told = after_window(learned, 10**9, LEVELS, solved_translation=True, agrees=False)
+        assert after_observation(told, at(12, aside), LEVELS).unacquitted == 0, "a window found it there"
+
+    def test_a_window_without_translation_does_not_clear_a_translation(self) -> None:
+        shifted = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+        state = after(*(fresh(n, flagged=False) for n in range(5)), *(fresh(5 + n, offset=shifted) for n in range(4)))
+        assert state.outcome is Finding.CONFIRMED
+        kept = after_window(state, 10**9, LEVELS, solved_translation=False, agrees=True)
+        assert kept.outcome is Finding.CONFIRMED
+        assert after_window(state, 10**9, LEVELS, solved_translation=True, agrees=True).outcome is Finding.UNKNOWN
+
+
+class TestMountScatter:
+    def swinging(self, degrees: float, count: int) -> list[Observation]:
+        rng = np.random.default_rng(2)
+        return [fresh(n, flagged=False, offset=turned(rng.normal(0.0, degrees), 0.0, 0.0)) for n in range(count)]
+
+    @pytest.mark.fault("a mount that swings", "`mount_loose`")
+    def test_a_mount_that_is_elsewhere_at_every_check_is_loose(self) -> None:
+        checks = self.swinging(0.3, 20)
+        assert diagnose(after(*checks)) == MOUNT_LOOSE
+        tight = [fresh(20 + n, flagged=False) for n in range(6)]
+        assert diagnose(after(*checks, *tight)) is None
+
+    def test_noise_streets_and_a_step_are_no_swing(self) -> None:
+        rng = np.random.default_rng(0)
+        noise = [fresh(n, flagged=False, offset=rng.normal(0.0, 0.0008, 6)) for n in range(2000)]
+        assert max(self.evidence(noise)) < LOOSE_AT / 2
+        step = [fresh(n, flagged=n > 10, offset=turned(0.0 if n < 10 else 2.0, 0.0, 0.0)) for n in range(20)]
+        assert max(self.evidence(step)) < LOOSE_AT / 2
+
+    def evidence(self, checks: Sequence[Observation]) -> list[float]:
+        state, found = MonitorState(), []
+        for check in checks:
+            state = after_observation(state, check, LEVELS)
+            found.append(state.scatter.evidence)
+        return found
+
+    def test_faint_checks_say_nothing_of_scatter(self) -> None:
+        faint = [replace(check, weak=True) for check in self.swinging(0.4, 40)]
+        assert after(*faint).scatter.evidence == 0.0
+
+
 class TestWrongFromTheFirstCheck:
     """Half a degree on a rig of which nothing is known: what the estimator may be off there, and a little more."""
 
@@ -258,6 +379,19 @@ class TestCauses:
     def test_what_hides_others_comes_first(self) -> None:
         both = [fresh(k, causes=(TIME_OFFSET, DARK)) for k in range(3)]
         assert diagnose(after(*both)) == DARK
+
+    @pytest.mark.fault(
+        "causes in the data that alternate", "they compete for one distribution; the leading one is named"
+    )
+    def test_causes_that_alternate_do_not_cancel_each_other(self) -> None:
+        alternating = [fresh(k, causes=(TIME_OFFSET if k % 2 else EGO_MOTION_WRONG,)) for k in range(720)]
+        assert all(diagnose(after(*alternating[:count])) is not None for count in (2, 3, 10, 720))
+        mostly = [fresh(k, causes=(TIME_OFFSET if k % 3 else EGO_MOTION_WRONG,)) for k in range(30)]
+        assert diagnose(after(*mostly)) == TIME_OFFSET
+
+    def test_causes_compete_with_a_mount_that_moved(self) -> None:
+        mostly_moved = [fresh(k, causes=(TIME_OFFSET,) if k % 4 == 3 else ()) for k in range(40)]
+        assert diagnose(after(*mostly_moved)) == BENT_MOUNT
 
     def test_a_cause_that_went_away_is_forgotten(self) -> None:
         dark = [fresh(k, causes=(DARK,)) for k in range(3)]

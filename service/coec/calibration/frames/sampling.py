@@ -58,7 +58,7 @@ class CheckSampler:
         check = None
         if period != self._period and self._new > 0 and len(self._pairs) >= self._config.min_pairs:
             check = tuple(self._pairs)
-            if self._new >= self._config.min_pairs:
+            if check[-1].stamp_ns - check[0].stamp_ns < self._period_ns:
                 self._pairs.clear()
             self._new = 0
         self._period = period
