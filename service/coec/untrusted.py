@@ -64,8 +64,8 @@ def printable(text: str, limit: int | None = LIMIT) -> str:
     """
     text = str.__str__(text)
     if _is_printable(text):
-        kept = len(text) if limit is None else limit
-        return text if len(text) <= kept else f"{text[:kept]}{_left_out(len(text) - kept)}"
+        length = len(text) if limit is None else limit
+        return text if len(text) <= length else f"{text[:length]}{_left_out(len(text) - length)}"
     shown: list[str] = []
     length = 0
     for index, character in enumerate(text):
@@ -98,8 +98,8 @@ def _left_out(count: int) -> str:
     return f"… ({count} more characters)"
 
 
-def _escaped(found: re.Match[str]) -> str:
-    return found[0].encode("unicode_escape").decode()
+def _escaped(match: re.Match[str]) -> str:
+    return match[0].encode("unicode_escape").decode()
 
 
 def _json_escaped(character: str) -> str:

@@ -13,7 +13,7 @@ from rich.text import Text
 
 import coec
 from coec.reports import console
-from coec.reports.progress import Bars, Words
+from coec.reports.progress import Bars, PlainColumn
 from coec.schemas.replies import MetricReply
 from hostile import HOSTILE, obeyed
 
@@ -74,7 +74,7 @@ def test_whatever_rich_is_given_it_sends_a_terminal_its_own_sequences_only(capsy
 def test_markup_in_the_words_of_a_bar_is_text() -> None:
     bars = Bars(terminal(), console.say, counted=False)
     task = bars.add_task("[red]front[/red]\n", note="[link=x]y")
-    (shown,) = [Words("{task.description}").render(one) for one in bars.tasks if one.id == task]
+    (shown,) = [PlainColumn("{task.description}").render(one) for one in bars.tasks if one.id == task]
     assert shown.plain == r"[red]front[/red]\n"
     assert not shown.spans
 

@@ -114,7 +114,7 @@ def test_the_scribe_notices_by_itself_that_the_folder_is_another_one(tmp_path: P
         assert not scribe.has_written()
         scribe.write_due()
         assert (first.written, last.written, scribe.has_written(), len(told)) == (time, time, True, time)
-    assert list(scribe._kept) == [first, last]
+    assert list(scribe._registered) == [first, last]
 
 
 def test_what_is_written_while_the_folder_is_replaced_is_written_again(tmp_path: Path) -> None:

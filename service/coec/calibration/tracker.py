@@ -235,9 +235,9 @@ def _drifted(belief: Belief, elapsed_h: float, config: TrackerConfig) -> Belief:
     return replace(belief, covariance=belief.covariance + np.diag(elapsed_h * creep_sigma(config) ** 2))
 
 
-def _grown(belief: Belief, measurement: Measurement, axes: list[int]) -> Belief:
-    """The belief with a covariance that explains a window."""
-    grown = belief
+def _grown(slow: Belief, measurement: Measurement, axes: list[int]) -> Belief:
+    """The slow track with a covariance that explains a window."""
+    grown = slow
     # Ends: the distance of the window falls to nothing as the covariance grows.
     while _disagreement(grown, measurement, axes)[1] < EXPLAINED:
         grown = replace(grown, covariance=GROWTH * grown.covariance)

@@ -88,8 +88,8 @@ def _tell_version(asked: bool) -> None:
     if asked:
         from coec.cli import version as work
 
-        told = json.dumps(work.document(), sort_keys=True) if "--json" in sys.argv[1:] else work.text()
-        plain_text.write(f"{told}\n")
+        output = json.dumps(work.document(), sort_keys=True) if "--json" in sys.argv[1:] else work.text()
+        plain_text.write(f"{output}\n")
         raise typer.Exit(0)
 
 
@@ -145,8 +145,8 @@ def main() -> int:
     except Exception as error:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             sys.stdout = None
-            told = f"coec: cannot write: {error.strerror}; make room where the output goes\n"
-            plain_text.write(told, on_error=True)
+            message = f"coec: cannot write: {error.strerror}; make room where the output goes\n"
+            plain_text.write(message, on_error=True)
             return CoecError.exit_code
         plain_text.write_traceback(error)
         if as_json:

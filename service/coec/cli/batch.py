@@ -15,7 +15,7 @@ from coec.fleet.engines.engine import Bounds, Engine
 from coec.fleet.places import jobs_of
 from coec.fleet.terms import terms_of
 from coec.reports import console
-from coec.reports.progress import Words
+from coec.reports.progress import PlainColumn
 from coec.schemas.fleet import BatchReport, WindowRow
 
 MIB = 2**20
@@ -61,12 +61,12 @@ def _engine(options: Options) -> Engine:
 def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
     """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then."""
     bars = Progress(
-        Words("windows"),
+        PlainColumn("windows"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        Words("{task.fields[note]}"),
+        PlainColumn("{task.fields[note]}"),
         console=console.err,
         transient=True,
         disable=not console.err.is_terminal,

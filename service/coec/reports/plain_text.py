@@ -52,9 +52,9 @@ def escape_interpreter() -> None:
     """From now on, what the interpreter itself prints is escaped too: tracebacks of threads and of callbacks, and log
     records of a command that configures no log. A hook that somebody else has set stays."""
 
-    def of_thread(ended: threading.ExceptHookArgs) -> None:
-        if ended.exc_value is not None and not isinstance(ended.exc_value, SystemExit):
-            write_traceback(ended.exc_value)
+    def of_thread(arguments: threading.ExceptHookArgs) -> None:
+        if arguments.exc_value is not None and not isinstance(arguments.exc_value, SystemExit):
+            write_traceback(arguments.exc_value)
 
     if threading.excepthook is threading.__excepthook__:
         threading.excepthook = of_thread

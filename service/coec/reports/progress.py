@@ -57,7 +57,7 @@ class CompilingNews:
         return 0.0 if self._began_s is None else self._now_s() - self._began_s
 
 
-class Words(TextColumn):
+class PlainColumn(TextColumn):
     """A column of text that is shown as it is, on one line: names in it come from recordings and vehicles."""
 
     def __init__(self, text_format: str) -> None:
@@ -91,11 +91,11 @@ class Bars(Progress):
         count = (MofNCompleteColumn(),) if counted else ()
         super().__init__(
             SpinnerColumn("dots" if console.encoding.startswith("utf") else "line"),
-            Words("{task.description}"),
+            PlainColumn("{task.description}"),
             BarColumn(),
             *count,
             TimeElapsedColumn(),
-            Words("{task.fields[note]}"),
+            PlainColumn("{task.fields[note]}"),
             console=console,
             transient=True,
             disable=not console.is_terminal,

@@ -59,10 +59,10 @@ class Scribe:
         self._folder = folder
         self._condition = threading.Condition()
         self._due: dict[Book, None] = {}
-        self._kept: dict[Book, None] = {}
+        self._registered: dict[Book, None] = {}
         self._report_replaced: list[Callable[[str], object]] = []
         self._pin = _Pin.of(folder)
-        self._asked = self._written = 0
+        self._requested = self._written = 0
         self._begun_s: float | None = None
         self._failure: Reason | None = None
         self._space: Reason | None = None
@@ -71,8 +71,8 @@ class Scribe:
         """Have these books written soon, in this order, because something was noted in them."""
         with self._condition:
             self._due.update(dict.fromkeys(books))
-            self._kept.update(dict.fromkeys(books))
-            self._asked += 1
+            self._registered.update(dict.fromkeys(books))
+            self._requested += 1
             self._condition.notify_all()
 
     def keep(self, *books: Book) -> None:
@@ -80,8 +80,8 @@ class Scribe:
         again. Those that were ever written are kept anyway."""
         with self._condition:
             for book in books:
-                self._kept.pop(book, None)
-                self._kept[book] = None
+                self._registered.pop(book, None)
+                self._registered[book] = None
 
     def on_replaced(self, report: Callable[[str], object]) -> None:
         """Call `report` with one sentence on the scribe's thread, before the books are written into another folder."""
@@ -91,7 +91,7 @@ class Scribe:
         """Whether everything noted before this call is on the disk. Waits at most `PATIENCE_S`, and not at all if the
         disk refuses, or if the write under way has already taken that long."""
         with self._condition:
-            wanted, end_s = self._asked, time.monotonic() + PATIENCE_S
+            wanted, end_s = self._requested, time.monotonic() + PATIENCE_S
             while self._written < wanted:
                 now_s = time.monotonic()
                 patience_s = min(end_s, (now_s if self._begun_s is None else self._begun_s) + PATIENCE_S) - now_s
@@ -116,7 +116,7 @@ class Scribe:
             self._begun_s = time.monotonic()
         self._notice_replacement()
         with self._condition:
-            books, number = tuple(self._due), self._asked
+            books, number = tuple(self._due), self._requested
             self._due.clear()
         failed: dict[Book, StateError] = {}
         for book in books:
@@ -154,8 +154,8 @@ class Scribe:
         for report in self._report_replaced:
             report(text)
         with self._condition:
-            self._due = {**self._kept, **self._due}
-            self._asked += 1
+            self._due = {**self._registered, **self._due}
+            self._requested += 1
 
     def look(self) -> None:
         """See whether the disk has room, and whether the folder is still the same. For the scribe's own thread, because
@@ -180,9 +180,9 @@ class Scribe:
         while not thread.stopping:
             thread.beat()
             with self._condition:
-                if self._asked == seen:
+                if self._requested == seen:
                     self._condition.wait(RETRY_S)
-                seen = self._asked
+                seen = self._requested
             self.look()
             if self._due:
                 self.write_due()

@@ -87,10 +87,10 @@ def listening(
                 return
             with order:
                 key, stamp = str(reply.ok.key_expr), reply.ok.timestamp
-                asked, before = answers.get(key, (None, None))
+                query_of, before = answers.get(key, (None, None))
                 # A change that was heard meanwhile is as new as this answer, or newer. Of several answers to one query
                 # the latest counts.
-                if (key not in heard or (asked is query and is_later(stamp, before))) and give(reply.ok):
+                if (key not in heard or (query_of is query and is_later(stamp, before))) and give(reply.ok):
                     answers[key] = (query, stamp)
 
         for key in told:

@@ -183,11 +183,11 @@ def ask(
         UsageError: the selector does not begin with a key expression.
         RemoteError: as `Replies.result`.
     """
-    ended = threading.Event()
-    replies = Replies(selector, timeout_s, ended.set)
+    finished = threading.Event()
+    replies = Replies(selector, timeout_s, finished.set)
     try:
         replies.query(session, payload, attachment)
-        in_time = ended.wait(timeout_s + GRACE_S)
+        in_time = finished.wait(timeout_s + GRACE_S)
     finally:
         replies.close()
     if not in_time:
@@ -214,17 +214,17 @@ class Replies:
     """
 
     def __init__(
-        self, selector: str, timeout_s: float, ended: Callable[[], None], bounds: Bounds | None = None
+        self, selector: str, timeout_s: float, on_finished: Callable[[], None], bounds: Bounds | None = None
     ) -> None:
-        """`ended` is called on Zenoh's thread when no more replies are needed. `bounds` None: by whether the selector
-        stands for one key.
+        """`on_finished` is called on Zenoh's thread when no more replies are needed. `bounds` None: by whether the
+        selector stands for one key.
 
         Raises:
             UsageError: the selector does not begin with a key expression.
         """
         self._selector = selector
         self._timeout_s = timeout_s
-        self._ended = ended
+        self._on_finished = on_finished
         self._target = target_of(selector)
         self._key = selector.partition("?")[0]
         self._bounds = bounds or (OF_MANY_KEYS if "*" in self._key else OF_ONE_KEY)
@@ -238,7 +238,7 @@ class Replies:
         """Sends the query and returns at once."""
         session.get(
             self._selector,
-            zenoh.handlers.Callback(self.add, self._ended, indirect=False),
+            zenoh.handlers.Callback(self.add, self._on_finished, indirect=False),
             target=self._target,
             # Any other mode keeps all replies in Zenoh until the query ends.
             consolidation=zenoh.ConsolidationMode.NONE,
@@ -259,7 +259,7 @@ class Replies:
             return
         self._error = self._refusal(reply) if reply.ok is None else self._excess(reply.ok)
         if self._error is not None:
-            self._ended()
+            self._on_finished()
         elif reply.ok is not None:
             self._store(reply.ok)
 
@@ -358,16 +358,16 @@ def ask_one(session: zenoh.Session, selector: str, timeout_s: float, payload: by
 
 def is_alive(session: zenoh.Session, keys: Keys, timeout_s: float) -> bool:
     """Whether somebody serves a pair of the vehicle, by its liveliness token."""
-    held, ended, given_up = threading.Event(), threading.Event(), zenoh.CancellationToken()
+    held, finished, given_up = threading.Event(), threading.Event(), zenoh.CancellationToken()
 
     def add(reply: zenoh.Reply) -> None:
         if reply.ok is not None:
             held.set()
-            ended.set()
+            finished.set()
 
-    handler = zenoh.handlers.Callback(add, ended.set, indirect=False)
+    handler = zenoh.handlers.Callback(add, finished.set, indirect=False)
     session.liveliness().get(keys.alive("*"), handler, timeout=timeout_s, cancellation_token=given_up)
-    ended.wait(timeout_s + GRACE_S)
+    finished.wait(timeout_s + GRACE_S)
     given_up.cancel()  # however many tokens there are, the first one says it
     return held.is_set()
 

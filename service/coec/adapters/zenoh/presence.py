@@ -178,9 +178,9 @@ class Presence:
 
     def _decide(self, stop: threading.Event) -> None:
         seen = self._look_until_seen(stop)
-        begun_s = time.monotonic()
+        started_s = time.monotonic()
         while not stop.is_set():
-            waited_s = time.monotonic() - begun_s
+            waited_s = time.monotonic() - started_s
             silent = waited_s > PROOF_S
             rivals = self._rivals(seen, tokens_count=silent and self._forbidden)
             step = next_step(self._daemon, rivals)
@@ -373,14 +373,14 @@ def _within(
 ) -> Iterator[tuple[zenoh.handlers.Callback[zenoh.Reply], zenoh.CancellationToken]]:
     """Handler and token of a query that is sent within the block; the block ends when all its replies have come, or
     after its time."""
-    ended, given_up = threading.Event(), zenoh.CancellationToken()
+    finished, given_up = threading.Event(), zenoh.CancellationToken()
 
     def receive(reply: zenoh.Reply) -> None:
         if reply.ok is not None:
             take(reply.ok)
 
-    yield zenoh.handlers.Callback(receive, ended.set, indirect=False), given_up
-    ended.wait(LOOK_S + GRACE_S)
+    yield zenoh.handlers.Callback(receive, finished.set, indirect=False), given_up
+    finished.wait(LOOK_S + GRACE_S)
     given_up.cancel()
 
 

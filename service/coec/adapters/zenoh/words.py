@@ -57,12 +57,12 @@ class Words:
         """The words and tokens that wait, at most `WAITING`."""
         for _ in range(WAITING):
             try:
-                came = self._waiting.get_nowait()
+                received = self._waiting.get_nowait()
             except queue.Empty:
                 return
             with self._lock:
-                self._waiting_bytes -= len(came.payload)
-            yield came
+                self._waiting_bytes -= len(received.payload)
+            yield received
 
     def refused(self) -> Counter[str]:
         """Number of words lost or refused since the last call, by cause."""

@@ -171,9 +171,9 @@ def commission_in_steps(
         with suppress(DecodeError):  # whoever needs the depth reports that there is none
             depth.infer(pair.camera)
         yield Step("depth", number, len(whole.pairs))
-    sight = sight_of(replace(whole, T_camera_lidar_start=right), depth, images, config, progress or Silence())
+    window_data = sight_of(replace(whole, T_camera_lidar_start=right), depth, images, config, progress or Silence())
     yield Step("edges", 1, 2)
-    evidence = gather(sight, FAR_RAD)
+    evidence = gather(window_data, FAR_RAD)
     yield Step("edges", 2, 2)
     rotation, pose = yield from _accuracies(evidence, right)
     _check(rotation)

@@ -55,7 +55,7 @@ def explained_by_nuisance(
     level: EdgeFrames,
     expected: Matrix4,
     found: Matrix4,
-    found_pose: Matrix4,
+    pose_optimum: Matrix4,
     min_significance: float,
     zooms: Sequence[float] = ZOOMS,
 ) -> Cause | None:
@@ -67,12 +67,12 @@ def explained_by_nuisance(
         level: the same range edges, placed, and the edge maps of one level.
         expected: (4, 4) where the local optimum should be.
         found: (4, 4) where it is, over rotations.
-        found_pose: (4, 4) where it is over all six degrees of freedom: a mount that was shifted is an explanation, too.
+        pose_optimum: (4, 4) where it is over all six degrees of freedom: a shifted mount is an explanation, too.
         min_significance: below this nothing is explained.
         zooms: factors on the focal length to try.
     """
     null, at_found = frame_alignment(level, expected).significance, frame_alignment(level, found)
-    turned, shifted = at_found.significance, frame_alignment(level, found_pose).significance
+    turned, shifted = at_found.significance, frame_alignment(level, pose_optimum).significance
     least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
     best, explanation = 0.0, None
     for again, motions, cause in _hypotheses(edges, rig, level, zooms):

@@ -240,19 +240,19 @@ class Standstill:
         other = Standstill.of(observation)
         if other.acquits != self.acquits and (observation.flagged or other.acquits):
             return True
-        return _are_apart(self.rotation, other.rotation) or _are_apart(self.translation, other.translation)
+        return _differ(self.rotation, other.rotation) or _differ(self.translation, other.translation)
 
 
 def _offset(observation: Observation, axes: slice) -> Offset | None:
-    told = told_by(observation, axes, None)
-    if told is None:
+    measured = told_by(observation, axes, None)
+    if measured is None:
         return None
     # Pairs that were taken before the vehicle stood have the error of another place.
     stands = set(observation.standing_stamps_ns).issuperset(observation.pair_stamps_ns)
-    return Offset(told.offset, told.noise if stands else plus(told.noise, told.place))
+    return Offset(measured.offset, measured.noise if stands else plus(measured.noise, measured.place))
 
 
-def _are_apart(one: Offset | None, other: Offset | None) -> bool:
+def _differ(one: Offset | None, other: Offset | None) -> bool:
     if one is None or other is None:
         return False
     rows = zip(one.mean, other.mean, one.variance, other.variance, strict=True)
@@ -441,10 +441,10 @@ def _explained(weights: Mapping[str, float], codes: Collection[str], fresh: floa
 def _agrees_with_earlier(state: MonitorState, observation: Observation) -> bool:
     """Whether a check puts the mount where earlier ones did, as far as streets differ."""
     for axes, tests in ((ROTATION_AXES, state.turned), (TRANSLATION_AXES, state.shifted)):
-        told = told_by(observation, axes, None)
-        if told is None or tests.right is None:
+        measured = told_by(observation, axes, None)
+        if measured is None or tests.right is None:
             continue
-        if tests.right.wider(told.place).distance2(told) > LEARNED2:
+        if tests.right.wider(measured.place).distance2(measured) > LEARNED2:
             return False
     return True
 

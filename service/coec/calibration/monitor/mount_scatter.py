@@ -45,34 +45,34 @@ class MountScatter:
         """The evidence on the axis that scatters most, nats."""
         return max(self.of_axes)
 
-    def after(self, told: Told | None, reach: Three, share: float) -> MountScatter:
-        """The sum after one more check that counts by `share`, 0 to 1. `told` is what the check says of the rotations,
-        None if it does not determine them; `reach` are the standard deviations of bad checks (rad). A check with faint
-        edges says nothing of scatter."""
-        if told is None or told.weak:
+    def after(self, measured: Told | None, reach: Three, share: float) -> MountScatter:
+        """The sum after one more check that counts by `share`, 0 to 1. `measured` is what the check says of the
+        rotations, None if it does not determine them; `reach` are the standard deviations of bad checks (rad). A check
+        with faint edges says nothing of scatter."""
+        if measured is None or measured.weak:
             return self
-        variance = plus(told.noise, told.place)
+        variance = plus(measured.noise, measured.place)
         if self.before is None or self.variance is None:
-            return MountScatter(self.of_axes, told.offset, variance)
-        rows = zip(self.of_axes, told.offset, self.before, plus(variance, self.variance), reach, strict=True)
+            return MountScatter(self.of_axes, measured.offset, variance)
+        rows = zip(self.of_axes, measured.offset, self.before, plus(variance, self.variance), reach, strict=True)
         sums = [sum_ + share * _step(one - other, at_rest, far) for sum_, one, other, at_rest, far in rows]
-        return MountScatter(three([min(max(value, 0.0), MOST) for value in sums]), told.offset, variance)
+        return MountScatter(three([min(max(value, 0.0), MOST) for value in sums]), measured.offset, variance)
 
 
-def _step(apart: float, at_rest: float, reach: float) -> float:
+def _step(difference: float, at_rest: float, reach: float) -> float:
     """Log-likelihood ratio of a difference (rad) whose variance is `at_rest` if the mount does not move. Either of the
     two checks may be a bad one, whose standard deviation is `reach`."""
-    loose, still = (_log_density(apart, variance, reach) for variance in (at_rest + 2.0 * SWING_RAD**2, at_rest))
+    loose, still = (_log_density(difference, variance, reach) for variance in (at_rest + 2.0 * SWING_RAD**2, at_rest))
     return min(max(loose - still, LEAST_STEP), MOST_STEP)
 
 
-def _log_density(apart: float, variance: float, reach: float) -> float:
+def _log_density(difference: float, variance: float, reach: float) -> float:
     """Up to the same constant for every variance."""
     bad = 2.0 * BAD_SHARE
-    good, astray = log(1.0 - bad) + _student(apart, variance), log(bad) + _student(apart, reach * reach)
+    good, astray = log(1.0 - bad) + _student(difference, variance), log(bad) + _student(difference, reach * reach)
     most = max(good, astray)
     return most + log(exp(good - most) + exp(astray - most))
 
 
-def _student(apart: float, variance: float) -> float:
-    return -0.5 * log(variance) - 0.5 * (FREEDOM + 1.0) * log(1.0 + apart * apart / variance / FREEDOM)
+def _student(difference: float, variance: float) -> float:
+    return -0.5 * log(variance) - 0.5 * (FREEDOM + 1.0) * log(1.0 + difference * difference / variance / FREEDOM)

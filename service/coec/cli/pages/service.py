@@ -57,7 +57,7 @@ was `suspect` or `miscalibrated` stays so; if the evidence for that is lost, onl
 calibration, or a person, ends it. Keep a copy of `state.directory` before a step back over several versions.
 """
 
-KEPT = (
+PRESERVED = (
     (
         "calibration, its provenance and uncertainty; candidate; `hold`; alarm counts (`state.json`)",
         "kept; of states before 22 November 2026, 10:56 UTC, without the uncertainty",
@@ -118,7 +118,7 @@ def operations_page() -> str:
             [(f"`{code}`", trouble.meaning, trouble.advice) for code, trouble in TROUBLES.items()],
         ),
         reloaded=table(("value", "holds"), [(f"`{place}`", when) for place, when in RELOADED.items()]),
-        kept=table(("what", "an update", "a step back"), KEPT),
+        kept=table(("what", "an update", "a step back"), PRESERVED),
     )
 
 

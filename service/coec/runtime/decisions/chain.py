@@ -159,21 +159,21 @@ def _parsed(line: bytes) -> Kept | None:
         if unread is None:
             return None
         entry = unread
-    told = None
+    reported = None
     if entry.result_sha256 is not None:
         try:
-            told = from_json(CalibrationResult, result)
+            reported = from_json(CalibrationResult, result)
         except DecodeError:
             if _other_version(result) is None:
                 return None
     if entry.camera_from_lidar is not None and not is_rigid(matrix_of(entry.camera_from_lidar)):
         return None
-    if told is not None and not is_rigid(matrix_of(told.camera_from_lidar)):
+    if reported is not None and not is_rigid(matrix_of(reported.camera_from_lidar)):
         return None
     result_sha256 = None if entry.result_sha256 is None else _sha256(result)
     if _sha256(document).encode() != sha256 or result_sha256 != entry.result_sha256:
         return None
-    return Kept(sha256.decode(), entry, told, line)
+    return Kept(sha256.decode(), entry, reported, line)
 
 
 def _stand_in(document: bytes) -> HistoryEntry | None:

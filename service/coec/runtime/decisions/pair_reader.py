@@ -317,7 +317,7 @@ def _estimate(stored: CalibrationResult) -> Estimate:
 
 def _track(stored: dict[str, Any]) -> Track:
     track = track_from_dict(stored)
-    for belief in (track.slow, track.candidate):
-        if belief is not None:
-            _pose(rows_of(belief.T_camera_lidar))
+    for posterior in (track.slow, track.candidate):
+        if posterior is not None:
+            _pose(rows_of(posterior.T_camera_lidar))
     return track

@@ -412,9 +412,9 @@ class PairStore:
 
 def _damage_of(lost: tuple[Lost, ...], before: Reason | None) -> Reason:
     """The reason that names the parts of the state that were lost, after the damage `before`."""
-    told = "; ".join(part.text for part in lost)
+    texts = "; ".join(part.text for part in lost)
     text = (
-        f"Parts of the state on the disk cannot be read: {told}. Everything else is kept, and the file is kept aside."
+        f"Parts of the state on the disk cannot be read: {texts}. Everything else is kept, and the file is kept aside."
     )
     if before is not None:
         return Reason(before.code, f"{before.text} {text}")

@@ -203,14 +203,14 @@ class Questions:
         done."""
         post = self._post(done)
 
-        def ended(outcome: JobOutcome) -> None:
+        def finished(outcome: JobOutcome) -> None:
             for path in paths:
                 self._windows.release(path.stem)
             post(outcome)
 
         for path in paths:
             self._windows.hold(path.stem)
-        self._worker.ask(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, ended))
+        self._worker.ask(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, finished))
 
     @property
     def commissioning(self) -> str | None:

@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 STATE_FILE = "state.json"
 
-_ASIDE: Final[Mapping[Literal["older", "newer"] | None, str]] = {"older": OLDER, "newer": NEWER, None: BROKEN}
+_SUFFIX: Final[Mapping[Literal["older", "newer"] | None, str]] = {"older": OLDER, "newer": NEWER, None: BROKEN}
 """Suffix under which a file is kept aside, by the version that wrote the part that cannot be read."""
 
 
@@ -66,7 +66,7 @@ class StateStore:
             )
             return None
         for lost in remembered.lost:
-            self._file.distrust(_ASIDE[lost.written_by])
+            self._file.distrust(_SUFFIX[lost.written_by])
             fields = {"pair": rig.pair, "part": lost.part, "why": lost.why}
             _log.warning("a part of the state on the disk cannot be read", extra={"fields": fields})
         if document.keys() - StoredPair.model_fields - OF_FIRST_VERSIONS:
@@ -118,7 +118,7 @@ def read_pairs(folder: Path) -> dict[str, tuple[StoredPair, PairState]]:
             raise StateError(f"{folder / STATE_FILE} cannot be used: {'; '.join(loaded.damage)}")
         raise NotFoundError(f"{folder} holds no {STATE_FILE}")
     documents = loaded.body.get("pairs")
-    found: dict[str, tuple[StoredPair, PairState]] = {}
+    readable: dict[str, tuple[StoredPair, PairState]] = {}
     refused = [] if isinstance(documents, dict) else ["it lists no pairs"]
     for name, document in (documents if isinstance(documents, dict) else {}).items():
         if not isinstance(document, dict):
@@ -130,7 +130,7 @@ def read_pairs(folder: Path) -> dict[str, tuple[StoredPair, PairState]]:
         if extrinsic:
             refused.append(f"the extrinsic of pair {name} is {extrinsic[0]}")
         else:
-            found[name] = stored, remembered.state
-    if refused and not found:
+            readable[name] = stored, remembered.state
+    if refused and not readable:
         raise StateError(f"{folder / STATE_FILE} cannot be used: {'; '.join(refused)}")
-    return found
+    return readable

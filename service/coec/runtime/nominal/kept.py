@@ -25,14 +25,14 @@ _log = logging.getLogger(__name__)
 NOMINAL_FILE = "nominal.json"
 
 
-class KeptCamera(Part):
+class StoredCamera(Part):
     """What is found of a camera."""
 
     frame_id: str
     intrinsics: CameraIntrinsics
 
 
-class KeptLidar(Part):
+class StoredLidar(Part):
     """What is found of a LiDAR."""
 
     frame_id: str
@@ -40,20 +40,20 @@ class KeptLidar(Part):
     cloud_frame_id: str | None
 
 
-class KeptEgo(Part):
+class StoredEgo(Part):
     """What is found of the ego-motion."""
 
     T_lidar_ego: Matrix4x4
 
 
-class KeptNominal(Part):
+class StoredNominal(Part):
     """What is found of a pair, out of its configuration. The file holds the whole `PairConfig`, which versions before
     this one require; its other keys may be those of another version."""
 
     T_camera_lidar: Matrix4x4
-    camera: KeptCamera
-    lidar: KeptLidar
-    ego: KeptEgo | None = None
+    camera: StoredCamera
+    lidar: StoredLidar
+    ego: StoredEgo | None = None
 
 
 class KeptPair(Part):
@@ -62,7 +62,7 @@ class KeptPair(Part):
 
     asked: str
     found_ns: Annotated[int, Field(ge=0, lt=2**63)]
-    pair: KeptNominal
+    pair: StoredNominal
     origins: dict[str, str]
 
 

@@ -46,7 +46,7 @@ SENT_AGAIN = (Kind.SOLVE, Kind.COMMISSION)
 """Jobs that may be sent more than once: to another worker, or for the next slice."""
 
 
-NOT_BEGUN = "waiting for the worker"
+NOT_STARTED = "waiting for the worker"
 """How far a commissioning is that was not begun."""
 
 
@@ -165,7 +165,7 @@ class Worker:
         """How far the commissioning of a pair is, in words; None: it has none."""
         with self._condition:
             commissionings = self._queue.commissionings
-        return None if pair not in commissionings else str(commissionings[pair] or NOT_BEGUN)
+        return None if pair not in commissionings else str(commissionings[pair] or NOT_STARTED)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Queues the depth inference of a camera frame (native msgpack). It only saves time, so it may be dropped."""
@@ -195,7 +195,7 @@ class Worker:
                 self._rss_bytes,
                 self._queue.in_progress(time.monotonic()),
                 self._queue.waiting,
-                {pair: str(reached or NOT_BEGUN) for pair, reached in self._queue.commissionings.items()},
+                {pair: str(reached or NOT_STARTED) for pair, reached in self._queue.commissionings.items()},
                 self._queue.outcomes,
                 {**self._queue.causes, **raised},
                 dict(self._faults),

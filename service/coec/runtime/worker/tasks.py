@@ -69,7 +69,7 @@ class _Commissioning:
 
     run: int
     steps: Steps[Baseline]
-    begun_s: float
+    started_s: float
 
 
 class Solver:
@@ -250,27 +250,27 @@ class Solver:
         Raises:
             WindowError, CalibrationError, DecodeError, ModelError, StateError: there is no baseline.
         """
-        begun, self._commissioning = self._commissioning, None  # stays None if a step raises
+        current, self._commissioning = self._commissioning, None  # stays None if a step raises
         end_s = time.monotonic() + SLICE_S
-        if begun is None or begun.run != run:
+        if current is None or current.run != run:
             start = np.array(pose, dtype=np.float64)
-            begun = _Commissioning(run, self._commissioning_steps(configuration, start, paths), time.monotonic())
+            current = _Commissioning(run, self._commissioning_steps(configuration, start, paths), time.monotonic())
         try:
-            step = next(begun.steps)
+            step = next(current.steps)
             while time.monotonic() < end_s:
-                step = next(begun.steps)
+                step = next(current.steps)
         except StopIteration as end:
             baseline: Baseline = end.value
         else:
-            self._commissioning = begun
+            self._commissioning = current
             return Underway(step.stage, step.done, step.total)
         saved = save_baseline(self._config.state.directory / BASELINES, baseline)
         return Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
 
     def forget_abandoned(self) -> None:
         """Frees the memory of a commissioning that was begun so long ago that its job has been given up."""
-        begun = self._commissioning
-        if begun is not None and time.monotonic() - begun.begun_s > DEADLINE_S[Kind.COMMISSION]:
+        current = self._commissioning
+        if current is not None and time.monotonic() - current.started_s > DEADLINE_S[Kind.COMMISSION]:
             self._commissioning = None
 
     def _commissioning_steps(
