@@ -66,7 +66,7 @@ class World:
             self.acquitted_s, self.at_rest = None, False
         self.state = after
         if completed_s is not None:
-            acquits = after.monitor.acquitted_ns is not None and after.monitor.unacquitted == 0
+            acquits = after.monitor.acquitted_ns == completed_s * S
             self.progress.completed(completed_s * S, self.steady_s, self.report, acquits=acquits)
         self.look()
 

@@ -297,13 +297,14 @@ def _well_told_move(estimate: Estimate) -> MovedWithin | None:
 
 def window_wanted_since(state: PairState) -> int | None:
     """The sensor time since which pairs are wanted for an urgent window; None if none is urgent. It is urgent if the
-    monitor accuses the served extrinsic, or if the camera moved within the latest window and health is `suspect` or
-    `miscalibrated`."""
+    monitor accuses the served extrinsic; if the camera moved within the latest window and health is `suspect` or
+    `miscalibrated`; or if checks have made health `suspect`."""
     if state.monitor.outcome in ACCUSING and state.flagged_since_ns is not None:
         return state.flagged_since_ns
     moved = None if state.latest is None else _well_told_move(state.latest)
-    suspected = state.seen in (HealthState.SUSPECT, HealthState.MISCALIBRATED)
-    return moved.first_after_ns if moved is not None and suspected else None
+    if moved is not None and state.seen in (HealthState.SUSPECT, HealthState.MISCALIBRATED):
+        return moved.first_after_ns
+    return state.flagged_since_ns if state.seen is HealthState.SUSPECT else None
 
 
 def kept_for_next(estimate: Estimate) -> KeptPairs | None:
@@ -494,7 +495,11 @@ def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason)
     """The state after an event at this sensor time that makes a pair healthy, unless its poor stretch began less than
     `SETTLING_NS` before."""
     since_ns = state.poor_since_ns
-    if state.seen in _DOUBTED and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
+    # A window decides a suspicion; a check that acquits does not end it at once.
+    settles = state.seen is HealthState.DEGRADED or (
+        state.seen is HealthState.SUSPECT and event is not Event.CONFIRMED_BY_WINDOW
+    )
+    if settles and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
         return replace(_seen_again(state), reasons=(SETTLING,))
     return replace(happened(state, event, *reasons), poor_since_ns=None)
 

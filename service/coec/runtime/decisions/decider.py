@@ -469,7 +469,7 @@ class Decider:
             return None
         before, after = taken.before, taken.after
         if completed:
-            acquits = after.monitor.acquitted_ns is not None and after.monitor.unacquitted == 0
+            acquits = stamp_ns is not None and after.monitor.acquitted_ns == stamp_ns
             self._progress.completed(stamp_ns, time.monotonic(), self._stream.report, acquits=acquits)
         if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
             self._latest_check = None
@@ -497,8 +497,8 @@ class Decider:
 
     def _go_on_with(self, taken: Taken, by_check: bool) -> None:
         """The effect of a step on the pairs to come: the extrinsic at which they are looked at, and whether a window is
-        wanted soon. It is if the monitor's outcome has become worse, if a window did not settle the suspicion, or if
-        a window saw a knock."""
+        wanted soon. It is if the monitor's outcome or health has changed, if a window did not settle the suspicion, or
+        if a window saw a step."""
         self._stream.adopt(taken.served)
         before, after = taken.before, taken.after
         since_ns = lifecycle.window_wanted_since(after)
@@ -506,7 +506,8 @@ class Decider:
             self._stream.calm()
             return
         waiting = after.pending is not None and after.pending.contradicts
-        if not waiting and not (by_check and before.monitor.outcome is after.monitor.outcome):
+        unchanged = before.monitor.outcome is after.monitor.outcome and before.seen is after.seen
+        if not waiting and not (by_check and unchanged):
             self._stream.alarm(since_ns)
 
     # --- what ails --------------------------------------------------------------------------------------------------
