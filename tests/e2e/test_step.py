@@ -189,5 +189,5 @@ def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path,
         applied = running.extrinsic()
         assert applied["camera_from_lidar"] == pending["camera_from_lidar"]
         assert (applied["provenance"], applied["pending"]) == ("estimated", None)
-        running.until(running.health, lambda told: told["state"] == "healthy", "health after the command")
+        assert running.health()["state"] == "unknown", "no check has acquitted it yet"
         assert running.terminate() == 0

@@ -490,7 +490,7 @@ class WorkerStatus(Part):
     )
     job: Text | None = Field(default=None, description="kind of the job that the worker has; null if it has none")
     job_age_s: float | None = Field(default=None, ge=0, description="how long the worker has had this job, s")
-    commissioning: dict[str, str] = Field(
+    commissioning: dict[Text, Text] = Field(
         default_factory=dict,
         description="how far the commissioning of each pair is that has one, such as `spread 4 of 10`",
     )
