@@ -289,6 +289,19 @@ class TestAcquittal:
         told = after_window(learned, 10**9, LEVELS, solved_translation=True, agrees=False)
         assert after_observation(told, at(12, aside), LEVELS).unacquitted == 0, "a window found it there"
 
+    def test_a_place_where_the_mount_lies_beside_where_it_has_been_is_not_acquitted_by_standing_there(self) -> None:
+        rig, noise = 0.03, 0.012
+        aside = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+
+        def at(number: int, offset: NDArray[np.float64], *, standing: bool = False) -> Observation:
+            one = fresh(number, flagged=False, offset=offset, standing=standing)
+            sigma = np.full(6, float(np.hypot(rig, noise)))
+            return replace(one, sigma=sigma, noise=np.full(6, noise), place=np.full(6, 0.01))
+
+        parked = after(*(at(n, RIGHT) for n in range(12)), *(at(12 + n, aside, standing=True) for n in range(4)))
+        assert not is_acquitted(parked, 0, MonitorConfig())
+        assert parked.evidence == after(*(at(n, RIGHT) for n in range(12)), at(12, aside, standing=True)).evidence
+
     def test_a_window_without_translation_does_not_clear_a_translation(self) -> None:
         shifted = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
         state = after(*(fresh(n, flagged=False) for n in range(5)), *(fresh(5 + n, offset=shifted) for n in range(4)))

@@ -231,13 +231,13 @@ class Standstill:
     contradicted: bool = False
 
     @classmethod
-    def of(cls, observation: Observation) -> Standstill:
+    def of(cls, observation: Observation, *, acquits: bool) -> Standstill:
         """The record of a check."""
-        return cls(observation.acquits, _offset(observation, ROTATION_AXES), _offset(observation, TRANSLATION_AXES))
+        return cls(acquits, _offset(observation, ROTATION_AXES), _offset(observation, TRANSLATION_AXES))
 
-    def contradicts(self, observation: Observation) -> bool:
+    def contradicts(self, observation: Observation, *, acquits: bool) -> bool:
         """Whether a later check of the same place says something else of the mount."""
-        other = Standstill.of(observation)
+        other = Standstill.of(observation, acquits=acquits)
         if other.acquits != self.acquits and (observation.flagged or other.acquits):
             return True
         return _differ(self.rotation, other.rotation) or _differ(self.translation, other.translation)
@@ -323,7 +323,7 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
         scatter = scatter.after(told_by(observation, ROTATION_AXES, None), ROTATIONS.reach, fresh)
         if scatter.evidence >= LOOSE_AT:
             codes.add(MOUNT_LOOSE.code)
-    acquits = observation.acquits and not codes and _agrees_with_earlier(state, observation)
+    acquits = not codes and _vouches(state, observation)
     after = replace(
         state,
         blind=_explained(state.blind, codes or ({BENT_MOUNT.code} if observation.flagged else ()), fresh),
@@ -343,7 +343,7 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
     after = replace(after, outcome=_outcome(state.outcome, after, levels))
     place = after.standstill
     if place is not None and place.contradicted and acquits and after.outcome is Finding.CLEAR:
-        return replace(after, standstill=Standstill.of(observation))
+        return replace(after, standstill=Standstill.of(observation, acquits=True))
     return after
 
 
@@ -405,7 +405,9 @@ def _novelty(state: MonitorState, observation: Observation) -> tuple[float, bool
     counted = set(state.last_stamps_ns)
     fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
     place = _same_place(state, observation)
-    return fresh, place is not None and not place.contradicted and not place.contradicts(observation)
+    if place is None or place.contradicted:
+        return fresh, False
+    return fresh, not place.contradicts(observation, acquits=_vouches(state, observation))
 
 
 def _same_place(state: MonitorState, observation: Observation) -> Standstill | None:
@@ -420,9 +422,10 @@ def _standstill_after(state: MonitorState, observation: Observation, *, judged: 
     place = _same_place(state, observation)
     if not judged:
         return place
+    acquits = _vouches(state, observation)
     if place is None:
-        return Standstill.of(observation)
-    return replace(place, contradicted=place.contradicted or place.contradicts(observation))
+        return Standstill.of(observation, acquits=acquits)
+    return replace(place, contradicted=place.contradicted or place.contradicts(observation, acquits=acquits))
 
 
 def _explained(weights: Mapping[str, float], codes: Collection[str], fresh: float) -> dict[str, float]:
@@ -438,15 +441,15 @@ def _explained(weights: Mapping[str, float], codes: Collection[str], fresh: floa
     return {code: after[code] for code in sorted(after) if after[code] > 0.0}
 
 
-def _agrees_with_earlier(state: MonitorState, observation: Observation) -> bool:
-    """Whether a check puts the mount where earlier ones did, as far as streets differ."""
+def _vouches(state: MonitorState, observation: Observation) -> bool:
+    """Whether a check acquits the pose, and puts the mount where earlier ones did, as far as streets differ."""
     for axes, tests in ((ROTATION_AXES, state.turned), (TRANSLATION_AXES, state.shifted)):
         measured = told_by(observation, axes, None)
         if measured is None or tests.right is None:
             continue
         if tests.right.wider(measured.place).distance2(measured) > LEARNED2:
             return False
-    return True
+    return observation.acquits
 
 
 def _weighed(state: MonitorState, observation: Observation, fresh: float, levels: AlarmLevels) -> MonitorState:
