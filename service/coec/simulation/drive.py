@@ -52,7 +52,7 @@ class DriveConfig:
         camera_hz, lidar_hz, ego_hz: frames per second; a sweep always lasts one period of its model.
         camera_delay_s: the camera exposes this long after the stamp of its sweep.
         speed_mps: mean speed, 0 for a standing vehicle; None = as usual in the scene.
-        go_s, stop_s: in dense traffic the vehicle drives and stands by turns, so long each; it drives on if stop_s is 0.
+        go_s, stop_s: in dense traffic the vehicle drives and stands by turns, so long each; 0 = it never stops.
         traffic: whether anything else moves.
         start_m: where along the road the drive begins.
         rolling_shutter_s: time from the first row of a picture to the last; the stamp is that of the middle row.
