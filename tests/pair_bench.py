@@ -127,11 +127,11 @@ RIG = rig_of(configuration(Path("state")).pairs[0])
 class KnowingWorker:
     """Answers at once, and rightly. `cost_s`: processor time that work of a kind takes, for which `pay` is told;
     `checked` are the stamps of the pairs of each check, `drawn` the questions for pictures, `commissionings` says how
-    far those of pairs are. `truth` is the pose at a stamp; `rng` scatters the checks by their noise, None: they do not
-    scatter."""
+    far those of pairs are. `truth` is the pose at a stamp; `scatter` draws the noise of the checks, None: they have
+    none."""
 
     truth: Callable[[int], Matrix4] = truth
-    rng: np.random.Generator | None = None
+    scatter: np.random.Generator | None = None
     cause: str | None = None
     baseline_not_used: str | None = None
     fault: Reason | None = None
@@ -170,8 +170,8 @@ class KnowingWorker:
         self.checked.append(tuple(pair.stamp_ns for pair in pairs))
         wrong = [se3.difference(np.array(job.body["pose"]), self.truth(pair.stamp_ns)) for pair in pairs]
         offset = np.mean(wrong, axis=0)
-        if self.rng is not None:
-            offset = offset + self.rng.normal(0.0, NOISE, 6)
+        if self.scatter is not None:
+            offset = offset + self.scatter.normal(0.0, NOISE, 6)
         observation = Observation(
             stamp_ns=pairs[-1].stamp_ns,
             pair_stamps_ns=tuple(pair.stamp_ns for pair in pairs),

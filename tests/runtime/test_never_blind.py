@@ -217,7 +217,7 @@ def test_a_long_drift(tmp_path: Path, record_property: Callable[[str, object], N
 def worst_of_drift(folder: Path, minutes: int) -> float:
     """Error of the served extrinsic, degrees, at most while it is healthy."""
     bench = settled(folder, moved((0.05, 0.0, 0.0, 0.0, 0.0, 0.0), lambda since_s: since_s / 60.0))
-    bench.worker.rng = np.random.default_rng(6)
+    bench.worker.scatter = np.random.default_rng(6)
     moments = driven(bench, range(60 * minutes))
     return max(moment.off_deg for moment in moments if moment.health == "healthy")
 
@@ -301,7 +301,7 @@ def healthy_until(observations: Sequence[Observation]) -> float:
 )
 def test_a_right_mount(tmp_path: Path, speed_mps: float | Callable[[int], float], seconds: int) -> None:
     bench = settled(tmp_path)
-    bench.worker.rng = np.random.default_rng(1)
+    bench.worker.scatter = np.random.default_rng(1)
     moments = driven(bench, range(seconds), speed_mps)
     assert changes(moments) == []
 
@@ -310,7 +310,7 @@ def test_a_right_mount(tmp_path: Path, speed_mps: float | Callable[[int], float]
 @pytest.mark.fault("a right mount that is parked for an hour", "it stays healthy once the last window is done")
 def test_a_right_mount_that_is_parked_for_an_hour(tmp_path: Path) -> None:
     bench = settled(tmp_path)
-    bench.worker.rng = np.random.default_rng(1)
+    bench.worker.scatter = np.random.default_rng(1)
     driven(bench, range(60), STANDING)
     assert changes(driven(bench, range(60, 3660), STANDING)) == []
 
@@ -320,7 +320,7 @@ def test_a_right_mount_that_is_parked_for_an_hour(tmp_path: Path) -> None:
 )
 def test_a_right_mount_through_poor_stretches(tmp_path: Path) -> None:
     bench = settled(tmp_path)
-    bench.worker.rng = rng = np.random.default_rng(3)
+    bench.worker.scatter = rng = np.random.default_rng(3)
     moments, second = [], 0
     for number in range(6):
         poor, good = int(rng.integers(5, 60)), int(rng.integers(10, 90))
