@@ -68,6 +68,8 @@ NOMINAL = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0
 BEFORE = se3.perturb(NOMINAL, np.radians([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
 AFTER = se3.perturb(NOMINAL, np.radians([0.1, 1.0, 0.0, 0.0, 0.0, 0.0]))
 WIDTH, HEIGHT = 16, 12
+NOISE = 8e-4
+"""Of a check, rad or m."""
 
 
 def truth(stamp_ns: int) -> Matrix4:
@@ -125,8 +127,11 @@ RIG = rig_of(configuration(Path("state")).pairs[0])
 class KnowingWorker:
     """Answers at once, and rightly. `cost_s`: processor time that work of a kind takes, for which `pay` is told;
     `checked` are the stamps of the pairs of each check, `drawn` the questions for pictures, `commissionings` says how
-    far those of pairs are."""
+    far those of pairs are. `truth` is the pose at a stamp; `scatter` draws the noise of the checks, None: they have
+    none."""
 
+    truth: Callable[[int], Matrix4] = truth
+    scatter: np.random.Generator | None = None
     cause: str | None = None
     baseline_not_used: str | None = None
     fault: Reason | None = None
@@ -163,15 +168,17 @@ class KnowingWorker:
     def _check(self, job: Job) -> Checked:
         pairs = unpack_pairs(job.body["frames"], LimitsConfig())
         self.checked.append(tuple(pair.stamp_ns for pair in pairs))
-        wrong = [se3.difference(np.array(job.body["pose"]), truth(pair.stamp_ns)) for pair in pairs]
+        wrong = [se3.difference(np.array(job.body["pose"]), self.truth(pair.stamp_ns)) for pair in pairs]
         offset = np.mean(wrong, axis=0)
+        if self.scatter is not None:
+            offset = offset + self.scatter.normal(0.0, NOISE, 6)
         observation = Observation(
             stamp_ns=pairs[-1].stamp_ns,
             pair_stamps_ns=tuple(pair.stamp_ns for pair in pairs),
             metrics=(),
             offset=offset,
             sigma=np.full(6, 1e-3),
-            noise=np.full(6, 8e-4),
+            noise=np.full(6, NOISE),
             place=np.full(6, 5e-4),
             dispersion=1.0,
             distance2=float(np.abs(offset).max() / 0.005),
@@ -208,7 +215,8 @@ class SlowWorker(KnowingWorker):
 
 
 class InstantRecorder:
-    """Tells the worker what is in a window, the moment it ends: the truth of its pairs, or what lies between two."""
+    """Tells the worker what is in a window, the moment it ends: the truth of its pairs, or what lies between two. A
+    window has three degrees of freedom: it sees no translation."""
 
     worker: KnowingWorker
 
@@ -266,7 +274,7 @@ class InstantRecorder:
         self.recorded += 1
         self.latest = self._folder.path(ended.window_id)
         self.latest.touch()
-        moved = np.mean([se3.difference(truth(stamp), NOMINAL) for stamp in stamps], axis=0)
+        moved = np.mean([se3.difference(self._seen(stamp), NOMINAL) for stamp in stamps], axis=0)
         pose = se3.perturb(NOMINAL, moved) @ self.worker.bias
         made = estimate(1)
         self.worker.estimates[ended.window_id] = replace(
@@ -279,8 +287,16 @@ class InstantRecorder:
         )
         late = [stamp for stamp in stamps if stamp >= STEP_S * S]
         if self.sees_knocks and 0 < len(late) < len(stamps):
-            self.worker.estimates[ended.window_id] = knocked(self.worker.estimates[ended.window_id], stamps, late)
+            self.worker.estimates[ended.window_id] = knocked(
+                self.worker.estimates[ended.window_id], stamps, late, self._seen
+            )
         self._on_recorded(ended.window_id, self.latest, True)
+
+    def _seen(self, stamp_ns: int) -> Matrix4:
+        """The pose at a stamp as far as windows see it."""
+        pose = self.worker.truth(stamp_ns).copy()
+        pose[:3, 3] = NOMINAL[:3, 3]
+        return pose
 
 
 class InstantScribe(Scribe):
@@ -291,11 +307,13 @@ class InstantScribe(Scribe):
         self.write_due()
 
 
-def knocked(of: Estimate, stamps: list[int], late: list[int]) -> Estimate:
+def knocked(of: Estimate, stamps: list[int], late: list[int], seen: Callable[[int], Matrix4]) -> Estimate:
     """The estimate of a window that was refused as it holds the step."""
     last_before = stamps[stamps.index(late[0]) - 1]
     verdict = Verdict(Decision.FAILED, (), (Reason(MOVED, "the camera moved"),))
-    return replace(of, verdict=verdict, moved=MovedWithin(last_before, late[0], len(late), BEFORE, AFTER))
+    return replace(
+        of, verdict=verdict, moved=MovedWithin(last_before, late[0], len(late), seen(last_before), seen(late[0]))
+    )
 
 
 class Bench:
@@ -309,12 +327,14 @@ class Bench:
         vehicle: str = "test",
         authority: AuthorityConfig | None = None,
         cores: float = 0.5,
+        truth: Callable[[int], Matrix4] = truth,
     ) -> None:
         config = configuration(folder, apply, vehicle)
         self.config = config.model_copy(
             update={"authority": authority or config.authority, "budget": BudgetConfig(cores=cores)}
         )
         self.kind = worker
+        self.truth = truth
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self.restart()
@@ -324,6 +344,7 @@ class Bench:
         self.budget = Budget(self.config.budget, lambda: 0.0)
         self.worker = self.kind()
         self.worker.pay = self.budget.pay
+        self.worker.truth = self.truth
         store = StateStore(self.folder, self.config.vehicle)
         self.intake = Intake(self.config.limits)
         self.published: list[str] = []

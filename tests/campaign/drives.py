@@ -22,24 +22,27 @@ RATE_HZ = 1.0
 """Pairs per second of driving: as many as the monitor takes."""
 CAMERA, LIDAR = "pinhole480x240", 32
 RENDER_S = 900.0
+OPTIONS = {"speed_mps": "--speed", "go_s": "--go", "stop_s": "--stop", "intrinsics_off": "--intrinsics-off"}
+"""Of `coec sim drive`, for the same words of a SOURCE."""
 TRUTH_TOPIC = "/ground_truth/tf"
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What `coec sim drive` is asked for."""
+    """What `coec sim drive` is asked for; `words` are further keys of a SOURCE, of `OPTIONS`, with their values."""
 
     seed: int
     seconds: int
     faults: tuple[str, ...] = ()
+    words: tuple[tuple[str, str], ...] = ()
 
     @property
     def source(self) -> str:
         """The same drive as a SOURCE: for the rig and its mask, which a bag has no place for."""
-        faults = f"&faults={';'.join(self.faults)}" if self.faults else ""
+        words = (*self.words, *((("faults", ";".join(self.faults)),) if self.faults else ()))
         return (
             f"sim:seed={self.seed}&seconds={self.seconds}&camera={CAMERA}&lidar={LIDAR}"
-            f"&camera_hz={RATE_HZ}&lidar_hz={RATE_HZ}{faults}"
+            f"&camera_hz={RATE_HZ}&lidar_hz={RATE_HZ}" + "".join(f"&{key}={value}" for key, value in words)
         )
 
     def recorded(self, folder: Path) -> Path:
@@ -49,6 +52,7 @@ class Drive:
         path = cache / f"drive-{self.seed}-{name}.mcap"
         if not path.exists():
             faults = [word for fault in self.faults for word in ("--fault", fault)]
+            faults += [word for key, value in self.words for word in (OPTIONS[key], value)]
             sizes = ("--camera", CAMERA, "--lidar", LIDAR, "--camera-hz", RATE_HZ, "--lidar-hz", RATE_HZ)
             done = coec("sim", "drive", "--output", path, "--seed", self.seed, "--seconds", self.seconds, *sizes,
                         *faults, timeout_s=RENDER_S)  # fmt: skip
@@ -68,6 +72,8 @@ class Truth:
         turns = [one.transform.rotation for one in poses]
         self._stamps_ns = [one.header.stamp.sec * NS_PER_S + one.header.stamp.nanosec for one in poses]
         self._turns = [rotation_from_quaternion_xyzw(np.array([q.x, q.y, q.z, q.w])) for q in turns]
+        places = [one.transform.translation for one in poses]
+        self._places = [np.array([place.x, place.y, place.z]) for place in places]
         recording = open_source(str(path))
         stamps_ns = [frame.stamp_ns for frame in recording.messages()]
         self.first_ns = min(stamps_ns)
@@ -81,9 +87,15 @@ class Truth:
 
     def error_deg(self, served: Matrix4, stamp_ns: int) -> float:
         """Geodesic angle of what is served from what was true at a time."""
+        return float(np.degrees(rotation_angle_rad(served[:3, :3] @ self._turns[self._number(stamp_ns)].T)))
+
+    def error_m(self, served: Matrix4, stamp_ns: int) -> float:
+        """Distance of the translation that is served from the true one at a time."""
+        return float(np.linalg.norm(served[:3, 3] - self._places[self._number(stamp_ns)]))
+
+    def _number(self, stamp_ns: int) -> int:
         at_ns = self.first_ns + (stamp_ns - self.first_ns) % self.pass_ns
-        place = max(bisect_right(self._stamps_ns, at_ns) - 1, 0)
-        return float(np.degrees(rotation_angle_rad(served[:3, :3] @ self._turns[place].T)))
+        return max(bisect_right(self._stamps_ns, at_ns) - 1, 0)
 
 
 def part(source: Path, begin_s: float, end_s: float, ahead_s: float, into: Path) -> Path:

@@ -11,7 +11,7 @@ import pytest
 from campaign.drives import Drive, Truth
 from campaign.figures import Figure, at_most, exactly, is_long, publish
 from campaign.test_never_blind import rate
-from campaign.watching import WRONG_DEG, Transition, configured, transitions, watching
+from campaign.watching import WRONG_DEG, Transition, configured, most_per_minute, transitions, watching
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 pytestmark = pytest.mark.slow
@@ -43,7 +43,7 @@ def drives() -> list[Drive]:
 def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     found: dict[str, list[Transition]] = {}
     entries: dict[str, Any] = {}
-    most_per_minute, worst_deg = 0, 0.0
+    most_changes, worst_deg = 0, 0.0
     never_well = []
     for drive in drives():
         recording = drive.recorded(tmp_path)
@@ -62,7 +62,7 @@ def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[
             entries[name] = [one["entry"] for one in history if one["entry"]["kind"] == "state"]
             errors = [one.error_deg for one in watch.samples if one.error_deg is not None]
             worst_deg = max(worst_deg, *errors)
-            most_per_minute = max(most_per_minute, _most_per_minute(found[name]))
+            most_changes = max(most_changes, most_per_minute(found[name]))
     for name, told in found.items():
         print(f"\n{name}")
         for one in told:
@@ -74,7 +74,7 @@ def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[
         exactly("changes to anything but stale, degraded (and back)", 0, len(accused)),
         exactly("changes without a reason", 0, len(mute)),
         at_most("served pose off the truth", WRONG_DEG, worst_deg, "deg"),
-        at_most("changes of health in any minute of sensor time", 1, most_per_minute, ""),
+        at_most("changes of health in any minute of sensor time", 1, most_changes, ""),
     ]
     details: dict[str, Any] = {
         "rate": rate(),
@@ -83,12 +83,6 @@ def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[
     }
     record_property("figure", f"accused {len(accused)} times in {len(found)} drives, {worst_deg:.2f} deg off at most")
     publish("poor_stretches", tmp_path, figures, details)
-
-
-def _most_per_minute(told: list[Transition]) -> int:
-    """In any minute of the drive. Back to healthy is the end of a change, not another one."""
-    begins = [one.second for one in told if one.after != "healthy"]
-    return max((sum(begin <= other < begin + 60.0 for other in begins) for begin in begins), default=0)
 
 
 def _row(one: Transition) -> dict[str, Any]:

@@ -74,7 +74,7 @@ class Sample:
     Attributes:
         wall_s: steady clock of the one who watches.
         stamp_ns: sensor time of the newest ego-motion on the air.
-        error_deg: of the served pose against the truth then; None without a truth.
+        error_deg, error_m: of the served pose against the truth then; None without a truth.
         age_s: what health says of its last evaluation.
     """
 
@@ -83,6 +83,7 @@ class Sample:
     state: str
     reasons: tuple[str, ...]
     error_deg: float | None
+    error_m: float | None
     age_s: float | None
     checks: int
     solved: int
@@ -154,13 +155,14 @@ class Watch:
             raise
         pair, worker = status["pairs"][0], status["worker"]
         served = np.array(extrinsic["camera_from_lidar"]["matrix"])
-        known = self.truth is not None and self._stamp_ns > 0
+        truth = self.truth if self._stamp_ns > 0 else None
         sample = Sample(
             wall_s=time.monotonic(),
             stamp_ns=self._stamp_ns,
             state=health["state"],
             reasons=tuple(reason["code"] for reason in health["reasons"]),
-            error_deg=self.truth.error_deg(served, self._stamp_ns) if known and self.truth else None,
+            error_deg=None if truth is None else truth.error_deg(served, self._stamp_ns),
+            error_m=None if truth is None else truth.error_m(served, self._stamp_ns),
             age_s=health["age_s"],
             checks=pair["checks"],
             solved=pair["solved"],
@@ -262,6 +264,12 @@ def transitions(samples: Sequence[Sample], second_of: Callable[[int], float]) ->
         for before, after in pairwise(samples)
         if before.state != after.state
     ]
+
+
+def most_per_minute(changes: Sequence[Transition]) -> int:
+    """Changes of health in any minute of the drive. Back to healthy is the end of a change, not another one."""
+    begins = [one.second for one in changes if one.after != "healthy"]
+    return max((sum(begin <= other < begin + 60.0 for other in begins) for begin in begins), default=0)
 
 
 def longest(samples: Sequence[Sample], condition: Callable[[Sample], bool], rate: float) -> float:

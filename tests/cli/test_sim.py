@@ -137,6 +137,7 @@ def test_a_rig_is_one_bag_whose_pairs_read_back_with_their_masks(coec: Coec, tmp
         (("--output", "rig.mcap", *RIG), "name a folder"),
         (("--output", "rig", *RIG, "--lidar", "16"), "--lidar of a rig"),
         (("--output", "rig", "--rig", "five"), "choose one of four-fisheyes"),
+        (("--output", "rig", "--rig", "four-fisheyes", "--stop", 5), "makes no stops"),
         (("--output", "rig", *RIG, "--fault", "step:1:rx=1"), "of which sensor"),
     ],
 )

@@ -191,6 +191,33 @@ def test_a_frozen_camera_repeats_its_last_picture_with_fresh_stamps() -> None:
     assert frames[1].image == pictures(plain())[1].image
 
 
+def test_a_frozen_lidar_repeats_its_last_sweep_with_fresh_stamps() -> None:
+    frames = sweeps(small("lidar_frozen:0.35-0.7").messages())
+    first = frames[1].xyz_m.tobytes()
+    assert [frame.xyz_m.tobytes() == first for frame in frames] == [False, True, True, True, False]
+    assert len({frame.stamp_ns for frame in frames}) == 5
+    assert first == sweeps(plain())[1].xyz_m.tobytes()
+
+
+def test_an_odometer_that_is_stuck_reports_a_standing_vehicle_that_drives_on() -> None:
+    drive = small("zero-ego:0.2-0.6")
+    sent = [drive._journey.motion(number, number / 50, 0) for number in range(50)]
+    assert [message.reaches(1.0) for message in sent] == [not 10 <= number < 30 for number in range(50)]
+    assert {(message.linear_mps, message.angular_radps) for message in sent[10:30]} == {((0.0,) * 3, (0.0,) * 3)}
+    assert np.array_equal(drive._journey.pose(0.5), small()._journey.pose(0.5))
+
+
+def test_in_stop_and_go_traffic_the_vehicle_stands_between_two_drives() -> None:
+    trip = small(stop_s=15.0, seconds=90.0)._journey.trip
+    speeds = {time_s: float(np.linalg.norm(trip.twist(time_s)[0])) for time_s in (10.0, 24.0, 37.0, 50.0, 75.0, 95.0)}
+    assert [speed > 4.0 for speed in speeds.values()] == [True, False, False, True, False, True], speeds
+    assert max(speeds[24.0], speeds[37.0], speeds[75.0]) < 1e-6, "it is still on its springs, too"
+    times = np.linspace(-0.1, 90.0, 4000)
+    steps = np.diff(trip.pace.progress(times))
+    assert steps.min() >= 0.0
+    assert np.abs(np.diff(steps)).max() < 4.0 * (times[1] - times[0]) ** 2, "it brakes and speeds up gently"
+
+
 def test_dead_beams_lost_motion_late_stamps_and_loss() -> None:
     dead = sweeps(small("beams:0:share=0.5", seconds=0.1).messages())[0]
     assert dead.ring is not None

@@ -101,9 +101,10 @@ Faults = Annotated[
     list[str] | None,
     typer.Option(
         "--fault",
-        help="KIND:BEGIN[-END][:KEY=VALUE,...], repeatable: step:30:rx=3, drift:30-90:ry=2, dirt, dark, frozen, beams, "
-        "no-ego, offset, offset_drift:10-60:seconds=0.05, loss; poor stretches: tunnel:20-35, open_road:20-50, "
-        "night:20-60, rain:20-60:mmph=20, low_sun:20-60.",
+        help="KIND:BEGIN[-END][:KEY=VALUE,...], repeatable: step:30:rx=3, drift:30-90:ry=2, "
+        "swing:30-90:rx=1,period_s=2, dirt, dark, frozen, lidar_frozen, beams, no-ego, zero-ego, offset, "
+        "offset_drift:10-60:seconds=0.05, loss; poor stretches: tunnel:20-35, open_road:20-50, night:20-60, "
+        "rain:20-60:mmph=20, low_sun:20-60.",
         metavar="FAULT",
     ),
 ]

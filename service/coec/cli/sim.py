@@ -30,7 +30,7 @@ TRUTH_TOPIC = "/ground_truth/tf"
 
 def opened(options: Options) -> SimulatedDrive:
     """The drive. Raises UsageError, SourceError: see `open_sim`."""
-    return open_sim(_query(options, ("lidar", "rolling_shutter_s", "intrinsics_off")))
+    return open_sim(_query(options, ("lidar", "go_s", "stop_s", "rolling_shutter_s", "intrinsics_off")))
 
 
 def opened_rig(options: Options) -> RigDrive:
@@ -38,6 +38,8 @@ def opened_rig(options: Options) -> RigDrive:
     own = (("--lidar", options.lidar != "64"), ("--rolling-shutter", options.rolling_shutter_s != 0.0))
     if not_its := [name for name, given in (*own, ("--intrinsics-off", options.intrinsics_off is not None)) if given]:
         raise UsageError(f"{', '.join(not_its)} of a rig: its sensors are what they are; leave it out")
+    if options.stop_s:
+        raise UsageError("--stop of a rig: its vehicle makes no stops; leave it out")
     return open_rig(_query(options, ("rig",)))
 
 

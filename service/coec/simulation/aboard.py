@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import cv2
@@ -138,6 +138,7 @@ class LidarAboard:
         self._journey, self._wire, self._model = journey, wire, model
         self._delay_s = delay_s
         self._own_body = own_body
+        self._repeated: tuple[int, LidarFrame] | None = None
 
     def time_s(self, index: int) -> float:
         """See `Aboard`."""
@@ -153,6 +154,15 @@ class LidarAboard:
 
     def frame(self, index: int, stamp_ns: int) -> LidarFrame:
         """See `Aboard`."""
+        frozen = next(wrong.now(self._wire.faults, wrong.LidarFrozen, self.time_s(index)), None)
+        if frozen is None:
+            return self._sweep(index, stamp_ns)
+        last = max(math.ceil((frozen.begin_s - self._delay_s) * self.hz) - 1, 0)
+        if self._repeated is None or self._repeated[0] != last:
+            self._repeated = (last, self._sweep(last, stamp_ns))
+        return replace(self._repeated[1], stamp_ns=stamp_ns, sequence=index)
+
+    def _sweep(self, index: int, stamp_ns: int) -> LidarFrame:
         time_s, journey, key = self.time_s(index), self._journey, self._wire.key
         share = max((fault.share for fault in wrong.now(self._wire.faults, wrong.Beams, time_s)), default=0.0)
         dead = journey.rng(_BEAMS, *key).random(self._model.pattern.beams) < share if share else None

@@ -52,6 +52,7 @@ class DriveConfig:
         camera_hz, lidar_hz, ego_hz: frames per second; a sweep always lasts one period of its model.
         camera_delay_s: the camera exposes this long after the stamp of its sweep.
         speed_mps: mean speed, 0 for a standing vehicle; None = as usual in the scene.
+        go_s, stop_s: in dense traffic the vehicle drives and stands by turns, so long each; 0 = it never stops.
         traffic: whether anything else moves.
         start_m: where along the road the drive begins.
         rolling_shutter_s: time from the first row of a picture to the last; the stamp is that of the middle row.
@@ -73,6 +74,8 @@ class DriveConfig:
     ego_hz: float = 50.0
     camera_delay_s: float = 0.01
     speed_mps: float | None = None
+    go_s: float = 20.0
+    stop_s: float = 0.0
     traffic: bool = True
     start_m: float = 0.0
     rolling_shutter_s: float = 0.0
@@ -109,6 +112,7 @@ class SimulatedDrive:
         self._journey = Journey(
             config.seed, config.scene, config.seconds,
             speed_mps=config.speed_mps, start_m=config.start_m, traffic=config.traffic, faults=config.faults,
+            go_s=config.go_s, stop_s=config.stop_s,
         )  # fmt: skip
         self._true = workshop_T_camera_lidar()
         self._turning = LidarAboard(

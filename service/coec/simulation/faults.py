@@ -59,6 +59,17 @@ class Drift(_Shift):
 
 
 @dataclass(frozen=True, slots=True)
+class Swing(_Shift):
+    """The mount is loose: it swings evenly to and fro by the shift about its pose, and is tight again at the end."""
+
+    period_s: float = 2.0
+
+    def phase(self, time_s: float) -> float:
+        """The share of the shift at a time, -1 to 1."""
+        return math.sin(2 * math.pi * (time_s - self.begin_s) / self.period_s)
+
+
+@dataclass(frozen=True, slots=True)
 class Dirt(Fault):
     """Blotches on the lens over this share of the picture."""
 
@@ -78,6 +89,11 @@ class Frozen(Fault):
 
 
 @dataclass(frozen=True, slots=True)
+class LidarFrozen(Fault):
+    """The LiDAR repeats its last sweep with fresh stamps."""
+
+
+@dataclass(frozen=True, slots=True)
 class Beams(Fault):
     """This share of the beams is dead."""
 
@@ -87,6 +103,11 @@ class Beams(Fault):
 @dataclass(frozen=True, slots=True)
 class NoEgo(Fault):
     """No ego-motion is sent."""
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroEgo(Fault):
+    """The odometer reports that the vehicle stands, whatever it does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,11 +162,14 @@ class OffsetDrift(Fault):
 KINDS: dict[str, type[Fault]] = {
     "step": Step,
     "drift": Drift,
+    "swing": Swing,
     "dirt": Dirt,
     "dark": Dark,
     "frozen": Frozen,
+    "lidar_frozen": LidarFrozen,
     "beams": Beams,
     "no-ego": NoEgo,
+    "zero-ego": ZeroEgo,
     "offset": Offset,
     "loss": Loss,
     "tunnel": Tunnel,
@@ -158,8 +182,9 @@ KINDS: dict[str, type[Fault]] = {
 CREEPING = ("drift", "offset_drift")
 """Kinds that grow from begin to end."""
 FORMS = (
-    "step:30:rx=3,tz=0.1 | drift:30-90:ry=2 | dirt:30-60:share=0.3 | dark:30-60:light=0.02 | frozen:30-60 | "
-    "beams:30-60:share=0.5 | no-ego:30-60 | offset:30-60:seconds=0.05 | loss:30-60:share=0.3 | "
+    "step:30:rx=3,tz=0.1 | drift:30-90:ry=2 | swing:30-90:rx=1,period_s=2 | dirt:30-60:share=0.3 | "
+    "dark:30-60:light=0.02 | frozen:30-60 | lidar_frozen:30-60 | beams:30-60:share=0.5 | no-ego:30-60 | "
+    "zero-ego:30-60 | offset:30-60:seconds=0.05 | loss:30-60:share=0.3 | "
     "offset_drift:10-60:seconds=0.05 | tunnel:20-35 | open_road:20-50 | night:20-60 | rain:20-60:mmph=20 | "
     "low_sun:20-60"
 )
@@ -168,6 +193,9 @@ FORMS = (
 
 HARDEST_RAIN_MMPH = 150.0
 """A cloudburst."""
+
+LEAST_PERIOD_S = 0.01
+"""Of a swing: a mount that moves faster blurs every picture, which is not drawn."""
 
 
 def parse_fault(text: str) -> Fault:
@@ -200,6 +228,8 @@ def parse_fault(text: str) -> Fault:
             raise UsageError(f"fault {text!r}: {key} must lie between 0 and 1")
     if not 0 <= values.get("mmph", 0.0) <= HARDEST_RAIN_MMPH:
         raise UsageError(f"fault {text!r}: mmph must lie between 0 and {HARDEST_RAIN_MMPH:g}")
+    if values.get("period_s", LEAST_PERIOD_S) < LEAST_PERIOD_S:
+        raise UsageError(f"fault {text!r}: period_s must be {LEAST_PERIOD_S:g} or more")
     return KINDS[kind](begin_s, end_s, **values)
 
 
@@ -211,10 +241,10 @@ class SensorFault:
     fault: Fault
 
 
-OF_ALL: tuple[type[Fault], ...] = (NoEgo, Loss, Tunnel, OpenRoad, Night, Rain, LowSun)
+OF_ALL: tuple[type[Fault], ...] = (NoEgo, ZeroEgo, Loss, Tunnel, OpenRoad, Night, Rain, LowSun)
 """Faults that need no sensor."""
-OF_CAMERAS: tuple[type[Fault], ...] = (Step, Drift, Dirt, Dark, Frozen, Offset, OffsetDrift, Loss)
-OF_LIDARS: tuple[type[Fault], ...] = (Step, Drift, Beams, Loss)
+OF_CAMERAS: tuple[type[Fault], ...] = (Step, Drift, Swing, Dirt, Dark, Frozen, Offset, OffsetDrift, Loss)
+OF_LIDARS: tuple[type[Fault], ...] = (Step, Drift, Swing, LidarFrozen, Beams, Loss)
 
 
 def parse_sensor_fault(text: str, cameras: Collection[str], lidars: Collection[str]) -> SensorFault:
@@ -259,7 +289,7 @@ def now(faults: Iterable[Fault], kind: type[F], time_s: float) -> Iterator[F]:
 
 
 def shifted(T_camera_lidar: NDArray[np.float64], faults: tuple[Fault, ...], time_s: float) -> NDArray[np.float64]:
-    """(4, 4): the extrinsic after all steps and drifts up to a time, in their order."""
+    """(4, 4): the extrinsic after all steps, drifts and swings up to a time, in their order."""
     result = T_camera_lidar
     for fault in faults:
         if isinstance(fault, Drift):
@@ -267,6 +297,8 @@ def shifted(T_camera_lidar: NDArray[np.float64], faults: tuple[Fault, ...], time
             result = perturb(result, share * fault.xi()) if share > 0 else result
         elif isinstance(fault, Step) and fault.active(time_s):
             result = perturb(result, fault.xi())
+        elif isinstance(fault, Swing) and fault.active(time_s):
+            result = perturb(result, fault.phase(time_s) * fault.xi())
     return result
 
 

@@ -43,7 +43,7 @@ class Journey:
 
     def __init__(
         self, seed: int, scene: str, seconds: float, *, speed_mps: float | None, start_m: float, traffic: bool,
-        faults: tuple[Fault, ...],
+        faults: tuple[Fault, ...], go_s: float = 20.0, stop_s: float = 0.0,
     ) -> None:  # fmt: skip
         """See `drive.DriveConfig`; only faults of the surroundings and of the odometer have an effect here.
 
@@ -54,7 +54,7 @@ class Journey:
         self._seed = seed
         self._faults = faults
         surroundings = _surroundings(scene, seed, speed_mps, faults)
-        pace = build_pace(seed, start_m, surroundings.speed_mps if speed_mps is None else speed_mps)
+        pace = build_pace(seed, start_m, surroundings.speed_mps if speed_mps is None else speed_mps, go_s, stop_s)
         poor = passages(faults, pace, seconds)
         self._town = Town(seed, start_m + pace.fastest_mps * seconds, poor, surroundings, traffic=traffic)
         self.trip: Trip = build_trip(seed, self._town.road, self._town.lane_left_m(), pace)
@@ -99,6 +99,8 @@ class Journey:
 
     def motion(self, index: int, time_s: float, stamp_ns: int) -> EgoMotion:
         """The sample of this number, with errors of odometer and gyroscope."""
+        if any(self._now(wrong.ZeroEgo, time_s)):
+            return EgoMotion(stamp_ns, "ego", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), sequence=index)
         linear, angular = self.trip.twist(time_s)
         constant, sample = self.rng(134), self.rng(135, index)
         linear = linear * (1 + constant.normal(0, SPEED_SCALE_SIGMA)) + sample.normal(0, SPEED_SIGMA_MPS, 3)

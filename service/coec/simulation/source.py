@@ -23,6 +23,8 @@ NUMBERS: dict[str, tuple[float, float]] = {
     "camera_delay_s": (0, 1),
     "start_m": (0, 1e6),
     "speed_mps": (0, 45),
+    "go_s": (1, 86400),
+    "stop_s": (0, 86400),
     "rolling_shutter_s": (0, 0.1),
 }
 """Query keys with a number, and its least and greatest value. The defaults are those of `DriveConfig`."""

@@ -18,6 +18,8 @@ Doubles = NDArray[np.float64]
 
 SPEED_SWING, SPEED_PERIOD_S = 0.25, 31.0
 """The share by which the speed swings about its mean, and the period of the swing."""
+BRAKE_S = 3.0
+"""How long a vehicle brakes before it stands, and speeds up after that."""
 WANDER_M, WANDER_PERIOD_M = 0.25, 83.0
 """How far the vehicle sways within its lane, and over which distance."""
 PITCH_RAD, PITCH_HZ = 0.004, (1.3, 0.41)
@@ -44,17 +46,21 @@ class Pace:
     Attributes:
         start_m: arc length at time 0.
         phase: of the swing of its speed, radians.
-        speed_mps: mean speed; 0 for a standing vehicle.
+        speed_mps: mean speed while it drives; 0 for a standing vehicle.
+        go_s, stop_s: how long it drives between two stops, and how long it then stands; without a stop it drives on.
     """
 
     start_m: float
     phase: float
     speed_mps: float
+    go_s: float = 20.0
+    stop_s: float = 0.0
 
-    @property
-    def liveliness(self) -> float:
-        """How much the vehicle moves on its springs, 0 to 1."""
-        return min(self.speed_mps / LIVELY_MPS, 1.0)
+    def liveliness(self, time_s: Doubles) -> Doubles:
+        """How much the vehicle moves on its springs at times in seconds, 0 to 1."""
+        braking, gaining = self._ramps(time_s)
+        share: Doubles = 1.0 - (braking - gaining) / BRAKE_S
+        return min(self.speed_mps / LIVELY_MPS, 1.0) * share
 
     @property
     def fastest_mps(self) -> float:
@@ -65,10 +71,41 @@ class Pace:
         """Arc length at times in seconds, metres."""
         omega = 2 * np.pi / SPEED_PERIOD_S
         swing = self.speed_mps * SPEED_SWING / omega
+        driven_s = self._driven_s(time_s)
         result: Doubles = (
-            self.start_m + self.speed_mps * time_s + swing * (np.cos(self.phase) - np.cos(omega * time_s + self.phase))
+            self.start_m
+            + self.speed_mps * driven_s
+            + swing * (np.cos(self.phase) - np.cos(omega * driven_s + self.phase))
         )
         return result
+
+    @property
+    def _cycle_s(self) -> float:
+        """From one start to the next."""
+        return self.go_s + 2 * BRAKE_S + self.stop_s
+
+    def _driven_s(self, time_s: Doubles) -> Doubles:
+        """How long a vehicle that never stops takes to come as far."""
+        if self.stop_s == 0.0:
+            return time_s
+        cycles = np.floor(time_s / self._cycle_s)
+        braking, gaining = self._ramps(time_s)
+        driven: Doubles = (
+            cycles * (self.go_s + BRAKE_S)
+            + np.minimum(time_s - cycles * self._cycle_s, self.go_s)
+            + braking
+            - braking**2 / (2 * BRAKE_S)
+            + gaining**2 / (2 * BRAKE_S)
+        )
+        return driven
+
+    def _ramps(self, time_s: Doubles) -> tuple[Doubles, Doubles]:
+        """How long the vehicle has been braking, and speeding up again, in its cycle at times in seconds."""
+        if self.stop_s == 0.0:
+            return np.zeros_like(time_s), np.zeros_like(time_s)
+        within = np.mod(time_s, self._cycle_s)
+        begin_s = self.go_s + BRAKE_S + self.stop_s
+        return np.clip(within - self.go_s, 0.0, BRAKE_S), np.clip(within - begin_s, 0.0, BRAKE_S)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +131,7 @@ class Trip:
         left = self.left_m + WANDER_M * np.sin(wave)
         turn = np.arctan(WANDER_M * 2 * np.pi / WANDER_PERIOD_M * np.cos(wave))
         heading = self.road.at(s)[:, 3] + turn
-        lively = self.pace.liveliness
+        lively = self.pace.liveliness(time)
         pitch = -self.road.at(s)[:, 4] + _swing(time, lively * PITCH_RAD, PITCH_HZ, self.phases[2:4])
         roll = _swing(time, lively * ROLL_RAD, ROLL_HZ, self.phases[4:6])
         heave = lively * HEAVE_M * np.sin(2 * np.pi * HEAVE_HZ * time + self.phases[6])
@@ -112,9 +149,9 @@ class Trip:
         return linear, rotation_log(turned) / (2 * TWIST_STEP_S)
 
 
-def build_pace(seed: int, start_m: float, speed_mps: float) -> Pace:
+def build_pace(seed: int, start_m: float, speed_mps: float, go_s: float = 20.0, stop_s: float = 0.0) -> Pace:
     """The pace of a seed."""
-    return Pace(start_m, float(_phases(seed)[0]), speed_mps)
+    return Pace(start_m, float(_phases(seed)[0]), speed_mps, go_s, stop_s)
 
 
 def build_trip(seed: int, road: Road, left_m: float, pace: Pace) -> Trip:
@@ -191,7 +228,7 @@ def whole_body() -> Mesh:
     return quads([*top, *flanks, *ends, *mirrors], dark, Material.LACQUER)
 
 
-def _swing(time_s: Doubles, size: float, hertz: tuple[float, float], phases: Doubles) -> Doubles:
+def _swing(time_s: Doubles, size: Doubles, hertz: tuple[float, float], phases: Doubles) -> Doubles:
     first = np.sin(2 * np.pi * hertz[0] * time_s + phases[0])
     result: Doubles = size * (0.4 * first + 0.6 * np.sin(2 * np.pi * hertz[1] * time_s + phases[1]))
     return result

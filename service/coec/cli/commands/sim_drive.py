@@ -35,6 +35,8 @@ class Options:
     ] = "64"
     scene: SimScene = "street"
     speed_mps: SimSpeed = None
+    go_s: Annotated[float, typer.Option("--go", help="Seconds of driving between two stops.", min=1)] = 20.0
+    stop_s: Annotated[float, typer.Option("--stop", help="Seconds for which it then stands; 0: no stops.", min=0)] = 0.0
     rolling_shutter_s: Annotated[
         float, typer.Option("--rolling-shutter", help="Seconds from the first image row to the last.", min=0, max=0.1)
     ] = 0.0

@@ -1,0 +1,150 @@
+"""Checks of a rendered drive on which a sensor is wrong, and what becomes of health."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from calibration.conftest import window_of
+from calibration.test_lifecycle import RULES
+from coec.adapters.images.codec import GreyImages
+from coec.calibration import lifecycle
+from coec.calibration.frames.sampling import CheckSampler, stands
+from coec.calibration.lifecycle import HealthState, PairState, Provenance, Status
+from coec.calibration.monitor.change_detector import MonitorState
+from coec.calibration.monitor.check_verdict import observe
+from coec.calibration.ports import DepthModel
+from coec.calibration.types import FramePair, Matrix4, Rig, Window
+from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
+from coec.geometry import se3
+from drives import drawn_source
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+DRIVE = "sim:seed=41&seconds=26&camera_hz=1&lidar_hz=1&ego_hz=20&camera=pinhole480x240&lidar=32&depth=yes"
+LIMIT_S = 15.0
+Change = Callable[[FramePair], FramePair]
+
+
+@dataclass(frozen=True)
+class Course:
+    """How health went: seconds for which it stayed healthy, the state at the end, and all codes of reasons."""
+
+    healthy_s: float
+    last: HealthState
+    reasons: frozenset[str]
+
+
+@pytest.fixture(scope="module")
+def drive() -> Window:
+    """A drive at 8 m/s with a pair a second."""
+    return window_of(drawn_source(DRIVE))
+
+
+def course(drive: Window, depth: DepthModel, change: Change = lambda pair: pair, rig: Rig | None = None) -> Course:
+    """Checks every period of the drive, its pairs changed, from a healthy state on."""
+    pose, begin_ns = drive.T_camera_lidar_start, drive.pairs[0].stamp_ns
+    sampler, images = CheckSampler(RULES.monitor), GreyImages(LimitsConfig())
+    state = PairState(
+        pose,
+        Provenance.ESTIMATED,
+        Status.ACCEPTED,
+        0,
+        health=HealthState.HEALTHY,
+        reasons=(),
+        proven=True,
+        monitor=MonitorState(vouched=True, acquitted_ns=begin_ns),
+    )
+    healthy_s, reasons = 0.0, set()
+    for pair in drive.pairs:
+        chosen = sampler.offer(change(pair))
+        if chosen is None:
+            continue
+        window = Window("check", rig or drive.rig, pose, chosen)
+        observation = observe(window, depth, images, CalibrationConfig(), None)
+        standing = tuple(one.stamp_ns for one in chosen if stands(one, WindowConfig()))
+        state = lifecycle.after_observation(state, replace(observation, standing_stamps_ns=standing), RULES)
+        reasons |= {reason.code for reason in state.reasons}
+        if state.health is HealthState.HEALTHY:
+            healthy_s = (observation.stamp_ns - begin_ns) / 1e9
+    return Course(healthy_s, state.health, frozenset(reasons))
+
+
+def without_motion(pair: FramePair) -> FramePair:
+    """Odometry reports a standing vehicle."""
+    assert pair.motion is not None
+    return replace(pair, motion=replace(pair.motion, linear_mps=(0.0, 0.0, 0.0), angular_radps=(0.0, 0.0, 0.0)))
+
+
+def with_points(pair: FramePair, T: Matrix4) -> FramePair:
+    """The sweep as a LiDAR measures it that was moved: its points p are T·p (4, 4)."""
+    moved = np.einsum("ij,nj->ni", T[:3, :3], pair.lidar.xyz_m) + T[:3, 3]
+    return replace(pair, lidar=replace(pair.lidar, xyz_m=np.ascontiguousarray(moved.astype(np.float32))))
+
+
+def turned(degrees: float) -> Matrix4:
+    """(4, 4) about the axis of the LiDAR."""
+    return se3.perturbation(np.array([0.0, 0.0, np.radians(degrees), 0.0, 0.0, 0.0]))
+
+
+def repeating(drive: Window, *, camera: bool) -> Change:
+    """The drivers repeat the first sweep, and the first picture if `camera`, with fresh stamps."""
+    first = drive.pairs[0]
+
+    def change(pair: FramePair) -> FramePair:
+        lidar = replace(first.lidar, stamp_ns=pair.lidar.stamp_ns)
+        picture = replace(first.camera, stamp_ns=pair.camera.stamp_ns) if camera else pair.camera
+        return replace(pair, camera=picture, lidar=lidar)
+
+    return change
+
+
+def test_a_right_rig_stays_healthy(drive: Window, stereo: DepthModel) -> None:
+    assert course(drive, stereo).last is HealthState.HEALTHY
+
+
+@pytest.mark.fault(
+    "odometry reports a standing vehicle that drives, and the mount is turned by 3°",
+    "not healthy after three periods; the odometry is named",
+)
+def test_stuck_odometry(drive: Window, stereo: DepthModel) -> None:
+    pose = drive.T_camera_lidar_start
+    after = se3.perturb(pose, np.radians([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))
+    found = course(drive, stereo, lambda pair: with_points(without_motion(pair), se3.inverse(after) @ pose))
+    assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
+    assert "ego_motion_wrong" in found.reasons
+
+
+@pytest.mark.fault("a LiDAR that is turned by 40° or 180° about its axis", "not healthy after three periods")
+@pytest.mark.parametrize("degrees", [40.0, 180.0])
+def test_a_turned_lidar(drive: Window, stereo: DepthModel, degrees: float) -> None:
+    found = course(drive, stereo, lambda pair: with_points(pair, turned(degrees)))
+    assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
+
+
+@pytest.mark.fault(
+    "drivers that repeat their last frames with fresh stamps, while odometry reports a standing vehicle or motion",
+    "not healthy after three periods; the frozen sensor is named",
+)
+@pytest.mark.parametrize(
+    ("camera", "standing", "code"), [(True, True, "camera_frozen"), (False, False, "lidar_frozen")]
+)
+def test_repeated_frames(drive: Window, stereo: DepthModel, *, camera: bool, standing: bool, code: str) -> None:
+    repeated = repeating(drive, camera=camera)
+    found = course(drive, stereo, lambda pair: without_motion(repeated(pair)) if standing else repeated(pair))
+    assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
+    assert code in found.reasons
+
+
+@pytest.mark.fault("a focal length that is 2 % or 5 % wrong", "not healthy after three periods; the lens is named")
+@pytest.mark.parametrize("factor", [1.02, 1.05])
+def test_a_wrong_focal_length(drive: Window, stereo: DepthModel, factor: float) -> None:
+    camera = drive.rig.camera
+    rig = replace(drive.rig, camera=camera._replace(fx=factor * camera.fx, fy=factor * camera.fy))
+    found = course(drive, stereo, rig=rig)
+    assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
+    assert "intrinsics_off" in found.reasons
+    assert found.reasons.isdisjoint({"time_offset", "ego_motion_wrong"})
