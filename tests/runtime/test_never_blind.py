@@ -239,7 +239,6 @@ def test_a_loose_mount(tmp_path: Path, swing_deg: float, limit_s: int) -> None:
     assert max(moment.second for moment in moments if moment.health == "healthy") <= limit_s, changes(moments)
 
 
-@pytest.mark.xfail(strict=True, reason="an accepted window clears `mount_loose` and the scatter of the checks")
 @LOOSE
 def test_a_loose_mount_whose_windows_are_accepted(tmp_path: Path, swing_deg: float, limit_s: int) -> None:
     bench = settled(tmp_path, swinging(swing_deg))
@@ -288,13 +287,7 @@ def healthy_until(observations: Sequence[Observation]) -> float:
 @pytest.mark.parametrize(
     ("speed_mps", "seconds"),
     [
-        pytest.param(
-            STANDING,
-            300,
-            marks=pytest.mark.xfail(
-                strict=True, reason="a window that ends while the vehicle stands has old pairs: `overdue_data`"
-            ),
-        ),
+        (STANDING, 300),
         (stop_and_go, 300),
         pytest.param(stop_and_go, 1200, marks=pytest.mark.slow),
     ],

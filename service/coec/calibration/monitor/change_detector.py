@@ -90,9 +90,6 @@ NS_PER_S = 1_000_000_000
 
 ROTATION_AXES, TRANSLATION_AXES = slice(0, 3), slice(3, 6)
 
-_OF_THE_MOUNT = frozenset({BENT_MOUNT.code, MOUNT_LOOSE.code})
-"""Causes that a window can clear."""
-
 
 def _unknown() -> NDArray[np.float64]:
     return np.full(6, np.nan)
@@ -323,7 +320,6 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
         scatter = scatter.after(told_by(observation, ROTATION_AXES, None), ROTATIONS.reach, fresh)
         if scatter.evidence >= LOOSE_AT:
             codes.add(MOUNT_LOOSE.code)
-    acquits = not codes and _vouches(state, observation)
     after = replace(
         state,
         blind=_explained(state.blind, codes or ({BENT_MOUNT.code} if observation.flagged else ()), fresh),
@@ -331,20 +327,23 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
         last_stamps_ns=observation.pair_stamps_ns,
         stood=stands,
         doubtful=doubtful_after(state.doubtful, observation.weak, fresh),
-        acquitted_ns=observation.stamp_ns if acquits else state.acquitted_ns,
-        unacquitted=0 if acquits else state.unacquitted + 1,
-        standstill=_standstill_after(state, observation, judged=judges) if stands else None,
         scatter=scatter,
     )
-    if not judges or repeated or fresh == 0.0:
-        # Neither for nor against: the data cannot tell, or were counted before.
-        return after
-    after = _weighed(after, replace(observation, weak=observation.weak or state.doubtful > 0.0), fresh, levels)
-    after = replace(after, outcome=_outcome(state.outcome, after, levels))
-    place = after.standstill
+    # Data that cannot tell, or were counted before, are neither for nor against the mount.
+    if judges and not repeated and fresh > 0.0:
+        after = _weighed(after, replace(observation, weak=observation.weak or state.doubtful > 0.0), fresh, levels)
+        after = replace(after, outcome=_outcome(state.outcome, after, levels))
+    # One check at a right place does not outweigh those that put the mount elsewhere.
+    acquits = not codes and _vouches(state, observation) and after.evidence < levels.clear
+    place = _standstill_after(state, observation, acquits=acquits, judges=judges) if stands else None
     if place is not None and place.contradicted and acquits and after.outcome is Finding.CLEAR:
-        return replace(after, standstill=Standstill.of(observation, acquits=True))
-    return after
+        place = Standstill.of(observation, acquits=True)
+    return replace(
+        after,
+        acquitted_ns=observation.stamp_ns if acquits else state.acquitted_ns,
+        unacquitted=0 if acquits else state.unacquitted + 1,
+        standstill=place,
+    )
 
 
 def after_window(
@@ -353,14 +352,16 @@ def after_window(
     """The state after a window with data up to the sensor time `stamp_ns` vouches for the served extrinsic. Causes in
     the data stay. So does what is known of the translation, if the window searched none: it cannot clear what it cannot
     see. What is known of the bias of the rig stays if the window `agrees` with what was served before, as an earlier
-    one did: small steps that lag behind a drift show as an offset from it."""
+    one did: small steps that lag behind a drift show as an offset from it. A window, which averages over a swing, does
+    not show that a mount is tight."""
     learned = agrees and state.vouched
     shifted = Hypotheses(state.shifted.right if learned else None) if solved_translation else state.shifted
     after = MonitorState(
         turned=Hypotheses(state.turned.right if learned else None),
         shifted=shifted,
-        blind={code: weight for code, weight in state.blind.items() if code not in _OF_THE_MOUNT},
+        blind={code: weight for code, weight in state.blind.items() if code != BENT_MOUNT.code},
         dirt=state.dirt,
+        scatter=replace(state.scatter, before=None, variance=None),
         vouched=True,
         acquitted_ns=max(stamp_ns, stamp_ns if state.acquitted_ns is None else state.acquitted_ns),
         standstill=state.standstill,
@@ -416,13 +417,14 @@ def _same_place(state: MonitorState, observation: Observation) -> Standstill | N
     return state.standstill if state.stood and standing.issuperset(observation.pair_stamps_ns) else None
 
 
-def _standstill_after(state: MonitorState, observation: Observation, *, judged: bool) -> Standstill | None:
-    """The check that counts for the place where the vehicle stands at the end of another; `judged`: whether that one
+def _standstill_after(
+    state: MonitorState, observation: Observation, *, acquits: bool, judges: bool
+) -> Standstill | None:
+    """The check that counts for the place where the vehicle stands at the end of another; `judges`: whether that one
     says anything of the mount."""
     place = _same_place(state, observation)
-    if not judged:
+    if not judges:
         return place
-    acquits = _vouches(state, observation)
     if place is None:
         return Standstill.of(observation, acquits=acquits)
     return replace(place, contradicted=place.contradicted or place.contradicts(observation, acquits=acquits))
@@ -442,12 +444,15 @@ def _explained(weights: Mapping[str, float], codes: Collection[str], fresh: floa
 
 
 def _vouches(state: MonitorState, observation: Observation) -> bool:
-    """Whether a check acquits the pose, and puts the mount where earlier ones did, as far as streets differ."""
+    """Whether a check acquits the pose, and puts the mount where earlier checks and the one before it did, as far as
+    streets differ."""
     for axes, tests in ((ROTATION_AXES, state.turned), (TRANSLATION_AXES, state.shifted)):
         measured = told_by(observation, axes, None)
-        if measured is None or tests.right is None:
+        if measured is None:
             continue
-        if tests.right.wider(measured.place).distance2(measured) > LEARNED2:
+        if tests.right is not None and tests.right.wider(measured.place).distance2(measured) > LEARNED2:
+            return False
+        if axes is ROTATION_AXES and state.scatter.distance2(measured) > LEARNED2:
             return False
     return observation.acquits
 

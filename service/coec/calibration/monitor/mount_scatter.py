@@ -10,7 +10,7 @@ ratios (Page 1954) of differences widened by a swing against those of a mount at
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, log, radians
+from math import exp, fsum, log, radians
 
 from coec.calibration.monitor.likelihood import BAD_SHARE, FREEDOM, Three, Told, plus, three
 
@@ -44,6 +44,15 @@ class MountScatter:
     def evidence(self) -> float:
         """The evidence on the axis that scatters most, nats."""
         return max(self.of_axes)
+
+    def distance2(self, measured: Told) -> float:
+        """Squared distance between a check and the last one with clear edges, in standard deviations of a mount at
+        rest; 0 before the first."""
+        if self.before is None or self.variance is None:
+            return 0.0
+        at_rest = plus(plus(measured.noise, measured.place), self.variance)
+        rows = zip(measured.offset, self.before, at_rest, strict=True)
+        return fsum((one - other) ** 2 / variance for one, other, variance in rows)
 
     def after(self, measured: Told | None, reach: Three, share: float) -> MountScatter:
         """The sum after one more check that counts by `share`, 0 to 1. `measured` is what the check says of the

@@ -67,6 +67,12 @@ class _Last:
     report: StreamStatistics
 
 
+def _later(before: _Last, last: _Last) -> _Last:
+    """The newer of two, with the later sensor time: the last pair of a window may be older than the last check."""
+    stamps_ns = [one.stamp_ns for one in (before, last) if one.stamp_ns is not None]
+    return _Last(last.monotonic_s, max(stamps_ns, default=None), last.report)
+
+
 class Progress:
     """Progress of the checks of one pair. Belongs to the thread that decides."""
 
@@ -78,9 +84,9 @@ class Progress:
     def completed(self, stamp_ns: int | None, monotonic_s: float, report: StreamStatistics, *, acquits: bool) -> None:
         """A check of pairs up to this sensor time was completed; or a window, which says even more. `acquits`: whether
         it acquits the served extrinsic."""
-        self._last = _Last(monotonic_s, stamp_ns, report)
+        self._last = _later(self._last, _Last(monotonic_s, stamp_ns, report))
         if acquits:
-            self._acquitted = self._last
+            self._acquitted = _later(self._acquitted, _Last(monotonic_s, stamp_ns, report))
         self._failure = None
 
     def failed(self, reason: Reason) -> None:
