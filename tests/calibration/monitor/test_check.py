@@ -120,6 +120,7 @@ A_CHECK = Check(
     edges_at_best=10.0,
     edges_in_view=100_000,
     looks=6.0,
+    scatter_rad=np.zeros(3),
     of_rotation=NOTHING,
     of_pose=NOTHING,
     contrast=TELLING_CONTRAST,

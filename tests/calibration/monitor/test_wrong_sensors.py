@@ -148,3 +148,17 @@ def test_a_wrong_focal_length(drive: Window, stereo: DepthModel, factor: float) 
     assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
     assert "intrinsics_off" in found.reasons
     assert found.reasons.isdisjoint({"time_offset", "ego_motion_wrong"})
+
+
+@pytest.mark.fault("a mount that swings by 1.5° about any axis in 2.3 s", "not healthy after four periods")
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_swinging_mount(drive: Window, stereo: DepthModel, axis: int) -> None:
+    pose = drive.T_camera_lidar_start
+
+    def change(pair: FramePair) -> FramePair:
+        angle_rad = np.radians(1.5) * np.sin(2.0 * np.pi * pair.stamp_ns / 2.3e9)
+        after = se3.perturb(pose, angle_rad * np.eye(6)[axis])
+        return with_points(pair, se3.inverse(after) @ pose)
+
+    # A check sees the mean of a swing, which may be right by chance.
+    assert course(drive, stereo, change).healthy_s <= LIMIT_S + RULES.monitor.period_s

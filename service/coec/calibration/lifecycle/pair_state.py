@@ -21,6 +21,7 @@ from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
 from coec.calibration.monitor.change_detector import (
     ACCUSING,
     ACQUITTAL_PERIODS,
+    BLIND_AT,
     AlarmLevels,
     Finding,
     MonitorState,
@@ -474,12 +475,14 @@ def _not_renewed(state: PairState, observation: Observation, rules: Rules) -> Pa
     lapsed = monitor.acquitted_ns is not None or monitor.unacquitted >= ACQUITTAL_PERIODS
     if is_acquitted(monitor, observation.stamp_ns, rules.monitor) or not lapsed:
         return state
-    cause = leading_cause(monitor.blind)
+    # What explains less than a whole check, or of the mount no more than one, explains nothing of the others.
+    least = {BENT_MOUNT: BLIND_AT}
+    cause = leading_cause({code: weight for code, weight in monitor.blind.items() if weight >= least.get(code, 1.0)})
     if cause is not None and cause.code == BENT_MOUNT:
         text = "The latest checks accuse the mount, and none acquits it."
         return _poor(state, Event.SUSPECTED, observation.stamp_ns, Reason("monitor_suspects", text))
     text = "No check of the latest pairs can confirm the extrinsic: their edges are faint, or do not fit well enough."
-    why = cause.as_reason() if cause is not None else Reason(NOT_ACQUITTED, text)
+    why = Reason(NOT_ACQUITTED, text) if cause is None else cause.as_reason()
     return _poor(state, Event.NOT_ACQUITTED, observation.stamp_ns, why)
 
 

@@ -140,8 +140,8 @@ class Observation:
         textured: number of blocks that could be dirty; 0 if unknown.
         standing_stamps_ns: of the pairs that were taken while the vehicle stood.
         undecided: the optimum lies too far off for a right pose, but the edges do not insist on it.
-        has_power: the edges at the local optimum are significant and stand out from other poses, so that the check
-            would hardly miss a displacement of a degree.
+        has_power: the edges at the local optimum are significant and stand out from other poses, and the pairs agree on
+            it, so that the check would hardly miss a displacement of a degree.
     """
 
     stamp_ns: int

@@ -86,6 +86,8 @@ class Check:
         edges_at_best: their significance at the local optimum over rotations.
         edges_in_view: number of range edges, of all pairs, that lie in the images at that optimum.
         looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 if that is unknown.
+        scatter_rad: (3,) standard deviation of the optimum over rotations from how its pairs and sectors differ, see
+            `Noise`; 0 if that is unknown.
         of_rotation, of_pose: how far the edges insist on these optima.
         contrast: how far the edges at the local optimum over rotations stand above other poses, standard deviations.
         overlap: range edges in view at the pose over those that come into view within reach.
@@ -100,6 +102,7 @@ class Check:
     edges_at_best: float
     edges_in_view: int
     looks: float
+    scatter_rad: NDArray[np.float64]
     of_rotation: Support
     of_pose: Support
     contrast: float
@@ -174,6 +177,7 @@ def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) 
         edges_at_best=frame_alignment(whole, found.T_rotation).significance,
         edges_in_view=_in_view(sharp, found.T_rotation),
         looks=1.0 if noise is None else noise.looks,
+        scatter_rad=np.zeros(3) if noise is None else np.sqrt(np.diag(noise.covariance)),
         of_rotation=support(landscape.centre, at_expected_turn),
         of_pose=support(at_pose, at_expected_pose),
         contrast=found.contrast,
