@@ -142,8 +142,9 @@ SCENARIOS = (
         limit_s=MINUTE_S, **IN_FORCE,
     ),
     Scenario(
+        # A check sees the mean of a swing, which may be right by chance, once or twice.
         "a mount that swings by 1.5°", Drive(SEED, 120, ("swing:70:rx=1.5,period_s=2.3",)), 70,
-        short=True, **IN_FORCE,
+        limit_s=2.0 * LIMIT_S, short=True, **IN_FORCE,
     ),
     *(
         Scenario(
@@ -187,7 +188,6 @@ def test_healthy_while_wrong(tmp_path: Path, record_property: Callable[[str, obj
     publish("green_while_wrong", tmp_path, figures, {"rate": rate(), "scenarios": details})
 
 
-@pytest.mark.fault("an hour of standing and twenty minutes of stop-and-go with a right mount", "it stays healthy")
 @pytest.mark.skipif(not is_long(), reason="takes an hour and a half: CAMPAIGN=long")
 def test_a_right_mount_stays_healthy(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     figures: list[Figure] = []
