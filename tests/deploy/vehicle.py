@@ -163,7 +163,12 @@ def main(story: Story) -> None:
         vehicle.said["names asked"] = list(world.names_asked)
         before = sum(world.strangers(ROUTER).values())
         subprocess.run([sys.executable, "-c", story.chatter], check=True)
-        wait_until(lambda: bool(world.told), "what the control said, at the listener", PATIENCE_S)
+        wait_until(
+            # The socket that sees packets is read by another thread than the listener's.
+            lambda: bool(world.told and world.names_asked) and sum(world.strangers(ROUTER).values()) > before,
+            "what the control said, at the listener and among the packets",
+            PATIENCE_S,
+        )
         vehicle.said["control"] = [sum(world.strangers(ROUTER).values()) - before, world.names_asked, len(world.told)]
     vehicle.said["unseen"] = world.unseen
     print(json.dumps(vehicle.said))
