@@ -417,10 +417,10 @@ def _confirmed(
     if accused:
         event = Event.MOUNT_MOVED if monitor.outcome is Finding.CONFIRMED else Event.SUSPECTED
         return _unless_red(state, event, TRANSLATION_OPEN)
-    cause = _data_cause(monitor)
     if not is_acquitted(monitor, stamp_ns if now_ns is None else now_ns, rules.monitor):
         text = "A window confirms the extrinsic, but its last pairs are old; no check has acquitted it since."
         return happened(state, Event.CONFIRMED_EARLIER, Reason(NOT_ACQUITTED, text))
+    cause = _data_cause(monitor)
     if cause is None:
         return _well_again(state, Event.CONFIRMED_BY_WINDOW, stamp_ns)
     after = happened(happened(state, Event.CONFIRMED_BY_WINDOW), Event.DATA_CAUSE, cause.as_reason())

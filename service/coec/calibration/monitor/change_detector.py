@@ -167,6 +167,11 @@ class Observation:
     has_power: bool = True
 
     @property
+    def stands(self) -> bool:
+        """Whether all pairs were taken while the vehicle stood."""
+        return set(self.standing_stamps_ns).issuperset(self.pair_stamps_ns)
+
+    @property
     def acquits(self) -> bool:
         """Whether the check by itself vouches for the pose: it would have noticed a wrong one, its edges lie where they
         should, and nothing is wrong with its data."""
@@ -245,8 +250,7 @@ def _offset(observation: Observation, axes: slice) -> Offset | None:
     if measured is None:
         return None
     # Pairs that were taken before the vehicle stood have the error of another place.
-    stands = set(observation.standing_stamps_ns).issuperset(observation.pair_stamps_ns)
-    return Offset(measured.offset, measured.noise if stands else plus(measured.noise, measured.place))
+    return Offset(measured.offset, measured.noise if observation.stands else plus(measured.noise, measured.place))
 
 
 def _differ(one: Offset | None, other: Offset | None) -> bool:
@@ -413,8 +417,7 @@ def _novelty(state: MonitorState, observation: Observation) -> tuple[float, bool
 
 def _same_place(state: MonitorState, observation: Observation) -> Standstill | None:
     """The check that counts for the place where all pairs of another were taken; None if that is a new place."""
-    standing = set(observation.standing_stamps_ns)
-    return state.standstill if state.stood and standing.issuperset(observation.pair_stamps_ns) else None
+    return state.standstill if state.stood and observation.stands else None
 
 
 def _standstill_after(
@@ -461,8 +464,7 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     """The state with its hypotheses after a check that counts by `fresh`. A check with faint edges, or of a place where
     the vehicle stands, may make the mount suspect but does not confirm a move: a lorry that parks in front of the
     camera stays, too."""
-    stands = set(observation.standing_stamps_ns).issuperset(observation.pair_stamps_ns)
-    most = levels.suspect if observation.weak or stands else levels.most
+    most = levels.suspect if observation.weak or observation.stands else levels.most
     turned, shifted, astray2 = state.turned, state.shifted, state.astray2
     told = told_by(observation, ROTATION_AXES, turned.before)
     if told is not None:
