@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 from cli.conftest import Coec
 from coec.adapters.files.conversions import result_of
 from coec.calibration.lifecycle import PairState, Rules, after_estimate, initial_state
 from coec.calibration.types import Decision, Reason, Verdict
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
-from coec.geometry import se3
+from coec.geometry import cameras, se3
 from coec.runtime.api.extrinsic import extrinsic_of
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.decisions.stored_pair import Clocks
@@ -77,6 +78,50 @@ def test_a_reply_of_a_service_gives_what_it_tells(coec: Coec, tmp_path: Path) ->
     np.testing.assert_allclose(told[0, 4], estimate(1).uncertainty.covariance[0, 4], rtol=1e-9)
 
 
+def holders(folder: Path) -> dict[str, Path]:
+    """Everything but a window that holds a calibration: the file or folder by its kind."""
+    accepted = result_of(estimate(1), RIG, "v7")
+    files = {"result": accepted, "reply": extrinsic_of("v7", RIG, SERVED, accepted, 0.0, "hash")}
+    for name, model in files.items():
+        (folder / f"{name}.json").write_bytes(to_json(model))
+    (folder / "state").mkdir()
+    kept(folder / "state", SERVED)
+    return {**{name: folder / f"{name}.json" for name in files}, "state": folder / "state"}
+
+
+@pytest.mark.parametrize("source", ["result", "reply", "state"])
+def test_the_intrinsics_that_it_was_estimated_with_come_along(coec: Coec, tmp_path: Path, source: str) -> None:
+    path = holders(tmp_path)[source]
+    camera = RIG.camera
+    K = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+    chain = YAML(typ="safe").load(coec("export", path, "--format", "kalibr").out)["cam0"]
+    assert (chain["camera_model"], chain["distortion_model"]) == ("pinhole", "none")
+    assert chain["intrinsics"] == [camera.fx, camera.fy, camera.cx, camera.cy]
+    assert chain["resolution"] == [camera.width, camera.height]
+    assert coec("export", path, "--format", "nuscenes").document[0]["camera_intrinsic"] == K
+    told = coec("export", path, "--format", "json").document["camera"]
+    assert told == {"model": "pinhole", **cameras.intrinsics_of(camera)}
+
+
+@pytest.mark.parametrize(
+    "intrinsics",
+    [
+        None,
+        {"model": "a_lens_of_tomorrow", "width": 640, "height": 400, "parameters": {"fx": 1.0}},
+        {"model": "pinhole", "width": 640, "height": 400, "parameters": {"fx": 1.0}},
+    ],
+)
+def test_intrinsics_that_are_absent_or_unknown_are_needed_only_where_they_are_written(
+    coec: Coec, result: Path, intrinsics: dict[str, object] | None
+) -> None:
+    document = json.loads(result.read_bytes())
+    result.write_text(json.dumps({**document, "intrinsics": intrinsics}))
+    assert coec("export", result, "--format", "tf").status == 0
+    outcome = coec("export", result, "--format", "kalibr")
+    assert outcome.status == 1
+    assert "give --config" in outcome.err
+
+
 def test_the_parent_may_be_another_frame_than_the_lidar(coec: Coec, result: Path) -> None:
     pose = "0.5,0,1.7,0,0,0.7071067811865476,0.7071067811865476"
     outcome = coec("export", result, "--format", "json", "--parent", "base_link", "--parent-pose", pose)
@@ -124,7 +169,6 @@ def test_a_file_is_replaced_whole_and_stays_what_it_was(coec: Coec, result: Path
         (("--format", "ros"), "known are tf, urdf, autoware"),
         (("--format", "tf", "--parent-pose", "1,2"), "seven finite numbers"),
         (("--format", "tf", "--parent", "a b"), "names no frame"),
-        (("--format", "kalibr"), "give --config"),
     ],
 )
 def test_what_does_not_fit_is_said(coec: Coec, result: Path, arguments: tuple[str, ...], said: str) -> None:

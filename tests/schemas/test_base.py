@@ -25,7 +25,7 @@ ACKNOWLEDGEMENT = Acknowledgement(
 
 def test_json_is_sorted_and_has_no_spaces_between() -> None:
     assert to_json(ACKNOWLEDGEMENT).decode() == (
-        '{"accepted":false,"code":"too_few_pairs","command":"calibrate","durable":null,"pair":"front","schema_version":6,'
+        '{"accepted":false,"code":"too_few_pairs","command":"calibrate","durable":null,"pair":"front","schema_version":7,'
         '"text":"4 more pairs — wait","vehicle":"v","window_id":null}'
     )
 

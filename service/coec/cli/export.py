@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from coec.adapters.exports.extrinsic import Extrinsic
-from coec.adapters.exports.told import Frames, of_reply, of_result, pose_of
+from coec.adapters.exports.told import Frames, intrinsics_config_of, of_reply, of_result, pose_of
 from coec.adapters.files import output
 from coec.adapters.files.rig import intrinsics_config
 from coec.adapters.mcap.windows import read_result, read_window
@@ -97,7 +97,8 @@ def _of_state(folder: Path, name: str | None, config: Config | None, frames: Fra
     if stored.accepted is None:
         raise UsageError(f"{folder}: nothing was accepted yet; --config says which frames the nominal calibration has")
     own = (stored.accepted.lidar_frame, stored.accepted.camera_frame)
-    return exported(state, stored.accepted.vehicle, chosen, own, None, frames)
+    camera = intrinsics_config_of(stored.accepted.intrinsics)
+    return exported(state, stored.accepted.vehicle, chosen, own, camera, frames)
 
 
 def _pose(text: str | None) -> Matrix4 | None:

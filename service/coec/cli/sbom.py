@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -12,11 +13,14 @@ from coec.adapters.depth.model_cards import CARDS, list_models
 from coec.adapters.depth.onnx_network import file_identity
 from coec.adapters.files.output import write
 from coec.adapters.system.installed import installed, pinned_hashes
+from coec.errors import UsageError
 from coec.reports import bill_of_materials, console
 from coec.reports.bill_of_materials import Inventory, Network
 
 APPLICATION = "coec"
 DOCUMENT, TABLE = "coec.cdx.json", "licences.md"
+SOURCE_DATE_EPOCH = "SOURCE_DATE_EPOCH"
+"""Variable with the time of a reproducible build (reproducible-builds.org)."""
 
 
 def run(lock: Path | None, output: Path | None, *, as_json: bool) -> int:
@@ -24,12 +28,12 @@ def run(lock: Path | None, output: Path | None, *, as_json: bool) -> int:
 
     Raises:
         NotFoundError: coec is not installed as a package, or something it needs is not.
-        UsageError: the lock file cannot be read.
+        UsageError: the lock file cannot be read, or SOURCE_DATE_EPOCH is no time.
         OutputError: a file cannot be written.
     """
     hashes = {} if lock is None else pinned_hashes(lock)
     inventory = inventory_here()
-    document = bill_of_materials.cyclonedx(inventory, hashes, datetime.now(UTC))
+    document = bill_of_materials.cyclonedx(inventory, hashes, _build_time())
     if output is not None:
         text = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
         written = [
@@ -46,6 +50,18 @@ def run(lock: Path | None, output: Path | None, *, as_json: bool) -> int:
         listed.add_row(package.name, package.version, package.licence or bill_of_materials.NOT_STATED, native)
     console.out.print(listed)
     return 0
+
+
+def _build_time() -> datetime | None:
+    """The time that SOURCE_DATE_EPOCH names (seconds since 1970); None where it is not set, because a document with the
+    present time would differ from one made a second later of the same installation."""
+    text = os.environ.get(SOURCE_DATE_EPOCH)
+    if not text:
+        return None
+    try:
+        return datetime.fromtimestamp(int(text), UTC)
+    except (ValueError, OverflowError, OSError) as error:
+        raise UsageError(f"{SOURCE_DATE_EPOCH}={text}: the seconds since 1970 are expected") from error
 
 
 def inventory_here() -> Inventory:

@@ -41,12 +41,12 @@ class Inventory:
     networks: Sequence[Network]
 
 
-def cyclonedx(inventory: Inventory, hashes: Hashes, made: datetime) -> dict[str, Any]:
-    """The CycloneDX document; the same installation always gives the same one, except for `made`.
+def cyclonedx(inventory: Inventory, hashes: Hashes, made: datetime | None) -> dict[str, Any]:
+    """The CycloneDX document; the same installation always gives the same one.
 
     Args:
         hashes: of the archives from which the packages may have been installed; none where they are not known.
-        made: with a time zone.
+        made: time stamp of the document, with a time zone; None: it has none.
     """
     application = inventory.application
     own = _reference(application)
@@ -88,7 +88,7 @@ def cyclonedx(inventory: Inventory, hashes: Hashes, made: datetime) -> dict[str,
         "serialNumber": f"urn:uuid:{uuid.uuid5(uuid.NAMESPACE_URL, repr((components, dependencies)))}",
         "version": 1,
         "metadata": {
-            "timestamp": made.isoformat(timespec="seconds"),
+            **({} if made is None else {"timestamp": made.isoformat(timespec="seconds")}),
             "tools": {
                 "components": [{"type": "application", "name": application.name, "version": application.version}]
             },

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from coec.errors import DecodeError
 from coec.untrusted import Untrusted, printable
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 """Version of the models in this package, raised when a field is added. A field that changes its meaning or goes away
 needs a new `@v2` in the keys instead."""
 

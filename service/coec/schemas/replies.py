@@ -53,6 +53,17 @@ class Transform(Part):
     quaternion_xyzw: Row4 = Field(description="rotation, unit quaternion, w ≥ 0")
 
 
+class Intrinsics(Part):
+    """Intrinsics of the camera, by the names of the configuration."""
+
+    model: Text = Field(description="model of the lens")
+    width: int = Field(description="image width, px")
+    height: int = Field(description="image height, px")
+    parameters: dict[Text, float] = Field(
+        description="fx fy cx cy (px; pixel centres at integers), and the parameters of the model by name"
+    )
+
+
 class Reason(Part):
     """One reason, for programs and for people."""
 
@@ -167,6 +178,9 @@ class CalibrationResult(Message):
     moved: MovedWithin | None = Field(
         default=None, description="set if the window was refused because the camera moved within it"
     )
+    intrinsics: Intrinsics | None = Field(
+        default=None, description="those of the camera that it holds for; null: the writer is of an earlier version"
+    )
 
 
 class CalibrationReport(CalibrationResult):
@@ -234,6 +248,9 @@ class ExtrinsicReply(Message):
     pending: Candidate | None = None
     held: bool = Field(default=False, description="frozen by `command/hold`")
     hold: Hold | None = Field(default=None, description="who holds it, since when and why; null if not held")
+    intrinsics: Intrinsics | None = Field(
+        default=None, description="those of the camera that it holds for; null: the service is of an earlier version"
+    )
 
 
 class DataQuality(Part):

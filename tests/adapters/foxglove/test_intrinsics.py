@@ -8,14 +8,19 @@ import pytest
 
 from boards import LENSES
 from coec.adapters.foxglove.intrinsics import counterpart_of
+from coec.geometry.cameras import build
 from coec.geometry.projection import project
 
 POINTS_M = np.random.default_rng(3).uniform([-1.0, -0.6, 1.0], [1.0, 0.6, 3.0], size=(200, 3))
+RATIONAL = build(
+    "rational", width=640, height=400, fx=320.0, fy=321.0, cx=319.5, cy=199.5,
+    k1=0.3, k2=0.05, p1=1e-3, p2=-1e-3, k3=0.01, k4=0.35, k5=0.08, k6=0.02,
+)  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["pinhole", "radtan", "kannala_brandt"])
+@pytest.mark.parametrize("name", ["pinhole", "radtan", "rational", "kannala_brandt"])
 def test_the_counterpart_projects_as_the_camera_does(name: str) -> None:
-    camera = LENSES[name]
+    camera = RATIONAL if name == "rational" else LENSES[name]
     counterpart = counterpart_of(camera)
     assert counterpart is not None
     told = counterpart.camera
@@ -25,10 +30,6 @@ def test_the_counterpart_projects_as_the_camera_does(name: str) -> None:
     if counterpart.distortion_model == "kannala_brandt":
         uv_px = cv2.fisheye.projectPoints(POINTS_M[:, None], still, still, K, D)[0]
     else:
-        assert counterpart.distortion_model == "plumb_bob"
+        assert counterpart.distortion_model == ("rational_polynomial" if name == "rational" else "plumb_bob")
         uv_px = cv2.projectPoints(POINTS_M, still, still, K, D)[0]
     np.testing.assert_allclose(project(camera, POINTS_M)[0], np.asarray(uv_px).reshape(-1, 2), atol=1e-8)
-
-
-def test_a_model_that_viewers_do_not_know_has_none() -> None:
-    assert counterpart_of(LENSES["double_sphere"]) is None

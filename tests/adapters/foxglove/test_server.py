@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import psutil
 import pytest
@@ -18,15 +19,18 @@ from adapters.foxglove.test_shown import EXTRINSICS, places, projected
 from adapters.foxglove.test_timeline import FULL
 from boards import LENSES, MOVED, NOMINAL, pair_with, rig_with, sweep
 from coec.adapters.foxglove import topics
+from coec.adapters.foxglove.intrinsics import counterpart_of
 from coec.adapters.foxglove.server import Screen
 from coec.adapters.foxglove.shown import Picture, picture_of
 from coec.adapters.foxglove.timeline import schema
-from coec.adapters.foxglove.topics import PICTURES, POINTS, TOPICS, Pose
+from coec.adapters.foxglove.topics import PICTURES, POINTS, TOPICS, Pose, topics_for
 from coec.adapters.images.codec import encode_png, probe
 from coec.calibration.types import Rig
 from coec.config import LimitsConfig
 from coec.errors import UnavailableError
 from coec.geometry import se3
+from coec.geometry.cameras import build
+from coec.geometry.projection import project
 from fakes import wait_until
 from foxglove_viewer import BINARY, TEXT, Viewer
 
@@ -43,7 +47,7 @@ and the kernel hold of them."""
 
 @pytest.fixture
 def screen() -> Iterator[Screen]:
-    screen = Screen(HOST, 0, "coec test")
+    screen = Screen(HOST, 0, "coec test", LENSES["kannala_brandt"])
     yield screen
     screen.close()
 
@@ -114,6 +118,41 @@ def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: Screen) ->
         assert len(calibration.D) == 4
 
 
+def test_intrinsics_of_a_lens_that_viewers_do_not_know_are_those_of_one_that_they_know() -> None:
+    """To a hundredth of a pixel all over the image, in OpenCV's fisheye model, which `kannala_brandt` names."""
+    told, rig = picture("double_sphere")
+    screen = Screen(HOST, 0, "coec test", rig.camera)
+    try:
+        with Viewer(screen.url) as viewer:
+            shown_to(viewer, screen, told, topics.CALIBRATION)
+            calibration = viewer.next_on(topics.CALIBRATION)
+    finally:
+        screen.close()
+    assert calibration.distortion_model == "kannala_brandt"
+    points_m = np.random.default_rng(3).uniform([-1.0, -0.6, 0.5], [1.0, 0.6, 3.0], size=(200, 3))
+    uv_px, seen = project(rig.camera, points_m)
+    still, K = np.zeros(3), np.reshape(calibration.K, (3, 3))
+    fitted_px = cv2.fisheye.projectPoints(points_m[:, None], still, still, K, np.array(calibration.D))[0][:, 0]
+    np.testing.assert_allclose(fitted_px[seen], uv_px[seen], atol=0.01)
+
+
+def test_intrinsics_that_viewers_cannot_have_are_no_topic() -> None:
+    """Who subscribed to one would wait for ever."""
+    told, rig = picture("double_sphere")
+    odd = build(
+        "mei", width=640, height=400, fx=150.0, fy=150.0, cx=320.0, cy=200.0, xi=1.0, k1=4.0, k2=-9.0, p1=0.2, p2=0.0
+    )
+    assert counterpart_of(odd) is None
+    screen = Screen(HOST, 0, "coec test", odd)
+    try:
+        with Viewer(screen.url) as viewer:
+            shown_to(viewer, screen, replace(told, rig=replace(rig, camera=odd)), topics.IMAGE)
+            viewer.next_on(topics.IMAGE)
+            assert set(viewer.channels) == set(topics_for(odd)) == set(TOPICS) - {topics.CALIBRATION}
+    finally:
+        screen.close()
+
+
 def test_the_timeline_arrives_with_its_schema_and_remarks_with_their_level(screen: Screen) -> None:
     with Viewer(screen.url) as viewer:
         viewer.subscribe([topics.HEALTH, topics.LOG])
@@ -141,11 +180,11 @@ def test_what_nobody_looks_at_is_known(screen: Screen) -> None:
 def test_a_port_that_is_taken_is_said_and_may_be_free_later(screen: Screen) -> None:
     port = int(screen.url.rpartition(":")[2])
     with pytest.raises(UnavailableError, match=f"{HOST}:{port}: Address already in use"):
-        Screen(HOST, port, "another")
+        Screen(HOST, port, "another", LENSES["pinhole"])
 
 
 def test_an_address_of_the_sixth_version_is_written_in_brackets() -> None:
-    screen = Screen("::1", 0, "coec test")
+    screen = Screen("::1", 0, "coec test", LENSES["pinhole"])
     try:
         assert screen.url.startswith("ws://[::1]:")
     finally:

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 import coec
 from coec.adapters.exports.extrinsic import AXES, Extrinsic, Origin
 from coec.adapters.files.conversions import estimate_of, matrix_of
+from coec.adapters.files.rig import intrinsics_config
 from coec.config import CameraIntrinsics
 from coec.errors import OutputError
-from coec.geometry import se3
-from coec.schemas.replies import CalibrationResult, ExtrinsicReply
+from coec.geometry import cameras, se3
+from coec.schemas.replies import CalibrationResult, ExtrinsicReply, Intrinsics
 
 FRAME = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]{0,127}")
 """Frame names that are safe in XML, YAML, JSON and a shell."""
@@ -40,7 +41,8 @@ class Frames:
 
 
 def of_result(result: CalibrationResult, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
-    """A window's result, with its whole covariance; the reasons of a negative verdict become the objections."""
+    """A window's result, with its whole covariance; the reasons of a negative verdict become the objections. `camera`
+    None: the intrinsics that the result holds."""
     objections = tuple(reason.text for reason in result.verdict.reasons)
     origin = Origin(
         vehicle=result.vehicle,
@@ -57,14 +59,15 @@ def of_result(result: CalibrationResult, camera: CameraIntrinsics | None, frames
         estimate_of(result).uncertainty.covariance,
         (result.lidar_frame, result.camera_frame),
         frames,
-        camera,
+        intrinsics_config_of(result.intrinsics) if camera is None else camera,
         origin,
     )
 
 
 def of_reply(reply: ExtrinsicReply, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
     """The extrinsic that a service serves, with the part of its covariance that a reply holds: σ of each axis and two
-    correlations. The only possible objection is that it is still the nominal calibration."""
+    correlations. The only possible objection is that it is still the nominal calibration. `camera` None: the intrinsics
+    that the reply holds."""
     served = reply.provenance != "nominal"
     origin = Origin(
         vehicle=reply.vehicle,
@@ -81,9 +84,20 @@ def of_reply(reply: ExtrinsicReply, camera: CameraIntrinsics | None, frames: Fra
         _covariance(reply),
         (reply.lidar_frame, reply.camera_frame),
         frames,
-        camera,
+        intrinsics_config_of(reply.intrinsics) if camera is None else camera,
         origin,
     )
+
+
+def intrinsics_config_of(intrinsics: Intrinsics | None) -> CameraIntrinsics | None:
+    """The intrinsics of a result or a reply; None if it holds none, or no camera that this version has."""
+    if intrinsics is None:
+        return None
+    parameters = {**intrinsics.parameters, "width": intrinsics.width, "height": intrinsics.height}
+    try:
+        return intrinsics_config(cameras.build(intrinsics.model, **parameters))
+    except ValueError:
+        return None
 
 
 def framed(

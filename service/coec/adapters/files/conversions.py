@@ -26,6 +26,7 @@ from coec.calibration.types import (
     Uncertainty,
     Verdict,
 )
+from coec.geometry import cameras
 from coec.geometry.se3 import quaternion_xyzw_from_rotation
 from coec.schemas import replies
 
@@ -43,6 +44,18 @@ def transform_of(T: Matrix4) -> replies.Transform:
 def matrix_of(transform: replies.Transform) -> Matrix4:
     """(4, 4) float64, the same doubles."""
     return np.array(transform.matrix, dtype=np.float64)
+
+
+def intrinsics_of(camera: cameras.Camera) -> replies.Intrinsics:
+    """The wire form of a camera; its numbers are the same doubles."""
+    parameters = cameras.intrinsics_of(camera)
+    width, height = int(parameters.pop("width")), int(parameters.pop("height"))
+    return replies.Intrinsics(
+        model=cameras.name_of(camera),
+        width=width,
+        height=height,
+        parameters={name: float(value) for name, value in parameters.items()},
+    )
 
 
 def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.CalibrationResult:
@@ -89,13 +102,15 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         depth_identity=estimate.depth_identity,
         config_hash=estimate.config_hash,
         moved=None if estimate.moved is None else _moved_of(estimate.moved),
+        intrinsics=intrinsics_of(rig.camera),
     )
 
 
 def comparable(reached: replies.CalibrationResult, recorded: replies.CalibrationResult) -> replies.CalibrationResult:
     """`reached` with the schema version of `recorded`, for a comparison byte by byte: a recording by an earlier version
-    of the program holds that version, which is no difference in the decision."""
-    return reached.model_copy(update={"schema_version": recorded.schema_version})
+    of the program holds that version, and may lack the intrinsics, which is no difference in the decision."""
+    intrinsics = None if recorded.intrinsics is None else reached.intrinsics
+    return reached.model_copy(update={"schema_version": recorded.schema_version, "intrinsics": intrinsics})
 
 
 def _moved_of(moved: MovedWithin) -> replies.MovedWithin:

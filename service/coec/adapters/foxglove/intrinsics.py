@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from coec.adapters.ros.outgoing import UnsayableCameraError, sayable
 from coec.geometry.cameras import Camera, intrinsics_of, name_of
 
 
@@ -20,6 +21,7 @@ class Counterpart:
 COUNTERPARTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "pinhole": ("plumb_bob", ()),
     "radtan": ("plumb_bob", ("k1", "k2", "p1", "p2", "k3")),
+    "rational": ("rational_polynomial", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
     "kannala_brandt": ("kannala_brandt", ("k1", "k2", "k3", "k4")),
 }
 """The viewers' name of each model, and coec's names of its coefficients in their order. Points on the image do not need
@@ -27,10 +29,12 @@ them."""
 
 
 def counterpart_of(camera: Camera) -> Counterpart | None:
-    """The camera for viewers; None if they do not know its model."""
-    found = COUNTERPARTS.get(name_of(camera))
-    if found is None:
+    """The camera for viewers. One of a model that they do not know becomes a Kannala-Brandt camera, as for ROS; None if
+    that would put points on other pixels."""
+    try:
+        known, _ = sayable(camera)
+    except UnsayableCameraError:
         return None
-    model, names = found
-    values = intrinsics_of(camera)
-    return Counterpart(camera, model, tuple(float(values[name]) for name in names) or (0.0,) * 5)
+    model, names = COUNTERPARTS[name_of(known)]
+    values = intrinsics_of(known)
+    return Counterpart(known, model, tuple(float(values[name]) for name in names) or (0.0,) * 5)

@@ -10,12 +10,13 @@ import numpy as np
 from foxglove import Channel, Context, channels, messages
 
 from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.intrinsics import counterpart_of
+from coec.adapters.foxglove.intrinsics import Counterpart, counterpart_of
 from coec.adapters.foxglove.shown import Marks, Picture
 from coec.adapters.foxglove.timeline import Moment, schema
 from coec.adapters.foxglove.topics import Pose, frame_of
 from coec.calibration.types import EncodedImage
 from coec.errors import UnavailableError
+from coec.geometry.cameras import Camera
 from coec.geometry.se3 import inverse, quaternion_xyzw_from_rotation
 
 NS_PER_S = 1_000_000_000
@@ -41,8 +42,9 @@ _LOG_LEVELS = (
 class Screen:
     """Sends to viewers. For use by one thread; the library's own threads send to each viewer at its speed."""
 
-    def __init__(self, host: str, port: int, name: str) -> None:
-        """Listen at a host, without brackets, and a port; 0: any free port. `name` is shown to viewers.
+    def __init__(self, host: str, port: int, name: str, camera: Camera) -> None:
+        """Listen at a host, without brackets, and a port; 0: any free port. `name` is shown to viewers. If they
+        have no model for the pair's `camera`, its intrinsics are no topic.
 
         Raises:
             UnavailableError: it is not possible to listen there.
@@ -56,11 +58,16 @@ class Screen:
         }
         self._cloud = channels.PointCloudChannel(topics.CLOUD, context=context)
         self._transforms = channels.FrameTransformsChannel(topics.TRANSFORMS, context=context)
-        self._calibration = channels.CameraCalibrationChannel(topics.CALIBRATION, context=context)
+        self._counterpart = counterpart_of(camera)
+        self._calibration = (
+            None
+            if self._counterpart is None
+            else channels.CameraCalibrationChannel(topics.CALIBRATION, context=context)
+        )
         self._health = Channel(topics.HEALTH, schema=schema(), context=context)
         self._log = channels.LogChannel(topics.LOG, context=context)
-        pictures = (self._image, *self._marks.values(), self._cloud, self._transforms, self._calibration)
-        self._all = (*pictures, self._health, self._log)
+        always = (self._image, *self._marks.values(), self._cloud, self._transforms, self._health, self._log)
+        self._all = always if self._calibration is None else (*always, self._calibration)
         try:
             self._server = foxglove.start_server(
                 name=name, host=host, port=port, context=context, message_backlog_size=BACKLOG
@@ -86,9 +93,8 @@ class Screen:
         if picture.cloud is not None:
             self._cloud.log(_cloud(picture, picture.cloud, stamp))
         self._transforms.log(_transforms(picture, stamp))
-        calibration = _calibration(picture, stamp)
-        if calibration is not None:
-            self._calibration.log(calibration)
+        if self._calibration is not None and self._counterpart is not None:
+            self._calibration.log(_calibration(picture, self._counterpart, stamp))
 
     def tell(self, moment: Moment) -> None:
         """Send a line of the timeline."""
@@ -187,10 +193,7 @@ def _pose_in_lidar(
     )
 
 
-def _calibration(picture: Picture, stamp: messages.Timestamp) -> messages.CameraCalibration | None:
-    counterpart = counterpart_of(picture.rig.camera)
-    if counterpart is None:
-        return None
+def _calibration(picture: Picture, counterpart: Counterpart, stamp: messages.Timestamp) -> messages.CameraCalibration:
     camera = counterpart.camera
     return messages.CameraCalibration(
         timestamp=stamp,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coec.adapters.files.rig import rig_of
-from coec.adapters.foxglove.topics import TOPICS, Pose, frame_of
+from coec.adapters.foxglove.topics import Pose, frame_of, topics_for
 from coec.adapters.zenoh.client import connected_by
 from coec.calibration.types import Rig
 from coec.cli.one_pair import pair_named
@@ -143,7 +143,7 @@ def show_recording(options: RecordingOptions, place: Place, *, as_json: bool) ->
 def _screen(place: Place, rig: Rig) -> Screen:
     from coec.adapters.foxglove.server import Screen
 
-    return Screen(place.host, place.port, f"coec {rig.pair}")
+    return Screen(place.host, place.port, f"coec {rig.pair}", rig.camera)
 
 
 def _announce(screen: Screen, rig: Rig, shown: str, *, as_json: bool) -> None:
@@ -151,7 +151,12 @@ def _announce(screen: Screen, rig: Rig, shown: str, *, as_json: bool) -> None:
     if as_json:
         frames = {pose.value: frame_of(rig.camera_frame, pose) for pose in Pose}
         console.print_json(
-            {"url": screen.url, "shown": shown, "topics": dict(TOPICS), "frames": {"lidar": rig.lidar_frame, **frames}}
+            {
+                "url": screen.url,
+                "shown": shown,
+                "topics": dict(topics_for(rig.camera)),
+                "frames": {"lidar": rig.lidar_frame, **frames},
+            }
         )
         return
     console.show(f"{screen.url}  {shown}")

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.conversions import number_or_null, transform_of
+from coec.adapters.files.conversions import intrinsics_of, number_or_null, transform_of
 from coec.calibration.lifecycle import PairState, Status
 from coec.calibration.lifecycle.policy import step_between
 from coec.calibration.types import Rig, Uncertainty
@@ -77,6 +77,7 @@ def extrinsic_of(
         pending=candidate_of(state) if state.pending else None,
         held=state.hold is not None,
         hold=hold_of(state),
+        intrinsics=intrinsics_of(rig.camera),
     )
 
 
