@@ -121,6 +121,10 @@ def on_one_thread() -> Iterator[None]:
         numba.set_num_threads(before)
 
 
+# A program that imported numba before `coec` has its configuration from an environment without the threading layer that
+# `coec` chooses. numba would read it again at the next kernel, and forget what is set below.
+numba.config.reload_config()
+
 # Threads of a parallel kernel must not spin while they wait: with other processes on the cores, spinning made a small
 # solve take 1 to 5 s instead of 0.1 s. The OpenMP runtime reads this when numba loads it; a value set by the user wins.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
