@@ -167,4 +167,22 @@ class _Passes(event.Listener):
         pass
 
 
+class _Kernels(event.Listener):
+    """Reports the end of each compilation. Kernels are compiled inside of those that call them, on any thread, but by
+    numba one at a time."""
+
+    def __init__(self) -> None:
+        self._depth = 0
+
+    def on_start(self, event: Any) -> None:
+        del event
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if not self._depth:
+            compile_news.end(event.data["dispatcher"].py_func.__qualname__)
+
+
 event.register("numba:run_pass", _Passes())
+event.register("numba:compile", _Kernels())
