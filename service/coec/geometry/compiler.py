@@ -38,6 +38,9 @@ loop of every operation on an array, however short, and each of those takes a se
 # Twelve hexadecimal digits are 48 bits, enough to distinguish the edits of one code base.
 _HASH_DIGITS = 12
 
+_FRESH = "coec-fresh-"
+"""How the name of a directory begins that only one process uses."""
+
 
 def _sources_hash(package: Path) -> str:
     """Hex digest over the paths and contents of all Python sources below `package`."""
@@ -87,7 +90,13 @@ def kernel_cache_directory(package: Path) -> Path:
     for candidate in candidates:
         if _private_directory(candidate):
             return candidate
-    return Path(tempfile.mkdtemp(prefix=f"coec-{name}-"))
+    return Path(tempfile.mkdtemp(prefix=f"{_FRESH}{name}-"))
+
+
+def kernel_cache() -> tuple[Path, bool]:
+    """The directory in which this process caches compiled kernels, and whether another process will find it again."""
+    directory = Path(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
+    return directory, not directory.name.startswith(_FRESH)
 
 
 _WIDE = "+avx512vbmi2"
