@@ -32,6 +32,10 @@ ENV PATH=/opt/coec/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     XDG_CACHE_HOME=/var/cache
 USER coec
+# Compiles the kernels for every lens, so that a service whose processor is like that of the build has none to compile at
+# its first start; on another processor it compiles those that it needs, once. A volume that is mounted on /var/cache
+# for the first time is filled with them by Docker and podman, but not by Kubernetes.
+RUN coec warmup
 # Relative paths in the configuration are relative to its file: set `state: {directory: /var/lib/coec}`.
 VOLUME ["/var/lib/coec", "/var/cache/coec"]
 STOPSIGNAL SIGTERM

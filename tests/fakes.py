@@ -22,7 +22,7 @@ SETTINGS = "settings"
 """File in the fake worker's folder: a line for each configuration that it was told, behind the id of its process."""
 
 LET_GO = "let-go"
-"""File in the fake worker's folder: a worker that is `late` waits for it."""
+"""File in the fake worker's folder: a worker that is `late`, or compiles, waits for it."""
 
 
 def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
@@ -39,7 +39,9 @@ def fake_worker_command(fault: str, folder: Path, at: str = "solve") -> list[str
     """Command of a worker that answers every question as documented, except for one fault.
 
     Args:
-        fault: `none`; `unusable`, `stillborn`, `dumb` (says nonsense): at the start; `babble` (says something that
+        fault: `none`; `compiling` (says that it compiles kernels, until it is let go, before it is ready),
+            `compiling-stuck` (reports no progress after the first), `compiling-later` (after it is ready, when it is
+            sent to); `unusable`, `stillborn`, `dumb` (says nonsense): at the start; `babble` (says something that
             nobody asked) or `deaf` (reads nothing more): as soon as it is ready; else a key of `FAULTS`, done at every
             question of the kind `at`. With the suffix `-once`, only by the first process that comes to it.
         folder: where it finds `RESULT` and remembers that it has done its fault.
@@ -120,6 +122,13 @@ def _grow(*_: object) -> None:
         hoard.append(bytearray(b"x" * 2**24))
 
 
+def _compile(link: Link, right: dict[str, Any], folder: Path) -> None:
+    link.send({"kind": "compiling", "done": 0, "total": 3})
+    wait_until((folder / LET_GO).exists, "the word to go on", 60.0)
+    link.send({"kind": "compiled"})
+    link.send(right)
+
+
 def _half(*_: object) -> None:
     os.write(int(sys.argv[-2]), b"\0\0\1\0half")
     signal.pause()
@@ -172,6 +181,7 @@ FAULTS: dict[str, Callable[[Link, dict[str, Any], Path], None]] = {
     "twice": _twice,
     "leave": _leave,
     "late": _late,
+    "compiles": _compile,
     "refuse": _instead(lambda right: {"id": right["id"], "refused": {"code": "bad_window", "text": "empty"}}),
     "other": _instead(lambda right: {**right, "id": right["id"] + 1}),
     "empty": _instead(lambda _: {}),
@@ -201,6 +211,14 @@ def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
 
     _note_settings(folder, link.receive())
     match fault:
+        case "compiling" if at_fault():
+            for done in range(3):
+                link.send({"kind": "compiling", "done": done, "total": 3})
+                wait_until((folder / LET_GO).exists, "the word to go on", 60.0)
+                link.send({"kind": "compiled"})
+        case "compiling-stuck" if at_fault():
+            link.send({"kind": "compiling", "done": 1, "total": 3})
+            signal.pause()
         case "unusable":
             link.send({"kind": "unusable", "code": "bad_model", "text": "no such network"})
             return
@@ -208,7 +226,8 @@ def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
             sys.exit(3)
         case "dumb" if at_fault():
             link.send({"kind": "ready?"})
-    link.send({"kind": "ready"})
+    steps = int(fault == "compiling-later")
+    link.send({"kind": "ready", "more": steps > 0})
     if fault == "babble" and at_fault():
         link.send({"id": 1, "result": None})
     if fault == "deaf" and at_fault():
@@ -218,6 +237,12 @@ def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
         if question["kind"] == "start":
             _note_settings(folder, question)
             link.send({"kind": "ready"})
+            continue
+        if question["kind"] == "warm_up":
+            link.send({"kind": "compiling", "done": 2, "total": 3})
+            wait_until((folder / LET_GO).exists, "the word to go on", 60.0)
+            link.send({"kind": "compiled"})
+            link.send({"kind": "warmed", "more": False})
             continue
         right = _answer(folder, question)
         if fault in FAULTS and question["kind"] == at and at_fault():

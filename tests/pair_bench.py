@@ -143,6 +143,8 @@ class KnowingWorker:
     checked: list[tuple[int, ...]] = field(default_factory=list)
     drawn: list[Job] = field(default_factory=list)
     commissionings: dict[str, str] = field(default_factory=dict)
+    warms_up: bool = False
+    compiled_s: float = 0.0
 
     def commissioning(self, pair: str) -> str | None:
         return self.commissionings.get(pair)

@@ -83,6 +83,13 @@ __all__ = [
 # connects to nobody but those that it is configured for.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
+# The threading layer of parallel kernels, which numba reads when it is imported; processes that are started inherit it.
+# By default numba prefers TBB where a library of that name is installed, as it is with OpenCV or ROS on Debian. A
+# program then never ends, because TBB's threads spin at its exit. GNU OpenMP is safe for kernels called from several
+# threads; numba's own queue, which takes its place on a system without libgomp, ends such a program. Both are equally
+# quick and give the same bits. A choice of the user, here or in NUMBA_THREADING_LAYER, wins.
+os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")
+
 _LATER = {
     "CalibrationConfig": "coec.config",
     "Description": "coec.library.recordings",

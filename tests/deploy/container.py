@@ -86,6 +86,8 @@ def take_steps(stage: Stage, built: bool) -> None:
             case "COPY":
                 *sources, target = step.words()
                 _copy(sources, folder / target)
+            case "RUN" if step.text == "coec warmup":
+                pass  # takes minutes for all lenses; a service compiles those that it needs
             case "RUN":
                 subprocess.run(["/bin/sh", "-c", step.text], cwd=folder, env=environment, check=True)
             case "ENV" | "USER" | "VOLUME" | "STOPSIGNAL" | "HEALTHCHECK" | "ENTRYPOINT" | "CMD":

@@ -73,6 +73,12 @@ def test_pin_images_changes_nothing_without_a_digest(tmp_path: Path, told: str) 
     assert (tmp_path / "Dockerfile").read_text() == (REPOSITORY / "Dockerfile").read_text()
 
 
+def test_kernels_are_compiled_into_the_volume_of_the_cache_by_the_user_who_runs_the_service() -> None:
+    """A cache that belongs to another user is not used, and what is written to a volume after its line is lost."""
+    steps = [step.instruction if step.text != "coec warmup" else "warmup" for step in stages()[-1].steps]
+    assert steps.index("ENV") < steps.index("USER") < steps.index("warmup") < steps.index("VOLUME")
+
+
 # -------------------------------------------------------------------------------------------------------- compose
 def test_every_service_is_bounded_confined_and_asked_whether_it_is_well() -> None:
     image = stages()[-1]

@@ -43,6 +43,7 @@ COMMANDS = (
     "fetch",
     "view",
     "router",
+    "warmup",
     "batch",
     "replay",
     "convert",

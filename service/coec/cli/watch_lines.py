@@ -22,6 +22,9 @@ from coec.schemas.replies import HealthReply
 WAITING = 1024
 """Changes that may wait to be written, some 10 MB; further ones are counted and left out."""
 
+COMPILING = "compiling_kernels"
+"""Code of the reason whose text is shown, because it says how far the compilation is."""
+
 POLL_S = 0.2
 """Time between two checks whether to stop."""
 
@@ -78,7 +81,7 @@ def _write(change: Change, *, as_json: bool) -> None:
     elif isinstance(value, bool):
         console.show(f"{change.pair}  {'is served' if value else 'is no longer served'}")
     elif isinstance(value, HealthReply):
-        why = ", ".join(reason.code for reason in value.reasons)
+        why = ", ".join(reason.text if reason.code == COMPILING else reason.code for reason in value.reasons)
         console.show(f"{change.pair}  {value.state}{f': {why}' if why else ''}")
     else:
         console.show(f"{change.pair}  extrinsic {value.provenance}, latest attempt {value.status}")

@@ -431,11 +431,12 @@ class Daemon:
         """Troubles that concern every pair alike."""
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
+        compiling = None if worker.compiling is None else worker.compiling.reason
         hidden = TOKENS_HIDDEN if self._presence.hidden else None
         tokens = self._presence.unproven
         unproven = Reason("rival_unproven", unproven_text(tokens)) if tokens else None
         own = (self._scribe.trouble, self._insecure, hidden, unproven, self._router.trouble, self._door.insecure)
-        return tuple(reason for reason in (self._fault, failing, *own) if reason is not None)
+        return tuple(reason for reason in (self._fault, failing, compiling, *own) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
 

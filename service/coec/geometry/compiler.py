@@ -38,6 +38,9 @@ loop of every operation on an array, however short, and each of those takes a se
 # Twelve hexadecimal digits are 48 bits, enough to distinguish the edits of one code base.
 _HASH_DIGITS = 12
 
+_FRESH = "coec-fresh-"
+"""How the name of a directory begins that only one process uses."""
+
 
 def _sources_hash(package: Path) -> str:
     """Hex digest over the paths and contents of all Python sources below `package`."""
@@ -87,7 +90,13 @@ def kernel_cache_directory(package: Path) -> Path:
     for candidate in candidates:
         if _private_directory(candidate):
             return candidate
-    return Path(tempfile.mkdtemp(prefix=f"coec-{name}-"))
+    return Path(tempfile.mkdtemp(prefix=f"{_FRESH}{name}-"))
+
+
+def kernel_cache() -> tuple[Path, bool]:
+    """The directory in which this process caches compiled kernels, and whether another process will find it again."""
+    directory = Path(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
+    return directory, not directory.name.startswith(_FRESH)
 
 
 _WIDE = "+avx512vbmi2"
@@ -120,6 +129,10 @@ def on_one_thread() -> Iterator[None]:
     finally:
         numba.set_num_threads(before)
 
+
+# A program that imported numba before `coec` has its configuration from an environment without the threading layer that
+# `coec` chooses. numba would read it again at the next kernel, and forget what is set below.
+numba.config.reload_config()
 
 # Threads of a parallel kernel must not spin while they wait: with other processes on the cores, spinning made a small
 # solve take 1 to 5 s instead of 0.1 s. The OpenMP runtime reads this when numba loads it; a value set by the user wins.
@@ -163,4 +176,22 @@ class _Passes(event.Listener):
         pass
 
 
+class _Kernels(event.Listener):
+    """Reports the end of each compilation. Kernels are compiled inside of those that call them, on any thread, but by
+    numba one at a time."""
+
+    def __init__(self) -> None:
+        self._depth = 0
+
+    def on_start(self, event: Any) -> None:
+        del event
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if not self._depth:
+            compile_news.end(event.data["dispatcher"].py_func.__qualname__)
+
+
 event.register("numba:run_pass", _Passes())
+event.register("numba:compile", _Kernels())

@@ -119,10 +119,10 @@ def show_lines(text: str) -> None:
         show(line)
 
 
-def progress(*, counted: bool = True) -> Bars:
+def progress(*, counted: bool = True, compiling: bool = True) -> Bars:
     """A progress display on standard error that disappears when it is done. Where standard error is not a terminal, a
-    line now and then."""
-    return Bars(err, say, counted=counted)
+    line now and then. `compiling`: it also shows when kernels are compiled."""
+    return Bars(err, say, counted=counted, compiling=compiling)
 
 
 def table(*columns: str, right: Iterable[int] = ()) -> Table:

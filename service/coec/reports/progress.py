@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import Any
 
@@ -78,15 +79,19 @@ class Bars(Progress):
         say: Callable[[str], None],
         *,
         counted: bool,
+        compiling: bool = True,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`say` prints a line; `counted` shows how many of how many parts are done."""
+        """`say` prints a line; `counted` shows how many of how many parts are done, `compiling` a task of its own
+        while kernels are compiled."""
         self._say = say
         self._counted = counted
         self._now_s = now_s
         self._told_s = now_s()
         self._news = CompilingNews(now_s)
-        self._listening = compile_news.heard_by(self._hear)
+        self._listening: AbstractContextManager[None] = (
+            compile_news.heard_by(self._hear) if compiling else nullcontext()
+        )
         self._compiling: TaskID | None = None
         count = (MofNCompleteColumn(),) if counted else ()
         super().__init__(

@@ -35,6 +35,9 @@ def status(payload: bytes) -> None:
         f"worker {worker.state}, process {worker.pid or '-'}, {worker.restarts} restarts, {worker.queued} waiting; "
         f"windows {storage.bytes_used / 1e6:.0f} MB, free {storage.bytes_free / 1e9:.1f} GB"
     )
+    if worker.compiling is not None:
+        done = f"{worker.compiling.done} of {worker.compiling.total}"
+        console.show(f"  compiling kernels, once on this machine: {done}, for {duration(worker.compiling.elapsed_s)}")
     if reply.budget is not None:
         _budget(reply.budget)
     table = console.table(

@@ -50,7 +50,7 @@ class Pair:
         self.name = pair.name
         rig, folder = rig_of(pair), outside.folder
         losses = LossCounter(_log, pair.name)
-        mailbox, queue = Mailbox(), DecisionQueue()
+        mailbox, queue = Mailbox(), DecisionQueue(lambda: outside.worker.compiled_s)
         store = PairStore(rig, config.vehicle, config.state, outside.store, outside.scribe, folder, losses)
         of_rig = outside.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.unanswered == 0)
         questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, of_rig, outside.show)

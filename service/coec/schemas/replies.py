@@ -495,11 +495,20 @@ class PairStatus(Part):
     )
 
 
+class CompilingStatus(Part):
+    """The compilation of the worker's kernels, which happens once on a machine."""
+
+    done: Count = Field(description="kernels that are there")
+    total: Count = Field(description="kernels that the configuration needs")
+    elapsed_s: float = Field(ge=0, description="time since the first was begun, s")
+
+
 class WorkerStatus(Part):
     """The process that runs the depth network and solves windows."""
 
     state: Literal["starting", "idle", "busy", "stopped"]
     pid: int | None = None
+    compiling: CompilingStatus | None = Field(default=None, description="null while no kernel is being compiled")
     restarts: Count = 0
     queued: Count = Field(default=0, description="jobs that wait")
     waiting: Counts = Field(

@@ -21,7 +21,7 @@ from coec.adapters.system.threads import ServiceThread
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Reason
 from coec.config import CalibrationConfig, WorkerConfig
 from coec.runtime.api.status import worker_status_of
-from coec.runtime.worker import jobs, link
+from coec.runtime.worker import compilation, jobs, link
 from coec.runtime.worker.child import Child, ChildError, Fault
 from coec.runtime.worker.costs import Cost
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Fate, Job, JobOutcome, Kind, Solved
@@ -519,6 +519,87 @@ def test_an_outcome_is_told_without_a_lock(tmp_path: Path) -> None:
         it.worker.ask(jobs.overlay("front", Path("a"), POSE, "first", told))
         assert it.answer() == ("next", Drawn(b"next"))
     assert statuses.get_nowait() in (WorkerState.BUSY, WorkerState.READY)
+
+
+# --- kernels that are compiled ----------------------------------------------------------------------------------------
+
+
+def compiling(it: Bench) -> tuple[int, int] | None:
+    """How many kernels are there, of how many; None if none are being compiled."""
+    told = it.worker.status().compiling
+    return None if told is None else (told.done, told.total)
+
+
+@pytest.mark.fault(
+    "a first start on a busy machine: kernels are compiled for minutes",
+    "no time limit counts it, no worker is replaced, status says how far it is; windows wait",
+)
+def test_no_time_limit_counts_the_time_of_compiling(tmp_path: Path) -> None:
+    with running("compiling", tmp_path) as it:
+        it.solve("a")
+        wait_until(lambda: compiling(it) is not None, "the compilation")
+        it.overlay("picture", deadline_s=2.0)
+        wait_until(lambda: it.worker.compiled_s > 2.5, "longer than the deadline")
+        assert compiling(it) == (0, 3)
+        assert it.worker.warms_up
+        status = worker_status_of(it.worker)
+        assert (status.state, status.restarts, status.waiting) == ("starting", 0, {"solve": 1, "overlay": 1})
+        assert status.compiling is not None
+        assert status.compiling.elapsed_s > 2.5
+        (tmp_path / LET_GO).touch()
+        assert {it.answer()[0] for _ in range(2)} == {"a", "picture"}
+        assert (it.worker.status().starts, it.faults(), compiling(it)) == (1, {}, None)
+        assert not it.worker.warms_up
+
+
+def test_a_check_is_refused_while_a_worker_that_starts_compiles_kernels(tmp_path: Path) -> None:
+    with running("compiling", tmp_path) as it:
+        wait_until(lambda: it.worker.warms_up, "the compilation")
+        it.check("early")
+        name, reason = it.failure()
+        assert (name, reason.code) == ("early", "compiling_kernels")
+        assert "0 of 3" in reason.text
+        (tmp_path / LET_GO).touch()
+        wait_until(lambda: it.worker.status().state is WorkerState.READY, "ready")
+        it.check("c")
+        assert it.answer()[0] == "c"
+
+
+@pytest.mark.fault("a compilation of kernels that makes no progress", "the worker is replaced, after a generous time")
+def test_a_worker_that_makes_no_progress_in_compiling_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compilation, "STALLED_S", 0.3)
+    with running("compiling-stuck-once", tmp_path) as it:
+        it.solve("a")
+        assert it.answer() == ("a", "a")
+        assert it.faults() == {Fault.TIMED_OUT: 1}
+        failure = it.worker.status().failure
+        assert failure is not None
+        assert "compilation of its kernels" in failure.text
+
+
+def test_a_job_for_which_kernels_are_compiled_has_its_time_besides(tmp_path: Path) -> None:
+    with running("compiles-once", tmp_path, IMPATIENT) as it:
+        it.solve("a")
+        wait_until(lambda: it.worker.compiled_s > IMPATIENT.timeout_s + 0.5, "longer than a job may take")
+        assert not it.worker.warms_up, "checks wait, as they do for any job"
+        (tmp_path / LET_GO).touch()
+        assert it.answer() == ("a", "a")
+        assert it.worker.status().starts == 1
+
+
+def test_kernels_that_no_check_needs_are_compiled_when_nothing_else_waits(tmp_path: Path) -> None:
+    with waiting("compiling-later", tmp_path) as it:
+        it.check("c")
+        it.worker.start()
+        assert it.answer()[0] == "c"
+        wait_until(lambda: compiling(it) == (2, 3), "the compilation")
+        it.check("next")
+        (tmp_path / LET_GO).touch()
+        assert it.answer()[0] == "next"
+        wait_until(lambda: compiling(it) is None, "the end of it")
+        assert (it.worker.status().starts, it.faults()) == (1, {})
 
 
 # --- the start --------------------------------------------------------------------------------------------------------

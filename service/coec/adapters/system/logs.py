@@ -8,7 +8,9 @@ import logging
 import sys
 import threading
 from collections import Counter
+from collections.abc import Mapping
 from datetime import UTC, datetime
+from types import MappingProxyType
 from typing import Literal, TextIO
 
 from coec.untrusted import json_printable, printable, printable_lines
@@ -69,6 +71,56 @@ def configure(level: str, form: Form, stream: TextIO | None = None) -> None:
     root.setLevel(_LEVELS[level])
 
 
+LOST: Mapping[str, str] = MappingProxyType(
+    {
+        "attachment_malformed": "a message's attachment cannot be read; the message is used",
+        "camera_info": "a CameraInfo cannot be used",
+        "check_not_afforded": "checks were left out, because `budget.cores` does not suffice for them",
+        "check_overtaken": "a check ended after another extrinsic was served, and says nothing of that one",
+        "check_superseded": "checks were left out, because newer ones came while a window was being solved",
+        "cloud_empty": "a cloud has no points",
+        "cloud_shape": "the arrays of a cloud do not have the same length",
+        "cloud_too_large": "a cloud has more points than `limits.max_points`",
+        "correction_of_nothing": "the rig has a correction for a pair that has no accepted estimate",
+        "decoder_fault": "a decoder failed on a message, which is a fault of coec; the log has the traceback",
+        "depth_missing": "a frame has no depth map, but `calibration.depth` wants one",
+        "depth_not_grey": "a depth map is no 16-bit grey image",
+        "frame_id": "a frame has another frame id than the configuration",
+        "frame_id_invalid": "a message has no frame id that can be used",
+        "image_corrupt": "an image cannot be decoded",
+        "image_size": "an image has another size than the intrinsics",
+        "image_size_mismatch": "an image has another size than its message says",
+        "image_too_large": "an image has more pixels than `limits.max_image_pixels`",
+        "image_truncated": "an image ends before its last row",
+        "memory_full": "a frame was refused, because too many frames wait; the machine is too slow for the streams",
+        "message_fields": "a message lacks fields, or has fields of other types",
+        "message_malformed": "a message cannot be decoded",
+        "message_too_large": "a message is larger than `limits.max_message_bytes`",
+        "motion_invalid": "an ego-motion is not finite",
+        "not_awaited": "frames were used before the answer that was due, because the worker cannot keep up with the "
+        "streams; they are as good as any, but a replay may decide otherwise",
+        "overrun": "messages were dropped before they were decoded, because too many wait",
+        "recorder_overrun": "pairs were not recorded, because the disk is too slow",
+        "sequence_gap": "messages were lost on their way here, by the numbers of the sender",
+        "snippet_overrun": "a recording of an event was left out, because the disk is too slow",
+        "stamp_invalid": "a message has a stamp that cannot be used",
+        "too_few_pairs": "a window ended with too few pairs for a solve",
+        "too_few_pairs_salvaged": "a window of an earlier run has too few pairs for a solve",
+        "transform_invalid": "a transform is not finite, or no rotation",
+        "transforms_too_many": "there are more transforms than can be kept",
+        "two_senders": "frames are refused, because two publishers send on one topic at the same time",
+        "unanswered": "an answer of the worker did not come in time",
+        "wrong_type": "a message is of another type than the stream's",
+    }
+)
+"""What was lost, by the reason under which it is counted; for losses that are counted without a sentence."""
+
+
+def loss_text(place: str, reason: str, detail: str = "") -> str:
+    """The line of the log for a loss at a place."""
+    return f"lost, {place}: {detail or LOST.get(reason) or reason.replace('_', ' ')}"
+
+
 class LossCounter:
     """Counts losses by place and reason, and logs the first of each kind and then every 2^n-th.
 
@@ -90,7 +142,7 @@ class LossCounter:
             self._counts[place, reason] = after
         if after.bit_length() != before.bit_length():
             fields = {**self._whose, "place": place, "reason": reason, "count": after}
-            self._logger.warning(f"lost: {detail or reason}", extra={"fields": fields})
+            self._logger.warning(loss_text(place, reason, detail), extra={"fields": fields})
 
     def snapshot(self) -> dict[tuple[str, str], int]:
         """The counts so far: (place, reason) -> number."""

@@ -16,11 +16,13 @@ from coec.runtime.decisions.decider import HELD, Known
 from coec.runtime.ingest.decoder import EGO
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
+from coec.runtime.worker import compilation
 from coec.schemas import replies
 
-HARMLESS = frozenset({HELD, "rival_unproven"})
-"""Codes of troubles that leave a healthy pair healthy: a hold, and a token that any program could declare. Else that
-program could take the calibration away from all consumers."""
+HARMLESS = frozenset({HELD, "rival_unproven", compilation.CODE})
+"""Codes of troubles that leave a healthy pair healthy: a hold; a token that any program could declare, which could else
+take the calibration away from all consumers; and kernels that are compiled, for instance for a new pair. If checks fail
+to come because of that, the pair is `overdue_worker`."""
 
 OLD_S = 5.0
 """Oldest reply that is still true, s. The thread that makes one every second must be stuck if the reply is older."""

@@ -29,6 +29,7 @@ from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.snippet_store import SNIPPET
 from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.worker import compilation
 from coec.schemas import replies
 from coec.schemas.keys import Format
 
@@ -92,7 +93,7 @@ class PairAnswers:
         self._snapshots = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
         essences = {
             "extrinsic": extrinsic.model_copy(update={"percent_complete": 0.0}),
-            "health": (health.state, tuple(reason.code for reason in health.reasons), health.needs, known.solved),
+            "health": (health.state, tuple(map(_essence, health.reasons)), health.needs, known.solved),
         }
         for name, essence in essences.items():
             if self._published.get(name) != essence:
@@ -249,3 +250,8 @@ class PairAnswers:
         nominal = self._outside.nominal(self.name)
         losses = {**counted.losses, **nominal.losses}
         return counted.model_copy(update={"losses": losses, "found": dict(nominal.origins)})
+
+
+def _essence(reason: replies.Reason) -> str:
+    """What has to change of a reason for health to be published anew: the code; of a compilation the progress, too."""
+    return reason.text if reason.code == compilation.CODE else reason.code

@@ -75,6 +75,11 @@ def worker_status_of(worker: Worker) -> replies.WorkerStatus:
     job = status.in_progress
     return replies.WorkerStatus(
         state=states[status.state],
+        compiling=None
+        if status.compiling is None
+        else replies.CompilingStatus(
+            done=status.compiling.done, total=status.compiling.total, elapsed_s=status.compiling.elapsed_s
+        ),
         pid=worker.pid,
         restarts=max(status.starts - 1, 0),
         queued=sum(status.waiting.values()),

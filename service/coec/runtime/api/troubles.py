@@ -85,6 +85,11 @@ TROUBLES: Mapping[str, Trouble] = {
         "The process that infers and solves has ended and is being replaced.",
         "Nothing if it happens once; if it goes on, check its memory (`worker.max_memory_bytes`) and the log.",
     ),
+    "compiling_kernels": Trouble(
+        "The worker compiles its kernels, once on a machine and after an update; the text says how many are there. The "
+        "extrinsic is served and windows are recorded meanwhile; checks and solves begin afterwards.",
+        "Nothing: it takes a minute, and longer on a busy machine. `coec warmup` compiles the kernels beforehand.",
+    ),
     "recording_failed": Trouble(
         "The last window could not be written; the next one is tried.",
         "Check the disk of `state.directory`: room, owner, errors.",
@@ -142,7 +147,7 @@ TROUBLES: Mapping[str, Trouble] = {
     ),
     "overdue_worker": Trouble(
         "No check has been completed for three periods: the worker has not answered.",
-        "Nothing while it starts; else check its load and the log.",
+        "Nothing while it starts or compiles kernels; else check its load and the log.",
     ),
     "overdue_depth": Trouble(
         "No check has been completed for three periods: no depth comes.",

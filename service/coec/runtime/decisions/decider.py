@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -23,9 +24,10 @@ from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Drift
 from coec.calibration.frames.window import KeptPairs
 from coec.calibration.lifecycle import HealthState, PairState, Rules
-from coec.calibration.monitor.change_detector import holds_at_rest
+from coec.calibration.monitor.change_detector import Finding, holds_at_rest
 from coec.calibration.types import Decision, Matrix4, Reason
 from coec.config import CalibrationConfig, PairConfig
+from coec.geometry import se3
 from coec.reports.holds import hold_text
 from coec.runtime.decisions.incident_pictures import IncidentPictures
 from coec.runtime.decisions.mailbox import Mailbox
@@ -46,6 +48,17 @@ _log = logging.getLogger(__name__)
 
 EVENTS = (HealthState.SUSPECT, HealthState.DEGRADED, HealthState.MISCALIBRATED)
 """States whose beginning is an event. A snippet of the seconds around it is recorded, if snippets are wanted."""
+
+FINDINGS: Mapping[Finding, str] = MappingProxyType(
+    {
+        Finding.UNKNOWN: "not enough to judge what is served",
+        Finding.CLEAR: "they agree with what is served",
+        Finding.AT_ODDS: "they contradict what is served, but not by one move of the mount",
+        Finding.SUSPECT: "the mount may have moved; a window is wanted soon",
+        Finding.CONFIRMED: "the mount has moved",
+    }
+)
+"""What the checks of a pair say, for the log."""
 
 UNTOLD_S = 0.02
 """Time between two attempts to report a state that is about to reach the disk, s."""
@@ -133,6 +146,7 @@ class Decider:
         """`calibrate_with` is called with the configuration for windows that begin from then on. `tell` is called with
         what is known, whenever something may have changed and once a second."""
         self.thread = ServiceThread(f"decisions-{pair.name}", self._run)
+        self._name = pair.name
         self._rules = Rules(pair.policy, pair.tracker, pair.monitor)
         self._stale_after_s = stale_after_s
         self._store = store
@@ -342,6 +356,7 @@ class Decider:
             self._checks += 1
             self._latest_check = check_of(observation, self._store.state)
             self._store.note_check(self._latest_check)
+            self._log_finding(before.monitor.outcome, self._store.state.monitor.outcome)
         return self._calibrating_anew(effect) if refused else effect
 
     def _check_in_vain(self, reason: Reason) -> None:
@@ -351,8 +366,7 @@ class Decider:
 
     def _take_result(self, question: Question | None, answer: Solved, live: bool) -> Effect | None:
         result = answer.result
-        fields = {"window": result.window_id, "decision": result.verdict.decision}
-        _log.info("a window was solved", extra={"fields": fields})
+        self._log_result(result)
         if answer.written is not None:
             self._note_file(result, answer.written)
         if answer.note is not None:
@@ -371,6 +385,33 @@ class Decider:
         else:
             self._store.save()
         return effect if fits else self._calibrating_anew(effect)
+
+    def _log_result(self, result: CalibrationResult) -> None:
+        """Logs the verdict of a window, how far its estimate is from what is served, and why it is refused."""
+        step = se3.difference(matrix_of(result.camera_from_lidar), self._store.state.T_camera_lidar)
+        turned_deg, moved_m = float(np.degrees(np.linalg.norm(step[:3]))), float(np.linalg.norm(step[3:]))
+        sigma_deg = max((value for value in result.sigma[:3] if value is not None), default=None)
+        text = f"window solved, {result.verdict.decision}: {turned_deg:.2f}° and {moved_m:.3f} m from what is served"
+        if sigma_deg is not None:
+            text += f", σ {sigma_deg:.2f}°"
+        if result.verdict.reasons:
+            text += f"; {' '.join(reason.text for reason in result.verdict.reasons)}"
+        fields = {
+            "pair": self._name,
+            "window": result.window_id,
+            "decision": result.verdict.decision,
+            "change_deg": round(turned_deg, 4),
+            "change_m": round(moved_m, 4),
+            "sigma_deg": None if sigma_deg is None else round(sigma_deg, 4),
+            "reasons": [reason.code for reason in result.verdict.reasons],
+        }
+        _log.info(text, extra={"fields": fields})
+
+    def _log_finding(self, before: Finding, after: Finding) -> None:
+        """Logs what the checks say if that has changed, or is said for the first time."""
+        if after is not before or self._checks == 1:
+            fields = {"pair": self._name, "from": before.value, "to": after.value, "checks": self._checks}
+            _log.info(f"checks: {FINDINGS[after]}", extra={"fields": fields})
 
     def _note_file(self, result: CalibrationResult, file: WrittenFile) -> None:
         version = WindowVersion(

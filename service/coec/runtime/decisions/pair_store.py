@@ -348,6 +348,8 @@ class PairStore:
             entry = _entry("extrinsic", after.provenance.value, _ORIGIN[after.provenance], stamp_ns)
             served = {"camera_from_lidar": transform_of(after.T_camera_lidar), "window_id": window_id}
             self.history.append(entry.model_copy(update=served))
+            fields = {"pair": self._rig.pair, "provenance": after.provenance.value, "window": window_id}
+            _log.info(_ORIGIN[after.provenance], extra={"fields": fields})
         if before.health is not after.health:
             self._since_ns = time.time_ns()
             self._note_health(before, after, stamp_ns)
@@ -357,7 +359,7 @@ class PairStore:
         text = "; ".join(reason.text for reason in after.reasons) or WORDS.get(after.health, "")
         self.history.append(_entry("state", after.health.value, text, stamp_ns))
         fields = {"pair": self._rig.pair, "from": before.health.value, "to": after.health.value, "why": text}
-        _log.info("the health of a pair changed", extra={"fields": fields})
+        _log.info(f"health: {after.health.value}, before {before.health.value}", extra={"fields": fields})
         if after.health is HealthState.MISCALIBRATED:
             self._begin_incident(after, stamp_ns)
         elif before.health is HealthState.MISCALIBRATED:

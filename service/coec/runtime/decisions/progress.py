@@ -17,6 +17,7 @@ from coec.runtime.decisions.questions import ANSWER_PERIODS
 from coec.runtime.ingest.decoder import CAMERA, LIDAR
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
+from coec.runtime.worker import compilation
 from coec.runtime.worker.jobs import Fate
 from coec.runtime.worker.queue import BUSY, SUPERSEDED, WORKER_FAILED
 
@@ -30,9 +31,22 @@ DEPTH_CODES = frozenset({ModelError.reply_code})
 """Codes of failures of the depth network."""
 
 WORKER_CODES = frozenset(
-    {WORKER_FAILED, SUPERSEDED.code, BUSY.code, Fate.LATE.value, "internal_error", "unsendable", "unanswered"}
+    {
+        WORKER_FAILED,
+        SUPERSEDED.code,
+        BUSY.code,
+        Fate.LATE.value,
+        compilation.CODE,
+        "internal_error",
+        "unsendable",
+        "unanswered",
+    }
 )
 """Codes of failures of the worker, or on the way to it and back."""
+
+NOT_TRIED = frozenset({compilation.CODE, SUPERSEDED.code})
+"""Codes of failures that say nothing of the data: the worker did not begin. If that goes on, no check is completed, and
+that is reported as `overdue_worker`."""
 
 
 class Attempts:
@@ -48,6 +62,8 @@ class Attempts:
 
     def failed(self, reason: Reason) -> None:
         """An attempt has failed."""
+        if reason.code in NOT_TRIED:
+            return
         self._in_vain += 1
         if self._in_vain >= IN_VAIN:
             text = f"The last {self._in_vain} {self._what} came to nothing. {reason.text}"

@@ -144,15 +144,16 @@ class Questions:
         return self._queue.unanswered
 
     def waits(self, stamp_ns: int) -> bool:
-        """Whether an answer of the worker or of the rig is due before a pair of this stamp and has not come."""
-        waits = self._queue.waits(stamp_ns)
+        """Whether an answer of the worker or of the rig is due before a pair of this stamp and has not come. None is
+        awaited while the worker compiles its kernels, because that takes longer than frames can be held."""
+        waits = self._queue.waits(stamp_ns) and not self._worker.warms_up
         if self._rig.must_wait(stamp_ns, for_own=waits) or waits:
             return True
         corrections = self._rig.corrections(stamp_ns)
         for correction in corrections:
             question = self._queue.ask(correction.from_ns, time.monotonic() + GRACE_S)
             self._mailbox.post(partial(self._decides.corrected, question, correction))
-        return bool(corrections) and self._queue.waits(stamp_ns)
+        return bool(corrections) and self._queue.waits(stamp_ns) and not self._worker.warms_up
 
     def settle(self, stamp_ns: int) -> None:
         """Lets the answers take effect that are due before a pair of this stamp."""

@@ -29,7 +29,7 @@ class Question:
 
     Attributes:
         due_ns: sensor time from which pairs are looked at only once the answer is known.
-        expires_s: time of the steady clock after which the answer is no longer awaited.
+        expires_s: time after which the answer is no longer awaited, by the steady clock less what does not count.
         name: id of the window that the question is about; empty for a check.
         take: takes the answer; None until it has come.
         effect: effect of the answer, once it was taken.
@@ -46,7 +46,9 @@ class Question:
 class DecisionQueue:
     """The questions of one pair. One thread asks and lets answers take effect, one thread answers."""
 
-    def __init__(self) -> None:
+    def __init__(self, paused_s: Callable[[], float] = lambda: 0.0) -> None:
+        """`paused_s()`: time so far that does not count as waiting, s: that in which the worker compiled kernels."""
+        self._paused_s = paused_s
         self._lock = threading.Lock()
         self._questions: deque[Question] = deque()
         self._untaken: deque[Question] = deque()
@@ -55,7 +57,7 @@ class DecisionQueue:
         """Asks a question. It is due no earlier than those before it, because its answer has to wait for theirs."""
         with self._lock:
             before_ns = self._questions[-1].due_ns if self._questions else due_ns
-            question = Question(max(due_ns, before_ns), expires_s, name)
+            question = Question(max(due_ns, before_ns), expires_s - self._paused_s(), name)
             self._questions.append(question)
             self._untaken.append(question)
             return question
@@ -75,8 +77,9 @@ class DecisionQueue:
     def expire(self, monotonic_s: float, lost: Callable[[Question], Take]) -> int:
         """Gives up questions that have waited too long; `lost(question)` stands in for the answer. Returns how many
         there were."""
+        counted_s = monotonic_s - self._paused_s()
         with self._lock:
-            late = [one for one in self._untaken if one.take is None and one.expires_s <= monotonic_s]
+            late = [one for one in self._untaken if one.take is None and one.expires_s <= counted_s]
         for question in late:
             question.take = lost(question)
         if late:

@@ -7,6 +7,7 @@ by its stamp has taken effect. So a replay of a drive gives the same windows and
 from __future__ import annotations
 
 import logging
+import time
 from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
@@ -27,6 +28,10 @@ _log = logging.getLogger(__name__)
 CHECKS_WAITING = 4
 """How many checks may wait for the answer to a window, 15 MB each: one for the period in which that answer is awaited,
 and one more for each further window that ends meanwhile."""
+
+
+PROGRESS_S = 15.0
+"""Time between two lines of the log about the pairs of a window, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,6 +146,8 @@ class Chooser:
     ) -> None:
         """`served` is the extrinsic at which pairs are looked at until another is adopted. `kept` are pairs of an
         earlier run that belong to the first window."""
+        self._name = pair.name
+        self._logged_s = -PROGRESS_S
         self._asks = asks
         self._recorder = recorder
         self._losses = losses
@@ -349,14 +356,26 @@ class Chooser:
             self._asks.check(self._unasked.popleft(), self._served, stamp_ns)
 
     def _select(self, event: PairSelected, T_camera_lidar: Matrix4) -> None:
+        self._log_progress(event.window_id)
         self._recorder.add(event.window_id, event.pair, T_camera_lidar)
         if self._infers:
             self._asks.prefetch(encode_camera(event.pair.camera))
+
+    def _log_progress(self, window_id: str) -> None:
+        """Logs how many pairs the open window has, at a bounded rate."""
+        now_s = time.monotonic()
+        if now_s - self._logged_s < PROGRESS_S:
+            return
+        self._logged_s = now_s
+        fields = {"pair": self._name, "window": window_id}
+        _log.info(f"window: {self._cutter.selected} of {self._window.pairs} pairs", extra={"fields": fields})
 
     def _end(self, event: SliceEnded, stamp_ns: int) -> None:
         """A slice ended at this sensor time: its pairs go to the disk, and from there to the worker."""
         if event.complete:
             self._window_due_ns = self._asks.window(event.window_id, stamp_ns)
-        fields = {"window": event.window_id, "pairs": event.pairs, "complete": event.complete}
-        _log.info("a slice ended", extra={"fields": fields})
+        fields = {"pair": self._name, "window": event.window_id, "pairs": event.pairs, "complete": event.complete}
+        enough = "it is recorded" if event.complete else f"too few, {self._window.min_pairs} are needed"
+        _log.info(f"window ended with {event.pairs} pairs: {enough}", extra={"fields": fields})
+        self._logged_s = -PROGRESS_S
         self._recorder.end(event)

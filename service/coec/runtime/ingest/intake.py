@@ -154,5 +154,7 @@ class Intake:
     def _tick(self) -> None:
         self._ticked_s = time.monotonic()
         waiting = self.inbox.waiting()
+        for sensor in self.sensors:
+            sensor.log.tick()
         for pair in self._pairs:
             pair.tick(waiting=any(sensor.number in waiting for sensor in pair.sensors.values()))

@@ -11,6 +11,7 @@ from coec.adapters.zenoh.inputs import Sample
 from coec.config import KnownStreamConfig, LimitsConfig
 from coec.runtime.ingest.decoder import EGO, TWO_SENDERS, Decoder, Frame
 from coec.runtime.ingest.frame_budget import FrameBudget
+from coec.runtime.ingest.stream_log import StreamLog
 from coec.runtime.timings import QUICK_S, Histogram
 
 _log = logging.getLogger(__name__)
@@ -36,6 +37,7 @@ class SensorStream:
     Attributes:
         kind: what the stream brings: camera frames, LiDAR sweeps or ego-motion.
         number: name of the stream in the inbox.
+        log: its lines in the log.
         took: how long the decoding of each sample took.
         takers: functions that get each frame, in the order in which the frames came.
     """
@@ -46,6 +48,7 @@ class SensorStream:
         self.config = config
         self.losses = LossCounter(_log, config.sensor, "sensor")
         self.decoder = Decoder(kind, config, limits, self.losses)
+        self.log = StreamLog(kind, config.sensor)
         self.took = Histogram(QUICK_S)
         self.takers: tuple[Callable[[Frame], None], ...] = ()
         self._on_trial: list[Frame] = []
@@ -74,6 +77,7 @@ class SensorStream:
             return
         frames, self._on_trial = self._on_trial, []
         for each in frames:
+            self.log.push(each)
             if not budget.admit(each):
                 self.losses.add(self.kind, "memory_full")
                 continue

@@ -19,6 +19,7 @@ from coec.adapters.ros import messages
 from coec.adapters.ros.camera_info import MAX_INFO_BYTES, decode_info
 from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
 from coec.adapters.ros.transforms import MAX_MESSAGE_BYTES
+from coec.adapters.system.logs import loss_text
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Reason
@@ -274,7 +275,8 @@ def _attempt(take: Callable[[], None]) -> str | None:
 def _tell_lost(place: str, cause: str, count: int) -> None:
     """Logs the first loss of each kind, and then every 2^n-th."""
     if count & (count - 1) == 0:
-        _log.warning(f"lost: {cause}", extra={"fields": {"place": place, "count": count}})
+        fields = {"place": place, "reason": cause, "count": count}
+        _log.warning(loss_text(place, cause), extra={"fields": fields})
 
 
 def _of_built(found: Found, otherwise: Reason | None) -> Nominal:

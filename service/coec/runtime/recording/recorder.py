@@ -350,7 +350,7 @@ class Recorder:
         self._latest = recorded.path
         self._store.add(recorded)
         fields = {"window": recorded.window_id, "pairs": recorded.pairs, "bytes": recorded.bytes}
-        _log.info("a window was recorded", extra={"fields": fields})
+        _log.info("window recorded", extra={"fields": {"pair": self._plan.rig.pair, **fields}})
         self._hand_over(recorded.window_id, recorded.path, live=True)
 
     def _close_stray(self) -> None:

@@ -60,10 +60,10 @@ DEADLINE_S = {
 }
 """Time from asking until an answer is given up, s. For a live window: two attempts of 120 s, which `worker` allows by
 default, after another window that needs as long, and two minutes for new processes. For a check, and for the
-registration of two LiDARs: twice the first start of a worker, which compiles its kernels for a minute and a half on two
-busy cores. For a picture: six solves of 10 s. For a commissioning: those of eight pairs at once, of three minutes each,
-when checks and windows, which go first, leave a fifth of the worker's time. One slice of it may take no longer than any
-other job (`worker.timeout_s`)."""
+registration of two LiDARs: the start of a worker on a busy machine, and a solve before it. For a picture: six solves of
+10 s. For a commissioning: those of eight pairs at once, of three minutes each, when checks and windows, which go first,
+leave a fifth of the worker's time. One slice of it may take no longer than any other job (`worker.timeout_s`). The time
+in which the worker compiles kernels does not count."""
 
 BACKLOG_DEADLINE_S = 86_400.0
 """The same for a window of an earlier run, s: it waits behind everything else, and is asked for again after the next

@@ -8,17 +8,31 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import logging
 import os
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
 
 from coec.adapters.system import allocator, logs
 from coec.config import Config
 from coec.errors import CoecError
+from coec.geometry import compile_news
 from coec.runtime.worker.link import Link
 from coec.runtime.worker.parent import tie_to
 
+_log = logging.getLogger(__name__)
+
+REPORT_S = 1.0
+"""Time between two reports on a kernel that takes long to compile, s."""
+
 START = "start"
 """Kind of the first message, and of every later one that brings another configuration."""
+
+WARM_UP = "warm_up"
+"""Kind of a message that has the next of the kernels compiled that no check needs."""
 
 DEPTH_MAPS_KEPT = 64
 """Number of depth maps kept per network: two windows of 25 and some more. A map at network resolution is about 1 MB."""
@@ -50,21 +64,71 @@ def _serve(link: Link, config: Config) -> None:
     gc.enable()
     solver: Solver | None = None
     while True:
-        try:
-            if solver is None:
-                solver = Solver(config, DEPTH_MAPS_KEPT)
-            else:
-                solver.use(config)
-            with second_compiler(config):
-                solver.warm_up()
-        except CoecError as error:
-            link.send({"kind": "unusable", "code": error.reply_code, "text": str(error)})
-            return
-        link.send({"kind": "ready"})
-        while (message := link.receive())["kind"] != START:
-            solver.forget_abandoned()
-            link.send(answer(solver, message))
-        config = Config.model_validate_json(message["settings"])
+        with ExitStack() as reporting, ExitStack() as helping:
+            try:
+                if solver is None:
+                    solver = Solver(config, DEPTH_MAPS_KEPT)
+                else:
+                    solver.use(config)
+                helping.enter_context(second_compiler(config))
+                reporting.enter_context(_reported(link, solver.lenses))
+                solver.warm_up_checks()
+                rest = solver.warm_up_windows()
+            except CoecError as error:
+                link.send({"kind": "unusable", "code": error.reply_code, "text": str(error)})
+                return
+            link.send({"kind": "ready", "more": True})
+            while (message := link.receive())["kind"] != START:
+                if message["kind"] == WARM_UP:
+                    more = _goes_on(rest)
+                    if not more:
+                        helping.close()
+                    link.send({"kind": "warmed", "more": more})
+                    continue
+                solver.forget_abandoned()
+                link.send(answer(solver, message))
+            config = Config.model_validate_json(message["settings"])
+
+
+def _goes_on(rest: Iterator[None]) -> bool:
+    """Takes the next step of a warm-up; returns whether there may be more. A kernel that cannot be compiled fails where
+    it is needed, with a reason."""
+    try:
+        next(rest)
+    except StopIteration:
+        return False
+    except Exception:
+        _log.exception("the warm-up failed")
+        return False
+    return True
+
+
+@contextmanager
+def _reported(link: Link, lenses: int) -> Iterator[None]:
+    """Inside the context, the service is sent how far the compilation of kernels is, see `compilation`."""
+    from coec.runtime.worker.kernels import compiled
+
+    told_s: float | None = None
+
+    def step(_: str) -> None:
+        nonlocal told_s
+        now_s = time.monotonic()
+        if told_s is None or now_s - told_s >= REPORT_S:
+            told_s = now_s
+            reached = compiled(lenses)
+            send({"kind": "compiling", "done": reached.done, "total": reached.total})
+
+    def end(_: str) -> None:
+        nonlocal told_s
+        told_s = None
+        send({"kind": "compiled"})
+
+    def send(message: dict[str, Any]) -> None:
+        with contextlib.suppress(OSError):  # the service is gone, which the next message to it shows, too
+            link.send(message)
+
+    with compile_news.heard_by(step, end):
+        yield
 
 
 if __name__ == "__main__":

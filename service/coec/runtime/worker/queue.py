@@ -129,6 +129,10 @@ class JobQueue:
             self._end(oldest, Fate.SUPERSEDED, SUPERSEDED, now_s)
         self._lanes[lane].append(entry)
 
+    def refuse(self, job: Job, reason: Reason, now_s: float) -> None:
+        """Answers a job at once with the reason why it is not taken in."""
+        self._end(_Entry(job, now_s), Fate.FAILED, reason, now_s)
+
     def prefetch(self, prefetch: Prefetch) -> None:
         """Takes in an image; if there is no room, the oldest image is dropped."""
         if self._stopped:

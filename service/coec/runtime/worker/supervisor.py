@@ -25,6 +25,7 @@ from coec.config import WorkerConfig
 from coec.runtime.timings import LONG_S, Histogram
 from coec.runtime.worker.answers import MalformedAnswerError, number_of, read_answer
 from coec.runtime.worker.child import Child, ChildError, Fault
+from coec.runtime.worker.compilation import STALLED_S, Compilation, Compiling
 from coec.runtime.worker.costs import IDLE, START, Cost, cost_of
 from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, Kind, Prefetch, Underway
 from coec.runtime.worker.queue import WORKER_FAILED, InProgress, JobQueue, Ticket
@@ -35,7 +36,7 @@ POLL_S = 0.1
 """Time between two looks at a worker, s. It is short against any job; a stop may have to wait this long."""
 
 START_TIMEOUT_S = 300.0
-"""Longest start of a worker, s. A first start compiles every kernel: tens of seconds on a slow machine."""
+"""Longest start of a worker, s, without the time of compiling kernels."""
 
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.5, 30.0
 """Pauses before a worker that could not start is started again, s; each is twice the one before. A worker that started
@@ -44,6 +45,10 @@ and ended without a single answer is started again after the first pause."""
 
 SENT_AGAIN = (Kind.SOLVE, Kind.COMMISSION)
 """Jobs that may be sent more than once: to another worker, or for the next slice."""
+
+
+NOT_WHILE_COMPILING = (Kind.CHECK, Kind.REGISTER)
+"""Jobs that are refused while the worker `warms_up`: their data would be minutes old at the answer."""
 
 
 NOT_STARTED = "waiting for the worker"
@@ -68,6 +73,7 @@ class WorkerStatus:
         starts: number of processes so far, including those that could not be started.
         failure: why the last process was replaced.
         rss_bytes: resident memory of the process when it was last looked at.
+        compiling: how far the compilation of kernels is; None if none are being compiled.
         in_progress: the work that the process has.
         waiting: number of waiting jobs, by kind; see `JobQueue.waiting`.
         commissionings: how far the commissioning of each pair is that has one, in words.
@@ -81,6 +87,7 @@ class WorkerStatus:
     starts: int
     failure: Reason | None
     rss_bytes: int
+    compiling: Compiling | None
     in_progress: InProgress | None
     waiting: Mapping[str, int]
     commissionings: Mapping[str, str]
@@ -121,6 +128,8 @@ class Worker:
         self._told = ""
         self._command = tuple(command)
         self._pay = pay
+        self._compilation = Compilation()
+        self._is_preparing, self._is_warm = True, True
         self._condition = threading.Condition()
         # All threads use the queue, so it is used only under the condition.
         self._queue = JobQueue(config.attempts)
@@ -152,13 +161,17 @@ class Worker:
         answered (`stopping`). Unsolved windows stay on the disk."""
         self.thread.request_stop()
         with self._held() as queue:
-            queue.stop(time.monotonic())
+            queue.stop(self._now_s())
             self._condition.notify_all()
 
     def ask(self, job: Job) -> None:
         """Queues a job; `job.done` will be called once, perhaps before this returns."""
+        compiling = self._compilation.status if self.warms_up and job.kind in NOT_WHILE_COMPILING else None
         with self._held() as queue:
-            queue.ask(job, time.monotonic())
+            if compiling is not None:
+                queue.refuse(job, compiling.reason, self._now_s())
+                return
+            queue.ask(job, self._now_s())
             self._condition.notify_all()
 
     def commissioning(self, pair: str) -> str | None:
@@ -184,6 +197,16 @@ class Worker:
         """Process id of the current worker."""
         return self._pid
 
+    @property
+    def warms_up(self) -> bool:
+        """Whether a worker compiles kernels before it takes jobs by its configuration."""
+        return self._is_preparing and self._compilation.status is not None
+
+    @property
+    def compiled_s(self) -> float:
+        """Time that workers have spent compiling kernels so far, s. It counts towards no time limit."""
+        return self._compilation.paused_s
+
     def status(self) -> WorkerStatus:
         """State and counters of the worker."""
         raised = {"done_raised": self._done_raised} if self._done_raised else {}
@@ -193,7 +216,8 @@ class Worker:
                 self._starts,
                 self._failure,
                 self._rss_bytes,
-                self._queue.in_progress(time.monotonic()),
+                self._compilation.status,
+                self._queue.in_progress(self._now_s()),
                 self._queue.waiting,
                 {pair: str(reached or NOT_STARTED) for pair, reached in self._queue.commissionings.items()},
                 self._queue.outcomes,
@@ -202,6 +226,10 @@ class Worker:
             )
 
     # --- on any thread ----------------------------------------------------------------------------------------------
+
+    def _now_s(self) -> float:
+        """Time of all jobs: a steady clock that stands still while the worker compiles kernels, s."""
+        return self._compilation.now_s()
 
     @contextmanager
     def _held(self) -> Iterator[JobQueue]:
@@ -236,7 +264,7 @@ class Worker:
         finally:
             self._state = WorkerState.STOPPED
             with self._held() as queue:
-                queue.stop(time.monotonic())
+                queue.stop(self._now_s())
 
     def _run_child(self) -> _Reached:
         """Runs one process from its start to its end."""
@@ -261,13 +289,15 @@ class Worker:
         except ChildError as error:
             self._note_fault(error, child.pid)
             with self._held() as queue:
-                queue.died(str(error), time.monotonic())
+                queue.died(str(error), self._now_s())
         finally:
             self._pid = None
+            self._compilation.end()
             child.kill()
         return reached
 
     def _await_ready(self, child: Child) -> None:
+        self._is_preparing = True
         with self._condition:
             self._told = self._settings
         child.send({"kind": "start", "settings": self._told})
@@ -276,7 +306,8 @@ class Worker:
             case None:
                 return
             case {"kind": "ready"}:
-                self._was_ready = True
+                self._was_ready, self._is_preparing = True, False
+                self._is_warm = message.get("more") is not True
                 return
             case {"kind": "unusable", "code": str(code), "text": str(text)}:
                 if not self._was_ready:
@@ -287,32 +318,48 @@ class Worker:
     def _take_turn(self, child: Child) -> bool:
         """Checks the worker, then gives it the next job, if there is one. Returns whether it has answered a job."""
         self._look_after(child)
-        if child.has_spoken(0.0):
-            child.receive()  # raises if the process has ended
+        if child.has_spoken(0.0) and not self._compilation.take(child.receive()):  # raises if the process has ended
             raise ChildError(Fault.STRAY_ANSWER, "answered though nothing was asked")
         if self._told != self._settings:
             self._await_ready(child)
         ticket = self._take()
         if ticket is None:
+            if not self._is_warm:
+                self._warm_up_further(child)
             return False
         kind = ticket.work.kind if isinstance(ticket.work, Job) else None
         timeout_s = ticket.work.timeout_s if isinstance(ticket.work, Job) else None
         self._pay(Cost(IDLE, "", child.taken_s()))
         try:
             self._send(child, ticket)
-            sent_s = time.monotonic()
+            sent_s = self._now_s()
             message = self._next_message(child, timeout_s or self._config.timeout_s)
         finally:
             self._pay(cost_of(ticket.work, child.taken_s()))
         if message is None:
             return False
-        self.work_took.add(time.monotonic() - sent_s, PREFETCH if kind is None else kind.value)
+        self.work_took.add(self._now_s() - sent_s, PREFETCH if kind is None else kind.value)
         answer = _checked_answer(message, ticket.number, kind)
         if isinstance(answer, Underway):
             self._log_progress(ticket.work.pair, answer)
         with self._held() as queue:
-            queue.answered(answer, time.monotonic())
+            queue.answered(answer, self._now_s())
         return True
+
+    def _warm_up_further(self, child: Child) -> None:
+        """Lets the worker compile the next of the kernels that no check needs, while nothing else waits."""
+        child.send({"kind": "warm_up"})
+        try:
+            message = self._next_message(child, self._config.timeout_s)
+        finally:
+            self._pay(Cost(START, "", child.taken_s()))
+        match message:
+            case None:
+                return
+            case {"kind": "warmed", "more": bool(more)}:
+                self._is_warm = not more
+                return
+        raise ChildError(Fault.MALFORMED_ANSWER, "sent something other than how far its warm-up is")
 
     def _log_progress(self, pair: str, reached: Underway) -> None:
         """Logs how far a commissioning is, once per stage."""
@@ -324,9 +371,9 @@ class Worker:
     def _take(self) -> Ticket | None:
         """The next job; None if there is none, after waiting for `POLL_S` at most."""
         with self._held() as queue:
-            ticket = queue.take(time.monotonic())
+            ticket = queue.take(self._now_s())
             self._state = WorkerState.READY if ticket is None else WorkerState.BUSY
-            if ticket is None:
+            if ticket is None and self._is_warm:
                 self._condition.wait(POLL_S)
         return ticket
 
@@ -336,27 +383,36 @@ class Worker:
         except ChildError as error:
             if error.fault is Fault.UNSENDABLE_JOB:
                 with self._held() as queue:
-                    queue.answered(Reason("unsendable", f"The worker {error}."), time.monotonic())
+                    queue.answered(Reason("unsendable", f"The worker {error}."), self._now_s())
             raise
         if isinstance(ticket.work, Job) and ticket.work.kind not in SENT_AGAIN:
             ticket.work.body.clear()  # frees the frames of a check, 15 MB, which are not sent twice
         with self._held() as queue:
-            queue.sent(time.monotonic())
+            queue.sent(self._now_s())
 
     def _next_message(self, child: Child, timeout_s: float) -> dict[str, Any] | None:
-        """The worker's next message; None if a stop was requested meanwhile.
+        """The worker's next message that is not about the compilation of kernels, whose time does not count; None if a
+        stop was requested meanwhile.
 
         Raises:
             ChildError: the worker is dead, too slow or too large, or its message cannot be understood.
         """
-        deadline_s = time.monotonic() + timeout_s
-        while not child.has_spoken(POLL_S):
-            if self.thread.stopping:
-                return None
+        deadline_s = self._now_s() + timeout_s
+        while True:
+            while not child.has_spoken(POLL_S):
+                if self.thread.stopping:
+                    return None
+                self._look_after(child)
+                if self._compilation.has_stalled:
+                    text = f"made no progress in the compilation of its kernels within {STALLED_S:g} s"
+                    raise ChildError(Fault.TIMED_OUT, text)
+                if self._now_s() > deadline_s:
+                    raise ChildError(Fault.TIMED_OUT, f"gave no answer within {timeout_s:g} s")
+            message = child.receive()
+            if not self._compilation.take(message):
+                self._compilation.end()
+                return message
             self._look_after(child)
-            if time.monotonic() > deadline_s:
-                raise ChildError(Fault.TIMED_OUT, f"gave no answer within {timeout_s:g} s")
-        return child.receive()
 
     def _look_after(self, child: Child) -> None:
         """Checks time limits, memory and life of the worker; called many times a second.
@@ -370,7 +426,7 @@ class Worker:
     def _keep_time(self) -> None:
         self.thread.beat()
         with self._held() as queue:
-            queue.expire(time.monotonic())
+            queue.expire(self._now_s())
 
     def _note_fault(self, error: ChildError, pid: int | None) -> None:
         if self.thread.stopping:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ from coec.runtime.worker.jobs import (
     WrittenFile,
 )
 from coec.runtime.worker.messages import unpack_lidars, unpack_pairs, unpack_sweeps
-from coec.runtime.worker.warm_up import invented_window, warm_up
+from coec.runtime.worker.warm_up import invented_window, warm_up_check, warm_up_solve
 
 _log = logging.getLogger(__name__)
 
@@ -106,18 +106,39 @@ class Solver:
         for pair in config.every_pair:
             self._network(pair.calibration.depth)
 
+    @property
+    def lenses(self) -> int:
+        """Number of models of lenses, for each of which some kernels are compiled."""
+        return len({type(rig.camera) for rig in self._rigs.values()})
+
     def warm_up(self) -> None:
-        """Runs every kernel once on a few invented points, so that no window waits for a compiler. Kernels are compiled
-        for types, so one is enough of pairs that differ only in numbers, as most pairs of a vehicle do."""
+        """Runs every kernel once on a few invented points. Kernels are compiled for types, so one is enough of pairs
+        that differ only in numbers, as most pairs of a vehicle do."""
+        self.warm_up_checks()
+        for _ in self.warm_up_windows():
+            pass
+
+    def warm_up_checks(self) -> None:
+        """Runs the kernels that checks use."""
+        for rig, calibration in self._alike():
+            warm_up_check(rig, calibration, self._images)
+
+    def warm_up_windows(self) -> Iterator[None]:
+        """Runs the other kernels, in steps of a few seconds where they have to be compiled."""
+        for rig, calibration in self._alike():
+            yield from warm_up_solve(rig, calibration, self._images)
+        if self._config.lidar_edges.period_s > 0.0 and len({pair.lidar.place for pair in self._config.pairs}) > 1:
+            self._warm_up_lidars()
+            yield
+
+    def _alike(self) -> list[tuple[Rig, CalibrationConfig]]:
+        """One rig and its configuration of each kind that kernels can tell apart."""
         alike = {
             (type(rig.camera), rig.sweep is None, pair.calibration): (rig, pair.calibration)
             for pair in self._config.pairs
             for rig in (self._rigs[pair.name],)
         }
-        for rig, calibration in alike.values():
-            warm_up(rig, calibration, self._images)
-        if self._config.lidar_edges.period_s > 0.0 and len({pair.lidar.place for pair in self._config.pairs}) > 1:
-            self._warm_up_lidars()
+        return list(alike.values())
 
     def _warm_up_lidars(self) -> None:
         if not installed():

@@ -1,9 +1,10 @@
-"""The warm-up of a worker before its first job: runs every kernel once on a few invented points, so that no window
-waits for a compiler."""
+"""The warm-up of a worker: runs every kernel once on a few invented points, so that no work waits for a compiler. What
+a check needs comes first, because windows take longer to come."""
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +29,7 @@ from coec.errors import CalibrationError, DecodeError
 from coec.geometry.cameras import scaled
 from coec.geometry.edges.alignment import alignment_of_parts
 from coec.geometry.projection import project
-from coec.runtime.worker.late_kernels import one_edge
+from coec.runtime.worker.late_kernels import late_kernels, one_edge
 
 POINTS = 4000
 DEPTH_PX = (48, 64)
@@ -41,18 +42,30 @@ EVALUATIONS, REACH_DEG = 4, 4.0
 """Limits of the searches of the warm-up."""
 
 
-def warm_up(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> None:
-    """Runs the kernels that a check and a solve of one pair use."""
-    search = calibration.search.model_copy(update={"max_evaluations": EVALUATIONS, "reach_deg": REACH_DEG})
-    configuration = calibration.model_copy(update={"search": search})
+def warm_up_check(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> None:
+    """Runs the kernels that a check of one pair uses."""
     rig = small(rig)
     with contextlib.suppress(CalibrationError, DecodeError):
-        diagnose(invented_window(rig), _Ramp(), images, configuration, None)
+        diagnose(invented_window(rig), _Ramp(), images, _short(calibration), None)
+
+
+def warm_up_solve(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> Iterator[None]:
+    """Runs the kernels that the solve of a window of one pair uses, a few seconds of compiling in each step."""
+    rig = small(rig)
+    for run in reversed(late_kernels(rig.camera)):
+        run()
+        yield
     with contextlib.suppress(CalibrationError, DecodeError):
-        calibrate(invented_window(rig), _Ramp(), images, configuration, Silence())
+        calibrate(invented_window(rig), _Ramp(), images, _short(calibration), Silence())
     # These two kernels compute the uncertainty of a result, and an invented window need not give a result.
     project(rig.camera, np.ones((1, 3)))
     alignment_of_parts(one_edge(rig.camera), np.zeros(1, np.uint8), 1, np.eye(4)[None])
+    yield
+
+
+def _short(calibration: CalibrationConfig) -> CalibrationConfig:
+    search = calibration.search.model_copy(update={"max_evaluations": EVALUATIONS, "reach_deg": REACH_DEG})
+    return calibration.model_copy(update={"search": search})
 
 
 class _Ramp:

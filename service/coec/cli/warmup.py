@@ -1,0 +1,110 @@
+"""`coec warmup`: compiles the kernels of the service into the cache of the user."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from coec.cli.commands.warmup import Options
+from coec.config import Config, OpenPairConfig, PairConfig, load_config
+from coec.errors import OutputError, UsageError
+from coec.geometry import compile_news
+from coec.geometry.cameras.registry import MODELS
+from coec.geometry.compiler import kernel_cache
+from coec.reports import console
+from coec.reports.stage_times import StageTimes
+from coec.runtime.worker.kernels import compiled
+from coec.runtime.worker.second_compiler import second_compiler
+from coec.runtime.worker.tasks import Solver
+
+SIZE = {"width": 160, "height": 120, "fx": 60.0, "fy": 60.0, "cx": 79.5, "cy": 59.5}
+"""Kernels are compiled for types, not for sizes."""
+
+IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def run(options: Options) -> int:
+    """Compiles, and prints where the kernels are.
+
+    Raises:
+        UsageError: an unknown lens model, or both a configuration and models.
+        ConfigError: the configuration cannot be used.
+        OutputError: there is no folder in which kernels could be kept.
+    """
+    lenses = _lenses(options)
+    folder, is_kept = kernel_cache()
+    if not is_kept:
+        text = "set XDG_CACHE_HOME or NUMBA_CACHE_DIR to one that belongs to this user"
+        raise OutputError(f"no folder for compiled kernels can be written: {text}")
+    before, started_s = _files(folder), time.monotonic()
+    total = _compile(lenses)
+    fresh, took_s = len(_files(folder) - before), time.monotonic() - started_s
+    if options.as_json:
+        document = {"cache": str(folder), "lenses": lenses, "kernels": total, "files_written": fresh, "seconds": took_s}
+        console.print_json(document)
+    else:
+        done = "nothing had to be compiled" if not fresh else f"compiled in {took_s:.0f} s"
+        console.show(f"{total} kernels for {', '.join(lenses)}: {done}")
+        console.show(f"kept in {folder}")
+    return 0
+
+
+def _lenses(options: Options) -> list[str]:
+    """The lens models to compile for, in the order of the registry."""
+    if options.config is not None and options.lenses:
+        raise UsageError("give either --config or --lens")
+    named = set(options.lenses or MODELS)
+    if unknown := sorted(named - set(MODELS)):
+        raise UsageError(f"--lens {unknown[0]}: unknown; known are {', '.join(MODELS)}")
+    if options.config is not None:
+        found = set(map(_lens, load_config(options.config).every_pair))
+        named = set(MODELS) if None in found else {lens for lens in found if lens is not None}
+    return [lens for lens in MODELS if lens in named]
+
+
+def _lens(pair: PairConfig | OpenPairConfig) -> str | None:
+    """The lens model of a pair; None if `CameraInfo` is to tell it."""
+    intrinsics = pair.camera.intrinsics
+    return None if intrinsics is None else intrinsics.model
+
+
+def _compile(lenses: Sequence[str]) -> int:
+    """Runs every kernel once; returns how many there are."""
+    config = Config.model_validate({"pairs": list(_pairs(lenses))})
+    total = compiled(len(lenses)).total
+    with console.progress(compiling=False) as bars:
+        times = StageTimes(bars)
+
+        def report(_: str) -> None:
+            times.step("compiling kernels", compiled(len(lenses)).done, total)
+
+        with compile_news.heard_by(report), second_compiler(config):
+            Solver(config, 1).warm_up()
+    return total
+
+
+def _pairs(lenses: Sequence[str]) -> Iterable[dict[str, Any]]:
+    """A pair for each lens, on LiDARs of two kinds: one that tells the times of its points, and one that does not."""
+    for lens in lenses:
+        parameters = dict.fromkeys(MODELS[lens].parameters, 0.0) | SIZE
+        if "alpha" in parameters:
+            parameters["alpha"] = 0.5
+        if "beta" in parameters:
+            parameters["beta"] = 1.0
+        kinds: dict[str, dict[str, Any]] = {"timed": {}, "spinning": {"sweep": {}}}
+        for kind, given in kinds.items():
+            yield {
+                "name": f"{lens}-{kind}",
+                "camera": {"key": f"{lens}/camera", "intrinsics": {"model": lens, **parameters}},
+                "lidar": {"key": f"{lens}/{kind}", **given},
+                "ego": {"key": "ego"},
+                "T_camera_lidar": IDENTITY,
+                "calibration": {"depth": {"model": "stereo"}, "search": {"dof": 6}},
+            }
+
+
+def _files(folder: Path) -> set[Path]:
+    """The compiled kernels in a folder."""
+    return set(folder.rglob("*.nbc"))

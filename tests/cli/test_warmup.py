@@ -1,0 +1,80 @@
+"""`coec warmup`: which lenses it compiles for, where the kernels are, and when it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from coec.cli import warmup
+from coec.cli.commands.warmup import Options
+from coec.config import Config
+from coec.errors import OutputError, UsageError
+from coec.geometry import compiler
+from coec.geometry.cameras.registry import MODELS
+from coec.reports.commented_yaml import commented_yaml
+from coec.runtime.worker.kernels import compiled
+from rig_said import pair_config
+
+
+def test_kernels_that_are_there_are_not_compiled_again(capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):
+        assert warmup.run(Options(lenses=["pinhole"], as_json=True)) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (told["lenses"], told["kernels"], told["files_written"]) == (["pinhole"], compiled(1).total, 0)
+    assert Path(told["cache"]).is_dir()
+    reached = compiled(1)
+    assert reached.done == reached.total
+
+
+def test_people_are_told_where_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert warmup.run(Options(lenses=["pinhole"])) == 0
+    out = capsys.readouterr().out
+    assert f"{compiled(1).total} kernels for pinhole" in out
+    assert f"kept in {compiler.kernel_cache()[0]}" in out
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The lenses of every compilation, of which none is done."""
+    seen: list[list[str]] = []
+
+    def compile_none(lenses: list[str]) -> int:
+        Config.model_validate({"pairs": list(warmup._pairs(lenses))})
+        seen.append(lenses)
+        return 0
+
+    monkeypatch.setattr(warmup, "_compile", compile_none)
+    return seen
+
+
+def test_by_default_it_compiles_for_every_lens_that_there_is(asked: list[list[str]]) -> None:
+    warmup.run(Options())
+    assert asked == [list(MODELS)]
+
+
+def test_it_compiles_for_the_lenses_of_a_configuration(tmp_path: Path, asked: list[list[str]]) -> None:
+    path = tmp_path / "coec.yaml"
+    pair = pair_config("front")
+    path.write_text(commented_yaml(Config(pairs=(pair,))))
+    warmup.run(Options(config=path))
+    path.write_text("middleware: rmw_zenoh\npairs: [{name: front, camera: /image, points: /points}]\n")
+    warmup.run(Options(config=path))
+    assert pair.camera.intrinsics is not None
+    assert asked == [[pair.camera.intrinsics.model], list(MODELS)], "a lens that CameraInfo tells may be any"
+
+
+@pytest.mark.parametrize("options", [Options(lenses=["fish"]), Options(lenses=["mei"], config=Path("coec.yaml"))])
+def test_it_refuses_an_unknown_lens_and_two_sources(options: Options, asked: list[list[str]]) -> None:
+    with pytest.raises(UsageError):
+        warmup.run(options)
+    assert asked == []
+
+
+@pytest.mark.fault("no folder for compiled kernels can be written", "`coec warmup` says so, and compiles nothing")
+def test_without_a_cache_it_says_so(asked: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warmup, "kernel_cache", lambda: (Path("nowhere"), False))
+    with pytest.raises(OutputError, match="XDG_CACHE_HOME"):
+        warmup.run(Options())
+    assert asked == []
