@@ -24,11 +24,10 @@ The same over HTTP, to GET and HEAD, where `metrics.http` names an address of lo
 
 | page | answer |
 |---|---|
-| `/metrics` | OpenMetrics 1.0.0 if `Accept` names `application/openmetrics-text` and does not prefer `text/plain`, else the \
-text format 0.0.4 of Prometheus |
+| `/metrics` | OpenMetrics 1.0.0 if `Accept` names `application/openmetrics-text` and does not prefer `text/plain`, \
+else the text format 0.0.4 of Prometheus |
 | `/health` | 200 while the service runs and every pair may be used (ROS level OK or WARN), else 503 |
-| `/live` | 200 while the service makes progress, else 503: then a restart helps, so that this is the page for liveness \
-probes |
+| `/live` | 200 while the service makes progress, else 503: then a restart helps. The page for liveness probes |
 
 {table}"""
 
