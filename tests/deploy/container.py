@@ -40,6 +40,8 @@ def enter_copy_of_root() -> None:
     _run("mount", "-t", "overlay", "overlay", "-o", layers, str(PLACE / "root"))
     for place in others:
         _run("mount", "--rbind", place, f"{PLACE}/root{place}")
+    # Every container has memory of its own there.
+    _run("mount", "-t", "tmpfs", "-o", "mode=1777", "tmpfs", f"{PLACE}/root/dev/shm")
     os.chroot(PLACE / "root")
     os.chdir("/")
 
@@ -81,7 +83,8 @@ def take_steps(stage: Stage, built: bool) -> None:
                 folder.mkdir(parents=True, exist_ok=True)
             case "COPY" if step.text.startswith("--from="):
                 *_, source, target = step.words()
-                assert source == target, "what another stage built is where it is copied to"
+                if source != target and Path(source).exists():
+                    shutil.copytree(source, target, symlinks=True, dirs_exist_ok=True)
                 assert built or not Path(target).exists()
             case "COPY":
                 *sources, target = step.words()
@@ -118,8 +121,8 @@ class Container:
 
     def command(self, command: Sequence[str]) -> list[str]:
         """The command with what gives it its user and takes its rights; for Popen, with `environment`."""
-        user = self.image.last("USER").text
-        rights = ["--reuid", user, "--regid", user, "--init-groups"]
+        user, _, group = self.image.last("USER").text.partition(":")
+        rights = ["--reuid", user, "--regid", group, "--init-groups"]
         if self.service.get("cap_drop") == ["ALL"]:
             rights += ["--bounding-set=-all", "--inh-caps=-all", "--ambient-caps=-all"]
         if "no-new-privileges:true" in _strings(self.service.get("security_opt")):

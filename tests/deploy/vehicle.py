@@ -198,14 +198,20 @@ def prepare(*, build: bool) -> None:
                 source = Path("/etc/made") / Path(origin).name if "/tls/" in origin else DEPLOY / origin
                 Path(target).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy(source, target)
-                shutil.chown(target, stages()[-1].last("USER").text)
+                os.chown(target, *owner_of_image())
     kernels = kernel_cache_directory(Path(geometry.__file__).parent)
     if not build:
         # Compiling them is no part of what is looked at.
         folder = Path("/var/cache/coec") / kernels.name
         shutil.copytree(kernels, folder)
         for path in (folder, *folder.rglob("*")):
-            shutil.chown(path, stages()[-1].last("USER").text)
+            os.chown(path, *owner_of_image())
+
+
+def owner_of_image() -> tuple[int, int]:
+    """User and group that the programs of the image run as."""
+    user, group = stages()[-1].last("USER").text.split(":")
+    return int(user), int(group)
 
 
 def live(vehicle: Vehicle, story: Story) -> None:

@@ -62,7 +62,7 @@ def process(config: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 def page(port: int, path: str) -> tuple[int, str]:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-    connection.request("GET", path)
+    connection.request("GET", path, headers={"Accept": "application/openmetrics-text"})
     answer = connection.getresponse()
     told = answer.status, answer.read().decode()
     connection.close()
@@ -173,6 +173,7 @@ def _reload(running: Service, path: Path, endpoint: str, port: int) -> None:
     families = parse(text)
     assert told == 200
     assert families["coec_query_seconds"].value("_count", resource="status") > 0
+    assert page(port, "/live")[0] == 200
     assert page(port, "/health")[0] == 503, "nobody has looked yet"
     assert json.loads(page(port, "/health")[1])["pairs"][PAIR]["state"] == "unknown"
     assert page(port, "/config")[0] == 404

@@ -11,8 +11,9 @@ from coec.config.base import Stage
 
 
 class MetricsConfig(Stage):
-    """HTTP for a scraper on the same computer: `/metrics` (OpenMetrics) and `/health` (200, or 503 when a
-    calibration is not known to be right). Everybody who reaches the address can read; nobody can change anything."""
+    """HTTP for a scraper on the same computer: `/metrics` (OpenMetrics if asked for, else Prometheus text), `/health`
+    (200, or 503 when a calibration is not known to be right) and `/live` (200 while the service makes progress).
+    Everybody who reaches the address can read; nobody can change anything."""
 
     http: str | None = Field(default=None, description="HOST:PORT, such as 127.0.0.1:9464; null: no HTTP")
     insecure: bool = Field(default=False, description="allow addresses other than loopback; health says so")

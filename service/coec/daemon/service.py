@@ -39,7 +39,7 @@ from coec.runtime.api.configuration import shown
 from coec.runtime.api.health import reasons_of
 from coec.runtime.api.http_door import HttpDoor
 from coec.runtime.api.last_words import LastWords
-from coec.runtime.api.metrics import Took, View
+from coec.runtime.api.metrics import TextFormat, Took, View
 from coec.runtime.api.pages import pages
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception, Rules
@@ -114,7 +114,7 @@ class Daemon:
         config = self._config = self._room.complete(config)
         self._notifier = notifier
         self._started_s, self._started_ns = time.monotonic(), time.time_ns()
-        self._given_back_s = self._started_s
+        self._given_back_s = self._progress_s = self._started_s
         self._state: Literal["starting", "running", "stopping", "failing"] = "starting"
         self._fault: Reason | None = None
         self._keys = Keys(config.prefix, config.vehicle)
@@ -131,7 +131,7 @@ class Daemon:
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         others = () if mode_of(settings) == "router" else connected_of(settings)
         self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
-        self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
+        self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health, self._is_alive))
         node = self._ros_side.node
         publishers = None if node is None else RosPublishers(session, node)
         self._ros_outputs = RosOutputs(publishers, config, self._worker)
@@ -295,7 +295,8 @@ class Daemon:
                 return EXIT_THREAD_DIED
             return CoecError.exit_code if self._presence.rival is None else UnavailableError.exit_code
         if all(thread.silence_s < STALLED_S for thread in self._prompt_threads()):
-            self._notifier.watchdog()
+            self._progress_s = time.monotonic()
+            self._notifier.watchdog(None if self._door.server is None else self._config.metrics.address)
             if self._state == "starting":
                 self._notifier.starting(STALLED_S)
         return 0
@@ -515,7 +516,11 @@ class Daemon:
         """The answers of every pair: running pairs first, then the awaited ones."""
         return [*(pair.answers for pair in self._pairs.values()), *self._room.answers.values()]
 
-    def _metrics(self) -> bytes:
+    def _is_alive(self) -> bool:
+        """Whether the main loop runs and no thread is stuck, by the measure of the watchdog."""
+        return time.monotonic() - self._progress_s < STALLED_S
+
+    def _metrics(self, text_format: TextFormat = TextFormat.OPEN_METRICS) -> bytes:
         pairs = self._pairs.items()
         took = {
             metrics.QUERY: [Took((), self._answers.took)],
@@ -527,7 +532,7 @@ class Daemon:
         }
         memory = (resident_bytes(), self._worker.status().rss_bytes)
         view = View(self._status_reply, self._health(), *memory, took, self._rig_answers.reply, self._uplink)
-        return metrics.render(view)
+        return metrics.render(view, text_format)
 
 
 def _snippets_of(config: Config) -> SnippetStore | None:

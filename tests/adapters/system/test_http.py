@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from coec.adapters.system import http as served
-from coec.adapters.system.http import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpServer, Page
+from coec.adapters.system.http import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpServer, Page, Request
 from coec.errors import UnavailableError
 from fakes import wait_until
 from ports import free_port
@@ -26,10 +26,10 @@ ENDLESS = b"x" * 32_000_000
 PATIENCE_S = 20.0
 
 
-def find(path: str) -> Page | None:
-    if path == "/broken":
+def find(request: Request) -> Page | None:
+    if request.path == "/broken":
         raise RuntimeError("of the test")
-    body = {"/page": BODY, "/endless": ENDLESS}.get(path)
+    body = {"/page": BODY, "/endless": ENDLESS, "/accept": request.accept.encode()}.get(request.path)
     return None if body is None else Page(200, body, "text/plain")
 
 
@@ -65,9 +65,47 @@ def test_a_page_is_answered_and_everything_else_is_not_found(server: HttpServer)
     assert get(server, "/page") == (200, BODY)
     assert get(server, "/page?from=a-scraper") == (200, BODY)
     assert get(server, "/")[0] == get(server, "/page/")[0] == get(server, "/../page")[0] == 404
-    assert get(server, "/page", "POST")[0] == 404
     assert get(server, "/broken")[0] == 500, "and the server goes on"
     assert get(server, "/page")[0] == 200
+
+
+def head_of(answer: bytes) -> list[bytes]:
+    return answer.partition(b"\r\n\r\n")[0].split(b"\r\n")
+
+
+@pytest.mark.parametrize("path", ["/page", "/missing", "/broken"])
+def test_the_head_alone_is_that_of_the_whole_answer(server: HttpServer, path: str) -> None:
+    answers = {}
+    for method in ("GET", "HEAD"):
+        with opened(server, f"{method} {path} HTTP/1.1\r\n\r\n".encode()) as client:
+            answers[method] = b"".join(iter(lambda client=client: client.recv(2**16), b""))  # type: ignore[misc]
+    assert head_of(answers["HEAD"]) == head_of(answers["GET"])
+    assert answers["HEAD"].endswith(b"\r\n\r\n")
+    assert len(answers["GET"]) > len(answers["HEAD"])
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE", "get", "FROBNICATE"])
+@pytest.mark.parametrize("path", ["/page", "/missing"])
+def test_another_method_is_refused_with_those_that_are_answered(server: HttpServer, method: str, path: str) -> None:
+    with opened(server, f"{method} {path} HTTP/1.1\r\nContent-Length: 0\r\n\r\n".encode()) as client:
+        first, *headers = head_of(client.recv(1000))
+    assert first == b"HTTP/1.1 405 Method Not Allowed"
+    assert b"Allow: GET, HEAD" in headers
+
+
+@pytest.mark.parametrize(
+    ("headers", "accept"),
+    [
+        (b"", b""),
+        (b"Accept: text/plain\r\n", b"text/plain"),
+        (b"aCCept:text/plain ;q=0.5\r\nX: y\r\nACCEPT:  */*\r\n", b"text/plain ;q=0.5,*/*"),
+        (b"Acceptance: text/html\r\nno header\r\n\xff: \xff\r\n", b""),
+    ],
+)
+def test_what_the_reader_accepts_reaches_the_page(server: HttpServer, headers: bytes, accept: bytes) -> None:
+    with opened(server, b"GET /accept HTTP/1.0\r\n" + headers + b"\r\n") as client:
+        answer = b"".join(iter(lambda: client.recv(2**16), b""))
+    assert answer.partition(b"\r\n\r\n")[2] == accept
 
 
 @pytest.mark.parametrize(

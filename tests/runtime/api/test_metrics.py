@@ -8,7 +8,7 @@ from typing import get_args
 import pytest
 
 from coec.runtime.api import metrics
-from coec.runtime.api.metrics import FAMILIES, Took, View
+from coec.runtime.api.metrics import FAMILIES, TextFormat, Took, View
 from coec.runtime.timings import LONG_S, QUICK_S, Histogram
 from coec.schemas.replies import (
     Axes,
@@ -113,6 +113,29 @@ def test_the_text_is_open_metrics_and_holds_every_family_with_its_help() -> None
     assert all(family.help for family in families.values())
     assert families["coec_uptime_seconds"].unit == "seconds"
     assert families["coec_storage_free_bytes"].unit == "bytes"
+
+
+def test_the_older_text_format_has_the_same_samples_below_families_that_it_knows() -> None:
+    view = replace(a_view(), rig=knocked())
+    texts = {form: metrics.render(view, form).decode() for form in TextFormat}
+    older = texts[TextFormat.PROMETHEUS].splitlines()
+    samples = [line for line in older if not line.startswith("#")]
+    assert samples == [line for line in texts[TextFormat.OPEN_METRICS].splitlines() if not line.startswith("#")]
+    kinds: dict[str, str] = {}
+    for line in older:
+        name, _, kind = line.removeprefix("# TYPE ").partition(" ")
+        if line.startswith("# TYPE "):
+            assert f"# HELP {name} " in texts[TextFormat.PROMETHEUS]
+            assert kind in ("counter", "gauge", "histogram")
+            kinds[name] = kind
+        elif not line.startswith("# HELP "):
+            family = line.partition(" ")[0].partition("{")[0]
+            of_histogram = family.rpartition("_")[0]
+            assert kinds.get(family) in ("counter", "gauge") or kinds.get(of_histogram) == "histogram", line
+            assert (kinds.get(family) == "counter") == family.endswith("_total"), line
+    assert len(kinds) == len(FAMILIES)
+    assert "# EOF" not in older
+    assert not [line for line in older if line.startswith("# UNIT")]
 
 
 def test_what_a_service_knows_is_told() -> None:

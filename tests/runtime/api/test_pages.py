@@ -11,10 +11,11 @@ from itertools import count
 import pytest
 from pydantic import ValidationError
 
-from coec.adapters.system.http import Page
+from coec.adapters.system.http import Page, Request
 from coec.config import MetricsConfig
 from coec.runtime.api.http_door import HttpDoor
-from coec.runtime.api.pages import pages
+from coec.runtime.api.metrics import TextFormat
+from coec.runtime.api.pages import accepted_format, pages
 from coec.runtime.api.router_watch import RouterWatch
 from ports import free_port
 from runtime.api.test_metrics import a_busy_status, a_health
@@ -22,7 +23,7 @@ from runtime.api.test_metrics import a_busy_status, a_health
 
 def health_page(state: str, **healths: tuple[str, int]) -> Page:
     known = {name: a_health(*health) for name, health in healths.items()}
-    page = pages(lambda: b"", lambda: a_busy_status(state), lambda: known)("/health")
+    page = pages(lambda _: b"", lambda: a_busy_status(state), lambda: known, lambda: True)(Request("/health"))
     assert page is not None
     return page
 
@@ -36,12 +37,59 @@ def test_health_is_good_when_every_pair_may_be_used() -> None:
     assert health_page("starting", front=("healthy", 0)).status == 503
 
 
-def test_there_are_two_pages() -> None:
-    find = pages(lambda: b"figures", a_busy_status, dict)
-    metrics = find("/metrics")
-    assert metrics is not None
-    assert (metrics.body, metrics.content_type.partition(";")[0]) == (b"figures", "application/openmetrics-text")
-    assert [find(path) for path in ("/", "/metrics/", "/config", "")] == [None] * 4
+def test_there_are_three_pages() -> None:
+    find = pages(lambda form: form.name.encode(), a_busy_status, dict, lambda: True)
+    plain, asked = find(Request("/metrics")), find(Request("/metrics", "application/openmetrics-text"))
+    assert plain is not None
+    assert asked is not None
+    assert (plain.body, plain.content_type) == (b"PROMETHEUS", "text/plain; version=0.0.4; charset=utf-8")
+    assert asked.body == b"OPEN_METRICS"
+    assert asked.content_type == "application/openmetrics-text; version=1.0.0; charset=utf-8"
+    assert [find(Request(path)) for path in ("/", "/metrics/", "/config", "")] == [None] * 4
+
+
+@pytest.mark.parametrize(("alive", "status"), [(True, 200), (False, 503)])
+def test_a_service_that_is_stuck_is_not_alive_whatever_its_pairs_are(alive: bool, status: int) -> None:
+    page = pages(lambda _: b"", a_busy_status, dict, lambda: alive)(Request("/live"))
+    assert page is not None
+    assert page.status == status
+
+
+PROMETHEUS_2 = (
+    "application/openmetrics-text;version=1.0.0,application/openmetrics-text;version=0.0.1;q=0.75,"
+    "text/plain;version=0.0.4;q=0.5,*/*;q=0.1"
+)
+PROMETHEUS_3 = (
+    "application/openmetrics-text;version=1.0.0;escaping=allow-utf-8;q=0.5,application/openmetrics-text;"
+    "version=0.0.1;q=0.4,text/plain;version=1.0.0;escaping=allow-utf-8;q=0.3,text/plain;version=0.0.4;q=0.2,*/*;q=0.1"
+)
+
+
+@pytest.mark.parametrize(
+    "accept",
+    [PROMETHEUS_2, PROMETHEUS_3, "Application/OpenMetrics-Text", "a/b;q=x, application/openmetrics-text;q=0.001"],
+)
+def test_open_metrics_is_for_readers_that_prefer_it(accept: str) -> None:
+    assert accepted_format(accept) is TextFormat.OPEN_METRICS
+
+
+@pytest.mark.parametrize(
+    "accept",
+    [
+        "",
+        "*/*",
+        "text/html,application/xhtml+xml,*/*;q=0.8",
+        "text/plain",
+        "image/png",
+        "application/openmetrics-text;q=0",
+        "application/openmetrics-text;q=0.2,text/plain;q=0.3",
+        "application/openmetrics-text; q = often",
+        "application/openmetrics-text;q=nan",
+        ",;=,;;q",
+    ],
+)
+def test_everybody_else_reads_plain_text(accept: str) -> None:
+    assert accepted_format(accept) is TextFormat.PROMETHEUS
 
 
 @pytest.mark.parametrize("http", ["127.0.0.1:9464", "localhost:9464", "[::1]:9464", "127.8.8.8:1"])

@@ -1,7 +1,7 @@
-"""A small HTTP server for a scraper on the same computer: GET, one answer, end of the connection.
+"""A small HTTP server for a scraper on the same computer: GET or HEAD, one answer, end of the connection.
 
 One thread serves all connections and waits for none of them. Slow clients have a deadline, and if there are too many
-connections the oldest is dropped. Requests are not kept, and only their path is used.
+connections the oldest is dropped. Requests are not kept. Only their method, path and `Accept` are used.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import logging
 import selectors
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from coec.adapters.system.threads import ServiceThread
@@ -30,7 +30,30 @@ DEADLINE_S = 3.0
 
 POLL_S = 0.2
 
-REASONS = {200: "OK", 400: "Bad Request", 404: "Not Found", 500: "Internal Server Error", 503: "Service Unavailable"}
+REASONS = {
+    200: "OK",
+    400: "Bad Request",
+    404: "Not Found",
+    405: "Method Not Allowed",
+    500: "Internal Server Error",
+    503: "Service Unavailable",
+}
+
+METHODS = (b"GET", b"HEAD")
+"""The methods that are answered. `HEAD` gets the head of the answer to `GET`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """The parts of a request that an answer depends on.
+
+    Attributes:
+        path: path without the query.
+        accept: value of the header `Accept`; several such headers are joined by commas. Empty: there is none.
+    """
+
+    path: str
+    accept: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +76,8 @@ class _Connection:
 class HttpServer:
     """Listens from construction until `close`; answers while `thread` runs."""
 
-    def __init__(self, host: str, port: int, find: Callable[[str], Page | None]) -> None:
-        """`find(path)` is called on the thread; for None the answer is 404.
+    def __init__(self, host: str, port: int, find: Callable[[Request], Page | None]) -> None:
+        """`find(request)` is called on the thread; for None the answer is 404.
 
         Raises:
             UnavailableError: it is not possible to listen there.
@@ -120,21 +143,28 @@ class HttpServer:
         complete = b"\r\n\r\n" in connection.received
         if not complete and len(connection.received) < MAX_REQUEST_BYTES:
             return
-        page = self._answer(bytes(connection.received)) if complete else _plain(400, "The request is too long.\n")
-        connection.unsent = memoryview(_response(page))
+        too_long = _plain(400, "The request is too long.\n")
+        answer = self._answer(bytes(connection.received)) if complete else _response(too_long)
+        connection.unsent = memoryview(answer)
         self._selector.modify(connection.socket, selectors.EVENT_WRITE, connection)
 
-    def _answer(self, request: bytes) -> Page:
-        words = request.partition(b"\r\n")[0].split(b" ")
+    def _answer(self, request: bytes) -> bytes:
+        """The bytes of the answer to a request whose head is complete."""
+        head = request.partition(b"\r\n\r\n")[0]
+        first, *headers = head.split(b"\r\n")
+        words = first.split(b" ")
         if len(words) != 3 or not words[2].startswith(b"HTTP/1."):
-            return _plain(400, "This is no request.\n")
+            return _response(_plain(400, "This is no request.\n"))
+        method = words[0]
+        if method not in METHODS:
+            return _response(_plain(405, "Pages are read with GET or HEAD.\n"), allowed=METHODS)
         path = words[1].partition(b"?")[0].decode("latin-1")
         try:
-            page = self._find(path) if words[0] == b"GET" else None
+            page = self._find(Request(path, _values(headers, b"accept")))
         except Exception:
             _log.exception("a page could not be made", extra={"fields": {"path": path[:64]}})
-            return _plain(500, "The service failed on this page; its log says why.\n")
-        return _plain(404, "There is no such page.\n") if page is None else page
+            page = _plain(500, "The service failed on this page; its log says why.\n")
+        return _response(page or _plain(404, "There is no such page.\n"), with_body=method != b"HEAD")
 
     def _send(self, connection: _Connection) -> None:
         assert connection.unsent is not None
@@ -171,11 +201,19 @@ def _plain(status: int, text: str) -> Page:
     return Page(status, text.encode(), "text/plain; charset=utf-8")
 
 
-def _response(page: Page) -> bytes:
+def _values(headers: Sequence[bytes], name: bytes) -> str:
+    """All values of a header, joined by commas."""
+    split = (line.partition(b":") for line in headers)
+    return ",".join(value.strip().decode("latin-1") for key, _, value in split if key.strip().lower() == name)
+
+
+def _response(page: Page, *, with_body: bool = True, allowed: Sequence[bytes] = ()) -> bytes:
+    """The bytes of an answer. Without its body it has the head that it would have with it."""
+    allow = f"Allow: {', '.join(method.decode() for method in allowed)}\r\n" if allowed else ""
     head = (
         f"HTTP/1.1 {page.status} {REASONS[page.status]}\r\n"
         f"Content-Type: {page.content_type}\r\n"
-        f"Content-Length: {len(page.body)}\r\n"
-        "Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nConnection: close\r\n\r\n"
+        f"Content-Length: {len(page.body)}\r\n{allow}"
+        "Cache-Control: no-store\r\nVary: Accept\r\nX-Content-Type-Options: nosniff\r\nConnection: close\r\n\r\n"
     )
-    return head.encode() + page.body
+    return head.encode() + (page.body if with_body else b"")

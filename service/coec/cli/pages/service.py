@@ -16,11 +16,18 @@ METRICS = """\
 # Metrics
 
 {written}
-OpenMetrics text, answered to a query for `<prefix>/@v1/<vehicle>/metrics` (`coec query metrics`), and over HTTP at
-`/metrics` where `metrics.http` names an address of loopback. `/health` there is 200 while the service runs and every
-pair may be used (ROS level OK or WARN), else 503. Counters have the suffix `_total`, histograms `_bucket`, `_count`
-and `_sum`; their buckets end at {quick} s,
-those of the worker at {long} s.
+OpenMetrics text, answered to a query for `<prefix>/@v1/<vehicle>/metrics` (`coec query metrics`). Counters have the
+suffix `_total`, histograms `_bucket`, `_count` and `_sum`. The buckets end at {quick} s, those of the worker at
+{long} s.
+
+The same over HTTP, to GET and HEAD, where `metrics.http` names an address of loopback:
+
+| page | answer |
+|---|---|
+| `/metrics` | OpenMetrics 1.0.0 if `Accept` names `application/openmetrics-text` and does not prefer `text/plain`, \
+else the text format 0.0.4 of Prometheus |
+| `/health` | 200 while the service runs and every pair may be used (ROS level OK or WARN), else 503 |
+| `/live` | 200 while the service makes progress, else 503: then a restart helps. The page for liveness probes |
 
 {table}"""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from coec.adapters.system.http import HttpServer, Page
+from coec.adapters.system.http import HttpServer, Page, Request
 from coec.calibration.types import Reason
 from coec.config import MetricsConfig
 from coec.errors import UnavailableError
@@ -26,8 +26,8 @@ class HttpDoor:
         insecure: the reason to report if other computers can reach the server; else None.
     """
 
-    def __init__(self, find: Callable[[str], Page | None]) -> None:
-        """`find(path)` makes a page; see `HttpServer`."""
+    def __init__(self, find: Callable[[Request], Page | None]) -> None:
+        """`find(request)` makes a page; see `HttpServer`."""
         self._find = find
         self._config = MetricsConfig()
         self.server: HttpServer | None = None
@@ -49,7 +49,7 @@ class HttpDoor:
             _log.error(self.trouble.text)
             return
         self.server.thread.start()
-        _log.info(f"metrics and health at http://{config.http}/metrics and /health")
+        _log.info(f"metrics at http://{config.http}/metrics, health at /health, liveness at /live")
         if config.is_open:
             text = f"Whoever reaches {config.http} can read the metrics: `metrics.insecure` is set. Listen on loopback."
             self.insecure = Reason("http_insecure", text)

@@ -1,4 +1,5 @@
-"""The state of the daemon as OpenMetrics text: base units, `_total` for counters, one help line each.
+"""The state of the daemon as OpenMetrics text, or in the older text format of Prometheus: base units, `_total` for
+counters, one help line each.
 
 Every family is declared once, in `FAMILIES`. Both this text and the documentation page `docs/metrics.md` are made from
 these declarations.
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from itertools import accumulate
 from typing import Literal, get_args
 
@@ -20,6 +22,18 @@ from coec.schemas.replies import BudgetStatus, CheckReply, HealthReply, Maybe6, 
 from coec.schemas.rig_state import RigReply, SensorState
 
 ENCODING = "application/openmetrics-text"
+TEXT = "text/plain"
+
+
+class TextFormat(Enum):
+    """Format of the text. The value is its content type in HTTP."""
+
+    OPEN_METRICS = f"{ENCODING}; version=1.0.0; charset=utf-8"
+    """OpenMetrics 1.0.0."""
+    PROMETHEUS = f"{TEXT}; version=0.0.4; charset=utf-8"
+    """Text format 0.0.4 of Prometheus, for readers that do not ask for OpenMetrics. It has neither units nor the types
+    `info` and `stateset`, which become gauges, and its families carry the names of their samples."""
+
 
 Sample = tuple[tuple[str, ...], float]
 """Values of a family's labels in their order, and the value of the sample."""
@@ -71,18 +85,27 @@ class Family:
         """Base unit; empty for a family without a unit, or with another unit for each sample."""
         return next((unit for unit in ("seconds", "bytes") if self.name.endswith(f"_{unit}")), "")
 
-    def lines(self, view: View) -> Iterable[str]:
-        """The lines of the family in OpenMetrics."""
-        yield f"# TYPE {self.name} {self.kind}"
-        if self.unit:
-            yield f"# UNIT {self.name} {self.unit}"
-        yield f"# HELP {self.name} {self.help}"
+    @property
+    def suffix(self) -> str:
+        """Suffix of the names of its samples; those of a histogram have several."""
+        return {"counter": "_total", "info": "_info"}.get(self.kind, "")
+
+    def lines(self, view: View, text_format: TextFormat) -> Iterable[str]:
+        """The lines of the family."""
+        if text_format is TextFormat.OPEN_METRICS:
+            yield f"# TYPE {self.name} {self.kind}"
+            if self.unit:
+                yield f"# UNIT {self.name} {self.unit}"
+            yield f"# HELP {self.name} {self.help}"
+        else:
+            kind = self.kind if self.kind in ("counter", "gauge", "histogram") else "gauge"
+            yield f"# HELP {self.name}{self.suffix} {self.help}"
+            yield f"# TYPE {self.name}{self.suffix} {kind}"
         if self.kind == "histogram":
             yield from self._buckets(view)
             return
-        suffix = {"counter": "_total", "info": "_info"}.get(self.kind, "")
         for values, value in self.samples(view):
-            yield f"{self.name}{suffix}{_braces(self.labels, values)} {_number(value)}"
+            yield f"{self.name}{self.suffix}{_braces(self.labels, values)} {_number(value)}"
 
     def _buckets(self, view: View) -> Iterable[str]:
         for took in view.took.get(self.name, ()):
@@ -97,10 +120,11 @@ class Family:
                 yield f"{self.name}_sum{_braces(self.labels, own)} {_number(counted.sum_s)}"
 
 
-def render(view: View) -> bytes:
-    """OpenMetrics text, UTF-8."""
-    lines = [line for family in FAMILIES for line in family.lines(view)]
-    return "\n".join([*lines, "# EOF", ""]).encode()
+def render(view: View, text_format: TextFormat = TextFormat.OPEN_METRICS) -> bytes:
+    """The text in a format, UTF-8."""
+    lines = [line for family in FAMILIES for line in family.lines(view, text_format)]
+    end = ["# EOF"] if text_format is TextFormat.OPEN_METRICS else []
+    return "\n".join([*lines, *end, ""]).encode()
 
 
 # --- samples --------------------------------------------------------------------------------------------------------

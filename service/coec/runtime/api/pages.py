@@ -1,36 +1,70 @@
-"""The HTTP pages `/metrics` and `/health`, for programs on the same computer that scrape or probe."""
+"""The HTTP pages `/metrics`, `/health` and `/live`, for programs on the same computer that scrape or probe."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
 
-from coec.adapters.system.http import Page
-from coec.runtime.api.metrics import ENCODING
+from coec.adapters.system.http import Page, Request
+from coec.runtime.api.metrics import ENCODING, TEXT, TextFormat
 from coec.schemas.replies import HealthReply, StatusReply
-
-METRICS_TYPE = f"{ENCODING}; version=1.0.0; charset=utf-8"
 
 GOOD_ENOUGH = frozenset({0, 1})
 """ROS levels of health at which a calibration may be used: OK and WARN."""
 
 
 def pages(
-    metrics: Callable[[], bytes], status: Callable[[], StatusReply], health: Callable[[], Mapping[str, HealthReply]]
-) -> Callable[[str], Page | None]:
-    """A function that makes the page of a path (None for an unknown path). `/health` is 200 if the service runs and
-    every pair may be used, else 503: a pair that was not looked at is not healthy."""
+    metrics: Callable[[TextFormat], bytes],
+    status: Callable[[], StatusReply],
+    health: Callable[[], Mapping[str, HealthReply]],
+    is_alive: Callable[[], bool],
+) -> Callable[[Request], Page | None]:
+    """A function that makes the page of a request (None for an unknown path).
 
-    def page(path: str) -> Page | None:
-        match path:
+    `/health` is 200 if the service runs and every pair may be used, else 503: a pair that was not looked at is not
+    healthy. `/live` is 200 while the service makes progress, whatever it thinks of its pairs, else 503: only then can a
+    restart help.
+    """
+
+    def page(request: Request) -> Page | None:
+        match request.path:
             case "/metrics":
-                return Page(200, metrics(), METRICS_TYPE)
+                text_format = accepted_format(request.accept)
+                return Page(200, metrics(text_format), text_format.value)
             case "/health":
                 return _health(status(), health())
+            case "/live":
+                alive = is_alive()
+                return Page(200 if alive else 503, b"alive\n" if alive else b"stuck\n", "text/plain; charset=utf-8")
             case _:
                 return None
 
     return page
+
+
+def accepted_format(accept: str) -> TextFormat:
+    """The format of the metrics for a header `Accept` (RFC 9110, 12.5.1): OpenMetrics if the reader names it and does
+    not prefer plain text, else the text format, which every reader knows."""
+    wanted = {ENCODING: 0.0, TEXT: 0.0}
+    for item in accept.split(","):
+        media_type, *parameters = (part.strip().lower() for part in item.split(";"))
+        if media_type in wanted:
+            wanted[media_type] = max(wanted[media_type], _quality(parameters))
+    preferred = 0.0 < wanted[ENCODING] >= wanted[TEXT]
+    return TextFormat.OPEN_METRICS if preferred else TextFormat.PROMETHEUS
+
+
+def _quality(parameters: list[str]) -> float:
+    """The quality among the parameters of a media type, 0 to 1; 1 if there is none, 0 if it is no number."""
+    for parameter in parameters:
+        name, _, value = parameter.partition("=")
+        if name.strip() == "q":
+            try:
+                quality = float(value)
+            except ValueError:
+                return 0.0
+            return quality if 0.0 <= quality <= 1.0 else 0.0
+    return 1.0
 
 
 def _health(status: StatusReply, health: Mapping[str, HealthReply]) -> Page:
