@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from coec.adapters.files.output import write
+from coec.adapters.files.output import require_absent, write
 from coec.adapters.mcap.bag_writer import write_bag
 from coec.adapters.ros import messages, outgoing
 from coec.adapters.ros.topics import Frame
@@ -49,11 +49,12 @@ def drive(options: Options) -> int:
     Raises:
         UsageError: the output is no .mcap, or an option does not fit.
         SourceError: the optional extra is not installed.
-        OutputError: it cannot be written.
+        OutputError: it cannot be written, or is there already.
     """
     output = options.output
     if output.suffix != ".mcap":
         raise UsageError(f"{output}: the drive is written as a ROS 2 bag, its name must end in .mcap")
+    require_absent(output, force=options.force)
     made = opened(options)
     from coec.simulation.parallel import messages_by
 
