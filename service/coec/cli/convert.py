@@ -41,6 +41,7 @@ NS_PER_S = 1_000_000_000
 ALWAYS = (
     "vehicle",
     "zenoh.connect",
+    "zenoh.listen",
     "state.directory",
     "pairs.camera.frame_id",
     "pairs.lidar.frame_id",
@@ -49,7 +50,7 @@ ALWAYS = (
 
 REMARKS = {
     "vehicle": "unique in the fleet; a part of every key",
-    "zenoh": "the router",
+    "zenoh": "the router; where an embedded one listens",
     "state": "windows, and what survives a restart",
     "pairs.T_camera_lidar": "workshop calibration: LiDAR to camera",
     "pairs.window": "fits this recording; leave it out for longer drives",

@@ -16,6 +16,7 @@ from coec.cli.commands import sim_view
 from coec.cli.commands.sim_drive import Options
 from coec.errors import OutputError, UsageError
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.simulation.source import open_rig, open_sim
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def drive(options: Options) -> int:
             {"written": str(output), "bytes": output.stat().st_size, "frames": len(made.camera_stamps_ns)}
         )
     else:
-        console.show(f"{output}  {len(made.camera_stamps_ns)} pictures  {output.stat().st_size} bytes")
+        console.show(f"{output}  {count(len(made.camera_stamps_ns), 'picture')}  {output.stat().st_size} bytes")
     return 0
 
 

@@ -22,6 +22,7 @@ from coec.errors import OutputError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.se3 import inverse
 from coec.reports import console
+from coec.reports.page.words import count
 
 if TYPE_CHECKING:
     from coec.simulation.rig_drive import RigDrive
@@ -78,7 +79,10 @@ def drive(options: Options) -> int:
     if options.as_json:
         console.print_json({"written": str(path), "bytes": path.stat().st_size, "frames": total, "sources": sources})
     else:
-        console.show(f"{path}  {total} pictures and sweeps  {path.stat().st_size} bytes; pairs as sources:")
+        console.show(
+            f"{path}  {count(total, 'picture or sweep', 'pictures and sweeps')}  {path.stat().st_size} bytes; "
+            "pairs as sources:"
+        )
         for camera in made.cameras:
             console.show(f"  '{source_of(folder, camera, made.lidars[0])}'")
         others = ", ".join(points_topic(lidar) for lidar in made.lidars[1:])
