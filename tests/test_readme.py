@@ -15,6 +15,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -253,8 +254,20 @@ def test_an_ellipsis_stands_for_any_lines_and_nothing_else_does() -> None:
 
 
 # ------------------------------------------------------------------------------------------------------ typing
-def play_through(block: Block, folder: Path, patience_s: float, *, short: bool) -> None:
-    """Types a block in a shell of its own, then looks at what came of it."""
+HERE = (sys.executable, "-m", "coec")
+
+
+def play_through(
+    block: Block,
+    folder: Path,
+    patience_s: float,
+    *,
+    short: bool,
+    coec: Sequence[str] = HERE,
+    env: Mapping[str, str] | None = None,
+) -> None:
+    """Types a block in a shell of its own, then looks at what came of it. `coec` is what that word runs, `env` the
+    environment of the shell; by default those of this process."""
     data = Path(os.environ.get("COEC_SAMPLE_DATA") or REPOSITORY.parent / "shared" / "data")
     if not data.is_dir() and any(SAMPLES in typed(step, short=short).command for step in block.steps):
         pytest.skip(f"needs the sample recordings: {data} is absent; COEC_SAMPLE_DATA may name another folder")
@@ -267,8 +280,9 @@ def play_through(block: Block, folder: Path, patience_s: float, *, short: bool) 
     lines = ["set -m", "trap 'kill $(jobs -p) 2> /dev/null; wait' EXIT"]
     for number, step in enumerate(block.steps):
         lines += shell_lines(typed(step, short=short), FORMS.get(step.command, Form()), spoken / str(number))
-    path = os.pathsep.join([str(shim(folder)), os.environ["PATH"]])
-    run_shell("\n".join(lines), cwd, environment() | {"PATH": path, "REPOSITORY": str(REPOSITORY)}, patience_s)
+    variables = environment() if env is None else env
+    path = os.pathsep.join([str(shim(folder, coec)), variables["PATH"]])
+    run_shell("\n".join(lines), cwd, {**variables, "PATH": path, "REPOSITORY": str(REPOSITORY)}, patience_s)
     for number, step in enumerate(block.steps):
         chosen = typed(step, short=short)
         out, err = ((spoken / f"{number}.{stream}").read_text() for stream in ("out", "err"))
@@ -302,8 +316,8 @@ def shell_lines(step: Step, form: Form, said: Path) -> list[str]:
     ]
 
 
-def shim(folder: Path) -> Path:
-    """A folder with `coec`: that of this checkout, on a port that is free, where a page can only name the usual one."""
+def shim(folder: Path, coec: Sequence[str]) -> Path:
+    """A folder with a program `coec`: the given one, on a free port, where a page can only name the usual one."""
     endpoint = f"127.0.0.1:{free_port()}"
     path = folder / "bin" / "coec"
     path.parent.mkdir()
@@ -311,7 +325,7 @@ def shim(folder: Path) -> Path:
         "#!/bin/bash\n"
         f"case $1 in run | play) sed -i s/127.0.0.1:7447/{endpoint}/ ./*.yaml ;; esac\n"
         f'case $1 in query | watch) set -- "$@" --connect tcp/{endpoint} ;; esac\n'
-        f'exec {shlex.quote(sys.executable)} -m coec "$@"\n'
+        f'exec {shlex.join(coec)} "$@"\n'
     )
     path.chmod(0o755)
     return path.parent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import duckdb
@@ -38,6 +39,19 @@ def test_a_batch_makes_tables_compares_with_the_vehicles_and_goes_on(
     assert "judged before" in second.out
     rows = duckdb.sql(f"SELECT url FROM read_parquet('{folder}/**/*.parquet')").fetchall()
     assert sorted(Path(url).name for (url,) in rows) == ["bad.mcap", "one-1.mcap", "two-1.mcap"]
+
+
+@pytest.mark.fault("the libraries for tables are not installed", "nothing is written, and the same command works later")
+def test_without_the_extra_nothing_is_written(
+    coec: Coec, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "results"
+    for module in ("pyarrow", "pyarrow.parquet"):
+        monkeypatch.setitem(sys.modules, module, None)
+    outcome = coec("batch", recorded / "one", "--output", folder)
+    assert outcome.status == 1
+    assert "coec[fleet]" in outcome.err
+    assert not folder.exists()
 
 
 def test_what_is_not_the_word_of_a_fleet_is_told(coec: Coec, tmp_path: Path) -> None:

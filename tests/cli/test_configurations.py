@@ -8,11 +8,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from cli.conftest import SMALL, Coec
+from coec.adapters.files import output
 from coec.cli.check_config import example, template
 from coec.cli.convert import configuration_for
 from coec.config import Config, config_hash, load_config
-from coec.errors import ConfigError
-from coec.reports.commented_yaml import commented_yaml
+from coec.errors import ConfigError, OutputError
+from coec.reports.commented_yaml import commented_yaml, short_yaml
 from coec.simulation.source import open_sim
 from conftest import REPOSITORY
 
@@ -87,14 +88,81 @@ def test_converted_configuration_fits_the_recording(coec: Coec, tmp_path: Path) 
     assert pair.camera.mask == tmp_path / "coec-mask.png"
     assert pair.camera.intrinsics.model == "double_sphere"
     assert pair.ego is not None
-    # Six frames cannot make the ten that a window needs by default.
-    assert pair.window.min_pairs == 3
+    # Six frames in ten seconds cannot make the ten that a window needs by default, over three minutes.
+    assert (pair.window.pairs, pair.window.min_pairs, pair.window.slice_s) == (6, 3, 10.0)
+
+
+SHORT = "sim:seed=1&seconds=100&camera_hz=1&lidar_hz=1&camera=fisheye64&lidar=16"
+
+
+@pytest.mark.parametrize("source", [SMALL, SHORT])
+def test_a_converted_configuration_has_what_differs_and_what_a_person_must_see(
+    coec: Coec, tmp_path: Path, source: str
+) -> None:
+    short, full = tmp_path / "a" / "coec.yaml", tmp_path / "b" / "coec.yaml"
+    assert coec("convert", source, short).status == coec("convert", source, full, "--full").status == 0
+    text = short.read_text()
+    assert len(text.splitlines()) <= 20
+    for seen in ("vehicle:", "zenoh: {connect:", "directory:", "key:", "frame_id:", "mask:", "intrinsics:"):
+        assert seen in text
+    assert "check-config coec.yaml" in text
+    same = {"pairs": (), "state": None}
+    assert load_config(short).model_copy(update=same) == load_config(full).model_copy(update=same)
+    of_short, of_full = (load_config(path).pairs[0].model_dump(exclude={"camera": {"mask"}}) for path in (short, full))
+    assert of_short == of_full
+
+
+@pytest.mark.parametrize(
+    "path", sorted((REPOSITORY / "deploy" / "examples").glob("*.yaml")), ids=lambda path: path.stem
+)
+def test_a_short_configuration_reads_back(tmp_path: Path, path: Path) -> None:
+    config = load_config(path)
+    assert _read(short_yaml(config, (), {}), tmp_path) == config
+    assert _read(short_yaml(config, ("pairs.window.pairs",), {"pairs.window": "a remark"}), tmp_path) == config
+
+
+@pytest.mark.parametrize("edited", ["coec.yaml", "coec-mask.png"])
+def test_an_edited_file_is_not_overwritten_unless_asked(coec: Coec, tmp_path: Path, edited: str) -> None:
+    path = tmp_path / edited
+    path.write_text("a person's work")
+    refused = coec("convert", SMALL, tmp_path / "coec.yaml")
+    assert refused.status == 1
+    assert f"{path} is there already" in refused.err
+    assert "--force" in refused.err
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [(edited, "a person's work")]
+    assert coec("convert", SMALL, tmp_path / "coec.yaml", "--force").status == 0
+    assert path.read_bytes() != b"a person's work"
+
+
+@pytest.mark.fault("a configuration cannot be written after its mask", "nothing is left that refuses the next try")
+def test_a_failed_conversion_does_not_refuse_the_next(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace = output.replace
+
+    def full_disk(path: Path, data: bytes) -> Path:
+        if path.suffix == ".yaml":
+            raise OutputError(f"cannot write {path}: No space left on device")
+        return replace(path, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(output, "replace", full_disk)
+        assert coec("convert", SMALL, tmp_path / "coec.yaml").status == 1
+    assert list(tmp_path.iterdir()) == []
+    assert coec("convert", SMALL, tmp_path / "coec.yaml").status == 0
 
 
 @pytest.mark.parametrize(
     ("seconds", "hertz", "slice_s", "min_pairs"),
-    [("60", "1", 29.5, 10), ("600", "1", 180.0, 10), ("600", "0.1", 180.0, 10), ("30", "0.2", 180.0, 3)],
-    ids=["a minute", "ten minutes", "sparse", "few frames"],
+    [
+        ("60", "1", 29.5, 10),
+        ("100", "1", 49.5, 10),
+        ("600", "1", 180.0, 10),
+        ("600", "0.1", 180.0, 10),
+        ("30", "0.2", 25.0, 3),
+        ("0.5", "1", 180.0, 1),
+    ],
+    ids=["a minute", "shorter than a slice", "ten minutes", "sparse", "few frames", "one frame"],
 )
 def test_the_window_is_one_that_the_recording_fills(seconds: str, hertz: str, slice_s: float, min_pairs: int) -> None:
     query = {"seconds": seconds, "camera_hz": hertz, "lidar_hz": hertz, "camera": "fisheye64", "lidar": "16"}
@@ -106,6 +174,10 @@ def test_the_window_is_one_that_the_recording_fills(seconds: str, hertz: str, sl
     bin_s = window.slice_s / window.pairs
     bins = {int((stamp_ns - recording.camera_stamps_ns[0]) / 1e9 / bin_s) for stamp_ns in recording.camera_stamps_ns}
     assert len(bins) >= window.min_pairs
+    # What follows ends the first window while the recording still goes on, or at its last frame.
+    last_s = (recording.camera_stamps_ns[-1] - recording.camera_stamps_ns[0]) / 1e9
+    assert window.slice_s <= last_s or last_s == 0
+    assert window.pairs <= max(25, len(recording.camera_stamps_ns))
 
 
 @pytest.mark.parametrize(

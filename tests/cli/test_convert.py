@@ -50,6 +50,18 @@ def test_bag_opens_in_ros_tools(coec: Coec, tmp_path: Path) -> None:
     assert bag.latched == {"/tf_static"}
 
 
+def test_a_recording_is_overwritten_only_if_asked(coec: Coec, tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    path.write_bytes(b"an hour of driving")
+    refused = coec("convert", SMALL, path)
+    assert refused.status == 1
+    assert "--force" in refused.err
+    assert path.read_bytes() == b"an hour of driving"
+    assert coec("convert", SMALL, path, "--full").status == 2
+    assert coec("convert", SMALL, path, "--force").status == 0
+    assert path.stat().st_size > 1000
+
+
 def test_other_endings_are_refused(coec: Coec, tmp_path: Path) -> None:
     assert coec("convert", SMALL, tmp_path / "drive.bag").status == 2
 

@@ -2,19 +2,129 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from pathlib import Path
 
 import pytest
 
 from cli.conftest import SMALL, Coec
+from coec.adapters.depth.maps import open_depth
+from coec.config import DepthConfig, LimitsConfig
 from coec.schemas.evaluation import ModelAssessment
+from tiny_onnx import first_channel
 
 
 def test_lists_the_cards_of_the_contract(coec: Coec) -> None:
     names = {card["name"] for card in coec("models", "--json").document["models"]}
     assert {"dpt_beit_large_512", "midas_small", "tcmonodepth_small", "meter_xxs_kitti"} <= names
     assert "dpt_beit_large_512" in coec("models").out
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where networks are looked for."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    return tmp_path / "data" / "coec" / "models"
+
+
+def test_says_whose_file_is_present_and_where_the_others_come_from(coec: Coec, folder: Path) -> None:
+    models = {card["name"]: card for card in coec("models", "--json").document["models"]}
+    street, dpt = models["street"], models["dpt_beit_large_512"]
+    assert (street["present"], Path(street["path"]).name) == (True, "street.onnx")
+    assert (dpt["present"], dpt["path"], dpt["sha256"], dpt["licence"]) == (False, None, None, "MIT")
+    assert dpt["looked_for"][0] == str(folder / "dpt_beit_large_512.onnx")
+    rows = {line.split()[0]: line for line in coec("models").out.splitlines() if line.strip()}
+    assert "present" in rows["street"]
+    assert "absent" in rows["dpt_beit_large_512"]
+    assert "isl-org/MiDaS" in rows["dpt_beit_large_512"]
+    assert all(card["obtain"] != "its authors" for card in models.values())
+
+
+def test_a_known_network_without_its_file_is_refused_with_the_way_out(coec: Coec, folder: Path) -> None:
+    err = coec("calibrate", SMALL, "--depth", "dpt_beit_large_512").err
+    assert f"looked for as {folder / 'dpt_beit_large_512.onnx'}" in err
+    assert "isl-org/MiDaS" in err
+    assert "coec models add FILE" in err
+    unknown = coec("calibrate", SMALL, "--depth", "nosuch").err
+    assert "on this machine: street." in unknown
+    assert "dpt_beit_large_512" not in unknown
+
+
+def test_adds_an_export_of_a_network_once_and_then_uses_it(coec: Coec, folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "dpt_beit_large_512.onnx"
+    file.write_bytes(first_channel())
+    before = os.umask(0o077)
+    try:
+        outcome = coec("models", "add", file)
+    finally:
+        os.umask(before)
+    place = folder / file.name
+    assert outcome.status == 0
+    assert str(place) in outcome.out
+    assert place.read_bytes() == file.read_bytes()
+    assert place.stat().st_mode & 0o777 == 0o644
+    assert [path.name for path in folder.iterdir()] == [file.name]
+    assert coec("models", "add", file, "--json").document == {
+        "name": "dpt_beit_large_512", "path": str(place), "copied": False,
+    }  # fmt: skip
+    depth = open_depth(DepthConfig(model="dpt_beit_large_512"), LimitsConfig())
+    assert depth.identity == hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def test_another_file_in_its_place_is_replaced_only_if_asked(coec: Coec, folder: Path, tmp_path: Path) -> None:
+    file, place = tmp_path / "any.onnx", folder / "midas_small.onnx"
+    file.write_bytes(first_channel())
+    folder.mkdir(parents=True)
+    place.write_bytes(b"another export")
+    refused = coec("models", "add", file, "--as", "midas_small")
+    assert refused.status == 1
+    assert "--force" in refused.err
+    assert place.read_bytes() == b"another export"
+    assert coec("models", "add", file, "--as", "midas_small", "--force").status == 0
+    assert place.read_bytes() == file.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "more", "status", "said"),
+    [
+        ("mine.onnx", first_channel(), (), 1, "docs/own-network.md"),
+        ("mine.onnx", first_channel(), ("--as", "nosuch"), 2, "no built-in card of this name"),
+        ("street.onnx", first_channel(), (), 1, "another file, or a damaged one"),
+        ("midas_small.onnx", b"rubbish", (), 1, "midas_small.onnx"),
+        ("midas_small.onnx", first_channel((1, 4, "h", "w")), (), 1, "midas_small.onnx"),
+        ("midas_small.onnx", None, (), 1, "there is no file"),
+    ],
+    ids=["unknown", "unknown name", "another file", "damaged", "another input", "absent"],
+)
+def test_what_is_no_known_network_is_not_added(
+    coec: Coec,
+    folder: Path,
+    tmp_path: Path,
+    name: str,
+    content: bytes | None,
+    more: tuple[str, ...],
+    status: int,
+    said: str,
+) -> None:
+    file = tmp_path / name
+    if content is not None:
+        file.write_bytes(content)
+    outcome = coec("models", "add", file, *more)
+    assert outcome.status == status
+    assert said in outcome.err
+    assert not folder.exists()
+
+
+def test_weights_in_other_files_are_refused_with_the_way_out(coec: Coec, folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "midas_small.onnx"
+    file.write_bytes(first_channel())
+    (tmp_path / "midas_small.onnx.data").write_bytes(b"weights")
+    outcome = coec("models", "add", file)
+    assert outcome.status == 1
+    assert "onnx.save(onnx.load(FILE), OTHER)" in outcome.err
+    assert not folder.exists()
 
 
 def test_shows_the_card_that_a_file_is_recognised_by(coec: Coec, sample_data: Path) -> None:

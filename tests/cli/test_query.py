@@ -135,6 +135,8 @@ def no_event(_: str) -> Sequence[Route]:
         (("command/hold", "--release", "--payload", "{}"), "leave --release out, or --payload"),
         (("command/explode", "--release"), "known: calibrate, apply"),
         (("overlay",), "--output FILE.jpg"),
+        (("overlay", "--output", "o.png"), "o.png: the picture is a JPEG, its name must end in .jpg"),
+        (("evidence/front-2", "--output", "e.PNG", "--param", "overlay=before"), "must end in .jpg"),
         (("health", "--output", "h.jpg"), "--output belongs to"),
         (("health", "--timeout", "inf"), "--timeout inf"),
     ],
@@ -254,6 +256,18 @@ def test_a_command_tells_who_says_that_he_gives_it(coec: Coec, vehicle: str) -> 
     assert coec("query", "health", "--connect", vehicle).status == 1
     (claim,) = CLAIMS
     assert claim == f"{getpass.getuser()}@{socket.gethostname()}".encode()
+
+
+def test_a_file_that_holds_something_else_is_replaced_only_if_asked(coec: Coec, vehicle: str, tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    path.write_bytes(b"another recording")
+    words = ("query", "windows/front-7.snippet", "--output", path, "--connect", vehicle)
+    refused = coec(*words)
+    assert refused.status == 1
+    assert f"{path} is there already" in refused.err
+    assert path.read_bytes() == b"another recording"
+    assert coec(*words, "--force").status == 0
+    assert coec(*words).status == 0, "what is complete is not fetched again"
 
 
 def test_of_several_pairs_one_has_to_be_named(coec: Coec, endpoint: str, tmp_path: Path) -> None:

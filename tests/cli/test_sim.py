@@ -11,7 +11,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from cli.conftest import Coec
+from coec.adapters.files import output
 from coec.calibration.types import CameraFrame, LidarFrame
+from coec.errors import OutputError
 from coec.sources import open_source
 from coec.sources.lidars import open_lidars
 
@@ -79,6 +81,37 @@ def test_failure_leaves_nothing_behind(coec: Coec, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     assert coec("sim", "drive", "--output", tmp_path / "file" / "drive.mcap", *SHORT).status == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_drive_is_overwritten_only_if_asked(coec: Coec, tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    path.write_bytes(b"an hour of driving")
+    refused = coec("sim", "drive", "--output", path, *SHORT)
+    assert refused.status == 1
+    assert "--force" in refused.err
+    assert path.read_bytes() == b"an hour of driving"
+
+
+@pytest.mark.fault("a drive of a rig cannot be written", "nothing is left that refuses the next try")
+def test_a_failed_drive_of_a_rig_does_not_refuse_the_next(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "rig"
+    words = ("sim", "drive", "--output", folder, *RIG, "--seconds", 0.25)
+
+    def full_disk(path: Path, data: bytes) -> Path:
+        if path.name == "rear.yaml":
+            raise OutputError(f"cannot write {path}: No space left on device")
+        return output.write(path, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("coec.cli.sim_rig.write", full_disk)
+        assert coec(*words).status == 1
+    assert list(folder.iterdir()) == []
+    assert coec(*words).status == 0
+    again = coec(*words)
+    assert again.status == 1
+    assert f"{folder / 'drive.mcap'}" in again.err
 
 
 RIG = ("--rig", "four-fisheyes", "--camera", "fisheye64", "--camera-hz", 4, "--lidar-hz", 4, "--scene", "room")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import tomllib
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,11 @@ from packaging.utils import canonicalize_name
 from coec.adapters.system.installed import pinned_hashes
 from conftest import REPOSITORY
 
-LOCK, CHECKS = (REPOSITORY / name for name in ("requirements.lock", "requirements-checks.lock"))
+LOCK, DOCS, CHECKS = LOCKS = tuple(
+    REPOSITORY / name for name in ("requirements.lock", "requirements-docs.lock", "requirements-checks.lock")
+)
+EXTRAS = ("fleet", "foxglove", "lidars")
+"""Those that commands of the pages need. Stores, Ray and training are installed by who has them."""
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +56,21 @@ def test_what_coec_and_its_demonstration_need_is_pinned(project: Any) -> None:
     assert missing(project["build-system"]["requires"], LOCK) == []
 
 
-def test_what_the_checks_need_is_pinned_beside_it_and_nothing_twice(project: Any) -> None:
-    assert missing(project["dependency-groups"]["checks"], LOCK, CHECKS) == []
-    assert twice(LOCK.read_text(), CHECKS.read_text()) == set()
-    assert missing(["pytest", "mypy", "playwright", "pyarrow"], LOCK), "who only wants to see it fetches none of these"
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_what_a_command_of_the_pages_needs_is_pinned(project: Any, extra: str) -> None:
+    assert missing(project["project"]["optional-dependencies"][extra], LOCK) == []
 
 
-@pytest.mark.parametrize("lock", [LOCK, CHECKS], ids=lambda lock: lock.stem)
+def test_what_the_site_and_the_checks_need_is_pinned_beside_it_and_nothing_twice(project: Any) -> None:
+    assert missing(project["dependency-groups"]["docs"], LOCK, DOCS) == []
+    assert missing(project["dependency-groups"]["checks"], *LOCKS) == []
+    assert all(twice(*(lock.read_text() for lock in two)) == set() for two in combinations(LOCKS, 2))
+    for unwanted in ("pytest", "mypy", "playwright", "mkdocs", "ray", "torch"):
+        assert missing([unwanted], LOCK), "who only uses it fetches none of these"
+    assert missing(["pytest"], LOCK, DOCS), "who only reads fetches no checks"
+
+
+@pytest.mark.parametrize("lock", LOCKS, ids=lambda lock: lock.stem)
 def test_every_pin_has_hashes_and_no_address(lock: Path) -> None:
     assert all(pinned_hashes(lock).values())
     assert re.findall(r"https?:|file:|--(?:extra-)?index", lock.read_text()) == []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,9 @@ import pytest
 
 from coec.adapters.files import durable
 from coec.errors import OutputError, SourceError, UsageError
-from coec.fleet import results, tables
+from coec.fleet import batch, results, tables
 from coec.fleet.desk import Desk
+from coec.fleet.engines.engine import FleetError
 from coec.fleet.places import Job
 from coec.fleet.results import Results
 from coec.fleet.terms import Terms
@@ -85,8 +86,8 @@ def test_a_batch_that_ends_anywhere_is_gone_on_with(tmp_path: Path, count: int) 
 
 def test_rows_are_the_same_whether_a_batch_was_stopped_or_not(tmp_path: Path, row: WindowRow) -> None:
     whole, stopped = (Results(tmp_path / name, Terms(), resume=False) for name in ("whole", "stopped"))
-    for batch in (whole, stopped):
-        batch.add(row)
+    for each in (whole, stopped):
+        each.add(row)
     whole.finish()
     Results(tmp_path / "stopped", Terms(), resume=True).finish()
     (one,), (other,) = (list((tmp_path / name).rglob("*.parquet")) for name in ("whole", "stopped"))
@@ -132,13 +133,49 @@ def test_a_folder_with_a_batch_is_gone_on_with_only_if_asked_and_on_the_same_ter
         Results(tmp_path, Terms(depth="street"), resume=True)
 
 
+class FailingEngine:
+    """An engine that fails after some rows."""
+
+    cores = 1
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def rows(self, jobs: Sequence[Job], terms: Terms) -> Iterator[WindowRow]:  # noqa: ARG002 - as the engines
+        yield from rows(self._count)
+        raise FleetError("the cluster cannot be reached")
+
+
+def run(folder: Path, terms: Terms, engine: FailingEngine) -> None:
+    batch.run([Job("0.mcap")], terms, engine, folder, lambda _: None, resume=False)
+
+
+@pytest.mark.fault("a batch fails before its first window is judged", "the same command can be given again")
+def test_a_batch_without_a_row_leaves_nothing_that_refuses_the_next(tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    for terms in (Terms(), Terms(depth="street")):
+        with pytest.raises(FleetError):
+            run(folder, terms, FailingEngine(0))
+        assert list(tmp_path.iterdir()) == []
+    with pytest.raises(FleetError):
+        run(folder, Terms(), FailingEngine(1))
+    with pytest.raises(UsageError, match="--resume"):
+        run(folder, Terms(), FailingEngine(1))
+
+
+def test_a_batch_that_goes_on_is_not_withdrawn(tmp_path: Path) -> None:
+    Results(tmp_path, Terms(), resume=False)
+    Results(tmp_path, Terms(), resume=True).finish()
+    assert [path.name for path in tmp_path.iterdir()] == [results.TERMS]
+
+
 @pytest.mark.fault(
     "tables of a batch are damaged, its folder cannot be written", "the message says which file, and what to do"
 )
 def test_what_cannot_be_read_or_written_is_told(tmp_path: Path) -> None:
-    batch = Results(tmp_path / "batch", Terms(), resume=False)
+    begun_batch = Results(tmp_path / "batch", Terms(), resume=False)
     for row in rows(4):
-        batch.add(row)
+        begun_batch.add(row)
     (table,) = (tmp_path / "batch").glob("date=*/vehicle=*/*.parquet")
     table.write_bytes(b"PAR1 rubbish PAR1")
     with pytest.raises(SourceError, match="judged again"):

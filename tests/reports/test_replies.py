@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 
-from coec.reports import replies, service_status
+from coec.reports import console, replies, service_status
 from coec.schemas.base import to_json
-from coec.schemas.replies import BudgetShare, BudgetStatus, ConfigurationStatus, PairStatus, StreamStatus
+from coec.schemas.replies import (
+    BudgetShare,
+    BudgetStatus,
+    ChainedEntry,
+    ConfigurationStatus,
+    HistoryEntry,
+    HistoryReply,
+    PairStatus,
+    StreamStatus,
+)
 from coec.schemas.rig_state import RigReply
 from rig_replies import joint, knocked, untold
 from runtime.api.test_metrics import a_busy_status
@@ -30,6 +41,45 @@ def test_a_configuration_that_is_not_in_force_is_said(
 
 
 @pytest.mark.fault("a budget that does not suffice", "`coec query status` says by how much, and who waits")
+@pytest.mark.parametrize(
+    ("status", "said"),
+    [
+        (None, "no attempt yet"),
+        ("not_accepted", "no attempt yet"),
+        ("accepted", "latest attempt accepted"),
+        ("failed", "latest attempt failed"),
+    ],
+)
+def test_before_the_first_attempt_none_is_called_not_accepted(status: str | None, said: str) -> None:
+    assert str(console.attempt(status)) == said
+
+
+def history_of(*entries: tuple[int, Literal["estimate", "state"], str]) -> bytes:
+    chained = tuple(
+        ChainedEntry(
+            sha256=64 * "a",
+            entry=HistoryEntry(
+                sequence=number, previous_sha256=64 * "0", kind=kind, code=code, text="A sentence.", wall_ns=0
+            ),
+        )
+        for number, kind, code in entries
+    )
+    return to_json(HistoryReply(vehicle="v", pair="front", total=1, results=(), entries=chained))
+
+
+def test_every_entry_of_the_history_has_its_number(capsys: pytest.CaptureFixture[str]) -> None:
+    replies.history(history_of((0, "state", "healthy"), (1, "estimate", "accepted"), (2, "state", "suspect")))
+    out = capsys.readouterr().out
+    assert "0 of 1 result\n" in out
+    assert [line.split()[0] for line in out.splitlines() if "A sentence." in line] == ["0", "1", "2"]
+    assert "Missing numbers" not in out
+
+
+def test_numbers_that_are_missing_from_the_history_are_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    replies.history(history_of((0, "state", "healthy"), (7, "state", "suspect")))
+    assert "Missing numbers are entries" in capsys.readouterr().out
+
+
 def test_a_budget_that_does_not_suffice_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     share = BudgetShare(look_s=1.0, window_s=None, unseen_s=7.0, suspected=False, waiting=True, active=True)
     budget = BudgetStatus(

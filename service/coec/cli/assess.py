@@ -24,6 +24,7 @@ from coec.evaluation.experiments import Stages
 from coec.library.choices import Choices, configuration_of
 from coec.reports import console
 from coec.reports.evaluation_documents import number
+from coec.reports.page.words import count
 from coec.schemas.base import to_json
 from coec.schemas.evaluation import DepthFrame, Maybe3, ModelAssessment
 from coec.schemas.replies import Vector3
@@ -149,7 +150,7 @@ def _report(
 
 
 def _show(report: ModelAssessment) -> None:
-    console.show(f"{Path(report.model).name} on {report.window_id}: {report.pairs} pairs")
+    console.show(f"{Path(report.model).name} on {report.window_id}: {count(report.pairs, 'pair')}")
     console.show(report.verdict, STYLES[report.suitability])
     figures = console.table("figure", "value", "unit", right=(1,))
     figures.add_row("rank correlation with inverse range", console.figure(report.rank_correlation, 2, sign=True), "")

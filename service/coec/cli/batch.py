@@ -15,6 +15,7 @@ from coec.fleet.engines.engine import Bounds, Engine
 from coec.fleet.places import jobs_of
 from coec.fleet.terms import terms_of
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.reports.progress import PlainColumn
 from coec.schemas.fleet import BatchReport, WindowRow
 
@@ -83,7 +84,7 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
         bars.update(task, advance=1, note=note)
         if bars.disable and now_s - said_s > LINE_S:
             said_s = now_s
-            console.say(f"{done} of {total} windows judged, {note}")
+            console.say(f"{done} of {count(total, 'window')} judged, {note}")
 
     with bars:
         yield told
@@ -96,12 +97,12 @@ def _show(report: BatchReport, cores: int) -> None:
         rows.add_row("judged before", str(report.kept))
     rows.add_row("accepted", str(report.accepted))
     rows.add_row("refused", str(report.refused))
-    for code, count in report.errors.items():
-        rows.add_row(f"without a result: {code}", str(count))
+    for code, number in report.errors.items():
+        rows.add_row(f"without a result: {code}", str(number))
     rows.add_row("compared with the vehicle's decision", str(report.compared))
     rows.add_row("decided otherwise", str(report.differing))
     console.out.print(rows)
     if report.share_of_ideal is not None:
-        share = f"{100.0 * report.share_of_ideal:.0f} % of what {cores} cores can do"
+        share = f"{100.0 * report.share_of_ideal:.0f} % of what {count(cores, 'core')} can do"
         console.show(f"{report.elapsed_s:.1f} s, {report.cpu_s:.1f} s of processor, {share}")
     console.show(f"tables in {report.output}")

@@ -16,6 +16,7 @@ from coec.errors import CalibrationError, SourceError
 from coec.evaluation.fitness import Cadence, Fitness, Remark, fitness_of
 from coec.library.choices import Choices, configuration_of
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.reports.stage_times import StageTimes
 from coec.sources import Recording, open_source, windows
 from coec.sources.spec import is_bag, parse_spec
@@ -111,7 +112,7 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
             if sigma[axis] is not None:
                 found = console.figure(correction[axis], sign=True)
                 axes.add_row(axis_name, found, console.figure(sigma[axis]), console.UNITS[axis])
-        console.show(f"{trial.pairs} pairs, tried at the recording's own extrinsic:")
+        console.show(f"{count(trial.pairs, 'pair')}, tried at the recording's own extrinsic:")
         console.out.print(axes)
     for remark in seen.remarks:
         console.show(f"{remark.level:4}  {remark.text}", LEVEL_STYLES[remark.level])

@@ -23,6 +23,7 @@ from coec.errors import UsageError
 from coec.library.choices import Choices, configuration_of
 from coec.reports import console, page, provenance
 from coec.reports.baseline_page import baselines_page
+from coec.reports.page.words import count
 from coec.reports.stage_times import StageTimes
 from coec.sources import windows
 
@@ -128,8 +129,8 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
 def show(baseline: Baseline) -> None:
     """Prints the baseline for people."""
     console.show(
-        f"{baseline.pair}: commissioned from {baseline.pairs} pairs of {baseline.windows} "
-        f"window{'s' if baseline.windows > 1 else ''}, hash {baseline_hash(baseline)}"
+        f"{baseline.pair}: commissioned from {count(baseline.pairs, 'pair')} of "
+        f"{count(baseline.windows, 'window')}, hash {baseline_hash(baseline)}"
     )
     show_learned(baseline)
 

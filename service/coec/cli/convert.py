@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from math import floor
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from coec.adapters.depth.maps import STEREO
-from coec.adapters.files.output import write
+from coec.adapters.files import output
 from coec.adapters.files.rig import intrinsics_config, mask_to_png, matrix_rows
 from coec.adapters.mcap.bag_writer import write_bag
 from coec.adapters.zenoh.player import Streams
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+from coec.cli.commands.convert import Options
 from coec.config import (
     CalibrationConfig,
     CameraConfig,
@@ -30,25 +32,52 @@ from coec.config import (
 )
 from coec.errors import OutputError, UsageError
 from coec.reports import console
-from coec.reports.commented_yaml import commented_yaml
+from coec.reports.commented_yaml import commented_yaml, short_yaml
 from coec.sources import Recording, open_source
 
 NS_PER_S = 1_000_000_000
 
 
-def run(source: str, out: Path, *, as_json: bool) -> int:
+ALWAYS = (
+    "vehicle",
+    "zenoh.connect",
+    "zenoh.listen",
+    "state.directory",
+    "pairs.camera.frame_id",
+    "pairs.lidar.frame_id",
+)
+"""Keys that a person has to see before the configuration is used elsewhere, whatever their defaults are."""
+
+REMARKS = {
+    "vehicle": "unique in the fleet; a part of every key",
+    "zenoh": "the router; where an embedded one listens",
+    "state": "windows, and what survives a restart",
+    "pairs.T_camera_lidar": "workshop calibration: LiDAR to camera",
+    "pairs.window": "fits this recording; leave it out for longer drives",
+}
+"""Comments on keys of a short configuration."""
+
+
+def run(options: Options) -> int:
     """Writes OUT.
 
     Raises:
         UsageError: OUT is neither .mcap nor .yaml.
-        OutputError: OUT cannot be written.
+        OutputError: OUT cannot be written, or is there already.
         SourceError: the recording cannot be read.
     """
+    out = options.out
     if out.suffix not in (".mcap", ".yaml", ".yml"):
         raise UsageError(f"{out}: OUT must end in .mcap (ROS 2 bag) or .yaml (daemon configuration)")
-    recording = open_source(source)
-    written = _bag(recording, out) if out.suffix == ".mcap" else _configuration(recording, out)
-    if as_json:
+    if options.full and out.suffix == ".mcap":
+        raise UsageError("--full belongs to a configuration, OUT.yaml")
+    output.require_absent(out, force=options.force)
+    recording = open_source(options.source)
+    if out.suffix == ".mcap":
+        written = _bag(recording, out)
+    else:
+        written = _configuration(recording, out, full=options.full, force=options.force)
+    if options.as_json:
         console.print_json({"written": [str(path) for path in written]})
     else:
         for path in written:
@@ -84,20 +113,23 @@ def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path 
 
 
 def _window(camera_stamps_ns: Sequence[int]) -> WindowConfig:
-    """The default window, or one adapted to a recording that could not fill it.
+    """The default window, or one that the recording can fill.
 
-    With fewer than twice the camera frames that a window needs, too few would be left as soon as some are refused (the
-    vehicle stood); then half of the frames are enough. A drive so short that it touches fewer bins of a slice than a
-    window needs pairs gets slices of half its length, so that one window is judged while the other half still passes.
+    A recording that is shorter than a slice gets slices of half its length, so that one window is judged while the
+    other half still passes, and as many pairs as such a half has frames. With fewer than twice the camera frames that a
+    window needs, the whole recording is one slice, and half of the frames are enough: too few would be left as soon as
+    some are refused, because the vehicle stood.
     """
     window = WindowConfig()
     frames = len(camera_stamps_ns)
-    if frames < 2 * window.min_pairs:
-        return window.model_copy(update={"min_pairs": max(1, frames // 2)})
     length_s = (camera_stamps_ns[-1] - camera_stamps_ns[0]) / NS_PER_S
-    if length_s < (window.min_pairs - 1) * window.slice_s / window.pairs:
-        return window.model_copy(update={"slice_s": length_s / 2})
-    return window
+    few = frames < 2 * window.min_pairs
+    fitted: dict[str, float] = {"min_pairs": max(1, frames // 2)} if few else {}
+    if 1e-3 <= length_s < window.slice_s:
+        # Rounded down, because the first pair after a slice ends it.
+        fitted["slice_s"] = floor((length_s if few else length_s / 2) * 1e3) / 1e3
+        fitted["pairs"] = min(window.pairs, frames if few else frames // 2)
+    return window.model_copy(update=fitted)
 
 
 def _calibration(camera: CameraFrame) -> CalibrationConfig:
@@ -110,17 +142,30 @@ def first_frames(recording: Recording) -> list[CameraFrame | LidarFrame | EgoMot
     return list(recording.messages([0]))
 
 
-def _configuration(recording: Recording, out: Path) -> list[Path]:
-    mask = recording.rig.mask
-    written = []
+def _configuration(recording: Recording, out: Path, *, full: bool, force: bool) -> list[Path]:
+    mask, mask_path = recording.rig.mask, out.with_name(f"{out.stem}-mask.png")
     if mask is not None:
-        written.append(write(out.with_name(f"{out.stem}-mask.png"), mask_to_png(np.asarray(mask))))
-    name = Path(written[0].name) if written else None
+        output.require_absent(mask_path, force=force)
+    name = None if mask is None else Path(mask_path.name)
     pair = configuration_for(recording, recording.rig.T_camera_lidar_nominal, name)
     config = Config(state=StateConfig(), pairs=(pair,))
     head = f"# Configuration of coec for the recording {recording.name}. `coec play` publishes it on these keys.\n"
-    written.append(write(out, (head + commented_yaml(config)).encode()))
-    return written
+    if full:
+        text = head + commented_yaml(config)
+    else:
+        text = f"{head}# Keys that are not here have their defaults: `coec check-config {out.name}` prints them all.\n"
+        text += short_yaml(config, ALWAYS, REMARKS)
+    if mask is None:
+        return [output.replace(out, text.encode())]
+    had_mask = mask_path.exists()
+    output.replace(mask_path, mask_to_png(np.asarray(mask)))
+    try:
+        output.replace(out, text.encode())
+    except OutputError:
+        if not had_mask:  # it would refuse the next try
+            mask_path.unlink(missing_ok=True)
+        raise
+    return [mask_path, out]
 
 
 def _bag(recording: Recording, out: Path) -> list[Path]:

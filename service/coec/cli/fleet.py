@@ -10,6 +10,7 @@ from coec.errors import DecodeError, UsageError
 from coec.fleet import questions, report
 from coec.reports import console, fleet_page, page, provenance
 from coec.reports.console import figure
+from coec.reports.page.words import count
 from coec.schemas.base import from_json, to_json
 from coec.schemas.fleet import AXES, FleetReport
 from coec.schemas.fleet_now import FleetNow
@@ -66,7 +67,7 @@ def _show(told: FleetReport) -> None:
     if told.changes is not None:
         changes = told.changes
         console.show(
-            f"against the earlier batch: {changes.both} windows in both, {changes.identical} identical, "
+            f"against the earlier batch: {count(changes.both, 'window')} in both, {changes.identical} identical, "
             f"{changes.newly_accepted} newly accepted, {changes.newly_refused} newly refused, "
             f"{changes.newly_failing} without a result any more"
         )

@@ -12,6 +12,7 @@ from coec.cli import commission
 from coec.cli.commands.fleet_commission import Options
 from coec.errors import UsageError
 from coec.reports import console
+from coec.reports.page.words import count
 
 
 def run(options: Options) -> int:
@@ -49,5 +50,7 @@ def _once(paths: Sequence[Path]) -> Sequence[Path]:
 
 
 def _show(model: Baseline, vehicles: int) -> None:
-    console.show(f"{model.pair}: {vehicles} vehicles, {model.pairs} pairs of {model.windows} windows")
+    console.show(
+        f"{model.pair}: {count(vehicles, 'vehicle')}, {count(model.pairs, 'pair')} of {count(model.windows, 'window')}"
+    )
     commission.show_learned(model)

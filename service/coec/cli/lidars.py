@@ -12,6 +12,7 @@ from coec.calibration.lidar_to_lidar.types import LidarEdge
 from coec.cli.commands.lidars import Options
 from coec.geometry.se3 import difference
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.sources.lidars import LidarRecording, open_lidars
 
 DEGREES = np.array([*np.rad2deg(np.ones(3)), *np.ones(3)])
@@ -50,9 +51,9 @@ def _show(recording: LidarRecording, edge: LidarEdge, error: np.ndarray | None) 
     console.out.print(told)
     bias = edge.range_bias
     console.show(
-        f"{recording.name}: {edge.rig.b} in {edge.rig.a}, {edge.pairs} pairs of sweeps, {edge.points} points of "
-        f"{edge.rig.b} on surfaces of {edge.rig.a} ({100 * edge.share:.0f} %), {1000 * edge.rms_m:.0f} mm from them; "
-        f"{edge.rig.b} measures {1000 * bias.longer_m:+.0f} ± {1000 * bias.sigma_m:.0f} mm longer"
+        f"{recording.name}: {edge.rig.b} in {edge.rig.a}, {count(edge.pairs, 'pair')} of sweeps, {edge.points} points "
+        f"of {edge.rig.b} on surfaces of {edge.rig.a} ({100 * edge.share:.0f} %), {1000 * edge.rms_m:.0f} mm from them"
+        f"; {edge.rig.b} measures {1000 * bias.longer_m:+.0f} ± {1000 * bias.sigma_m:.0f} mm longer"
     )
     for reason in edge.reasons:
         console.show(reason.text, "bold red")

@@ -159,7 +159,8 @@ def _drive(bench: Bench, options: Options, stages: Stages) -> tuple[list[dict[st
         }
         for radius_deg, outcomes in found.items()
     ]
-    title = f"{bench.window.window_id}: {options.objective}, {count} window{'s' if count > 1 else ''}"
+    windows = f"{count} window{'' if count == 1 else 's'}"
+    title = f"{bench.window.window_id}: {options.objective}, {windows}"
     named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in found.items()}
     output.write(options.output / "drive.png", paper_plots.drive(named, title))
     return rows, paper_charts.drive(named)

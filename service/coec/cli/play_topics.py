@@ -28,6 +28,7 @@ from coec.cli.stopping import until_signal
 from coec.config import OpenPairConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.schemas.ros_names import TF_STATIC
 from coec.sources import open_source
 from coec.sources.spec import SourceSpec, is_bag, is_rig, parse_spec
@@ -134,7 +135,7 @@ def _chosen(programme: Programme, asked: tuple[str, ...], middleware: Middleware
     infos = programme.infos
     unknown = [topic for topic in asked if topic not in infos]
     if unknown:
-        told = ", ".join(f"{topic} ({info.type_name}, {info.count} messages)" for topic, info in infos.items())
+        told = ", ".join(f"{topic} ({info.type_name}, {count(info.count, 'message')})" for topic, info in infos.items())
         raise UsageError(f"{programme.name} has no topic {', '.join(unknown)}; there: {told or 'none'}")
     wanted = {topic: info for topic, info in infos.items() if not asked or topic in asked}
     chosen = {topic: info for topic, info in wanted.items() if is_playable(middleware, topic, info.type_name)}

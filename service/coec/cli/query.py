@@ -312,6 +312,9 @@ def _save_picture(options: Options, way: Way, keys: Keys, head: str, argument: s
         raise UsageError(
             "--output belongs to windows/ID, overlay, and evidence/ID with --param overlay=before or after"
         )
+    path = Path(str(options.output))
+    if path.suffix.lower() not in ("", ".jpg", ".jpeg"):
+        raise UsageError(f"{path}: the picture is a JPEG, its name must end in .jpg")
     with connected_by(way, options.timeout_s) as session:
         if head == "overlay":
             key = keys.overlay(options.pair or _only_pair(session, options, keys))
@@ -320,7 +323,6 @@ def _save_picture(options: Options, way: Way, keys: Keys, head: str, argument: s
         reply = ask_one(session, _selector(single_key(key), tuple(options.params or ())), options.timeout_s)
     if reply.encoding != JPEG:
         raise UsageError("the answer is no picture: give --param overlay=before or overlay=after")
-    path = Path(str(options.output))
     output.replace(path, reply.payload)
     if options.as_json:
         console.print_json({"path": str(path), "size_bytes": len(reply.payload)})
@@ -347,6 +349,7 @@ def _download(options: Options, way: Way, keys: Keys, window_id: str) -> int:
             options.timeout_s,
             PATIENCE_S,
             bars.add_download(window_id),
+            replaces=options.force,
         )
     if options.as_json:
         console.print_json({"path": str(options.output), **info.model_dump(mode="json")})

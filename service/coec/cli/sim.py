@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from coec.adapters.files.output import write
+from coec.adapters.files.output import require_absent, write
 from coec.adapters.mcap.bag_writer import write_bag
 from coec.adapters.ros import messages, outgoing
 from coec.adapters.ros.topics import Frame
@@ -16,6 +16,7 @@ from coec.cli.commands import sim_view
 from coec.cli.commands.sim_drive import Options
 from coec.errors import OutputError, UsageError
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.simulation.source import open_rig, open_sim
 
 if TYPE_CHECKING:
@@ -49,11 +50,12 @@ def drive(options: Options) -> int:
     Raises:
         UsageError: the output is no .mcap, or an option does not fit.
         SourceError: the optional extra is not installed.
-        OutputError: it cannot be written.
+        OutputError: it cannot be written, or is there already.
     """
     output = options.output
     if output.suffix != ".mcap":
         raise UsageError(f"{output}: the drive is written as a ROS 2 bag, its name must end in .mcap")
+    require_absent(output, force=options.force)
     made = opened(options)
     from coec.simulation.parallel import messages_by
 
@@ -82,7 +84,7 @@ def drive(options: Options) -> int:
             {"written": str(output), "bytes": output.stat().st_size, "frames": len(made.camera_stamps_ns)}
         )
     else:
-        console.show(f"{output}  {len(made.camera_stamps_ns)} pictures  {output.stat().st_size} bytes")
+        console.show(f"{output}  {count(len(made.camera_stamps_ns), 'picture')}  {output.stat().st_size} bytes")
     return 0
 
 

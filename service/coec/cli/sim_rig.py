@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coec.adapters.files.output import write
+from coec.adapters.files.output import require_absent, write
 from coec.adapters.files.rig import mask_to_png
 from coec.adapters.mcap.bag_writer import write_messages
 from coec.adapters.ros import messages, outgoing
@@ -22,6 +22,7 @@ from coec.errors import OutputError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.se3 import inverse
 from coec.reports import console
+from coec.reports.page.words import count
 
 if TYPE_CHECKING:
     from coec.simulation.rig_drive import RigDrive
@@ -35,12 +36,15 @@ def drive(options: Options) -> int:
     Raises:
         UsageError: the output is a file, or an option does not fit.
         SourceError: the optional extra is not installed.
-        OutputError: it cannot be written.
+        OutputError: it cannot be written, or is there already.
     """
     folder = options.output
     if folder.suffix == ".mcap" or folder.is_file():
         raise UsageError(f"{folder}: a rig is written into a folder, {BAG} and a mask for each camera: name a folder")
     made = opened_rig(options)
+    beside = [folder / name for camera in made.cameras for name in (f"{camera}_mask.png", f"{camera}.yaml")]
+    require_absent(folder / BAG, *beside, force=options.force)
+    present = {path for path in beside if path.exists()}
     from coec.simulation.parallel import messages_by
 
     total = sum(entry.stream != 0 for entry in made.plan)
@@ -60,19 +64,25 @@ def drive(options: Options) -> int:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_messages(part, topics())
+        for camera in made.cameras:
+            _write_camera(made, camera, folder)
         part.replace(path)
+        present.update(beside)
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
     finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-    for camera in made.cameras:
-        _write_camera(made, camera, folder)
+        # What a failed run has made would refuse the next.
+        for left in (part, *(each for each in beside if each not in present)):
+            with suppress(OSError):
+                left.unlink(missing_ok=True)
     sources = {f"{camera}-{lidar}": source_of(folder, camera, lidar) for camera, lidar in made.config.layout.pairs}
     if options.as_json:
         console.print_json({"written": str(path), "bytes": path.stat().st_size, "frames": total, "sources": sources})
     else:
-        console.show(f"{path}  {total} pictures and sweeps  {path.stat().st_size} bytes; pairs as sources:")
+        console.show(
+            f"{path}  {count(total, 'picture or sweep', 'pictures and sweeps')}  {path.stat().st_size} bytes; "
+            "pairs as sources:"
+        )
         for camera in made.cameras:
             console.show(f"  '{source_of(folder, camera, made.lidars[0])}'")
         others = ", ".join(points_topic(lidar) for lidar in made.lidars[1:])

@@ -16,6 +16,8 @@ from coec.cli.commands.watch import Options
 from coec.cli.query import Asked
 from coec.cli.stopping import until_signal
 from coec.reports import console
+from coec.reports.instants import second
+from coec.reports.page.words import count
 from coec.schemas.keys import Keys
 from coec.schemas.replies import HealthReply
 
@@ -47,7 +49,7 @@ def run(options: Options, asked: Asked) -> int:
                     break
                 continue
             heard += 1
-            _write(change, as_json=options.as_json)
+            _write(change, asked.vehicle, as_json=options.as_json)
     return 0 if heard else 1
 
 
@@ -69,19 +71,22 @@ def _changes(session: zenoh.Session, asked: Asked, timeout_s: float) -> Iterator
     with listening(session, Keys(asked.prefix, asked.vehicle), "*", timeout_s, take, refuse):
         yield waiting
     if lost:
-        count = lost.total()
-        console.say(f"coec: {count} messages were not shown: no document of ours, or more than could be written")
+        told = count(lost.total(), "message was", "messages were")
+        console.say(f"coec: {told} not shown: no document of ours, or more than could be written")
 
 
-def _write(change: Change, *, as_json: bool) -> None:
-    value = change.value
+def _write(change: Change, vehicle: str, *, as_json: bool) -> None:
+    """Prints a change: for people with the time, and with its vehicle."""
+    value, pair = change.value, f"{vehicle}/{change.pair}"
     if as_json:
         document = value if isinstance(value, bool) else value.model_dump(mode="json")
         console.print_json({"key": change.key, "value": document})
-    elif isinstance(value, bool):
-        console.show(f"{change.pair}  {'is served' if value else 'is no longer served'}")
+        return
+    if isinstance(value, bool):
+        text = "is served" if value else "is no longer served"
     elif isinstance(value, HealthReply):
         why = ", ".join(reason.text if reason.code == COMPILING else reason.code for reason in value.reasons)
-        console.show(f"{change.pair}  {value.state}{f': {why}' if why else ''}")
+        text = f"{value.state}{f': {why}' if why else ''}"
     else:
-        console.show(f"{change.pair}  extrinsic {value.provenance}, latest attempt {value.status}")
+        text = f"extrinsic {value.provenance}, {console.attempt(value.status)}"
+    console.show(f"{second(time.time_ns())}  {pair}  {text}")

@@ -9,12 +9,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from coec.adapters.files import durable, output
 from coec.errors import DecodeError, OutputError, UsageError
 from coec.fleet import tables
+from coec.fleet.extra import library
 from coec.fleet.terms import Terms
 from coec.schemas.base import from_json, to_json
 from coec.schemas.fleet import WindowRow
@@ -34,10 +35,11 @@ class Results:
         Raises:
             UsageError: the folder holds a batch already, or one on other terms.
             OutputError: the folder cannot be written.
-            SourceError: a table in it is damaged.
+            SourceError: a table in it is damaged, or the extra that writes tables is not installed.
         """
+        library("pyarrow.parquet")  # before anything is written: what fails later must not leave a folder that is taken
         self._folder = folder
-        self._claim(terms, resume=resume)
+        self._begun = self._claim(terms, resume=resume)
         self._made = tables.urls(folder)
         self._rows: list[WindowRow] = []
         self._journal = durable.Log(folder / JOURNAL, 2 * ROWS_A_FILE, self._lines)
@@ -65,12 +67,15 @@ class Results:
             self.finish()
 
     def finish(self) -> None:
-        """Writes the waiting rows into tables.
+        """Writes the waiting rows into tables. A batch that this object began and that has no row is withdrawn: its
+        folder can be used again, on any terms.
 
         Raises:
             OutputError: a table cannot be written. The rows stay in the journal, and the next run writes the tables.
         """
         if not self._rows:
+            if self._begun and not self._made:
+                self._withdraw()
             return
         # The name depends on the rows in the file, so that no file replaces one with other rows.
         urls = [row.url for row in self._rows]
@@ -85,7 +90,14 @@ class Results:
     def _lines(self) -> Iterator[bytes]:
         return (to_json(row) for row in self._rows)
 
-    def _claim(self, terms: Terms, *, resume: bool) -> None:
+    def _withdraw(self) -> None:
+        with suppress(OSError):
+            for name in (JOURNAL, TERMS):
+                (self._folder / name).unlink(missing_ok=True)
+            self._folder.rmdir()
+
+    def _claim(self, terms: Terms, *, resume: bool) -> bool:
+        """Whether the folder held no batch. Then it holds the terms of this one."""
         path = self._folder / TERMS
         try:
             there = json.loads(path.read_bytes())["fingerprint"]
@@ -96,13 +108,15 @@ class Results:
         if there is None:
             document = {"fingerprint": terms.fingerprint, "terms": terms.model_dump(mode="json")}
             output.replace(path, json.dumps(document, sort_keys=True, indent=1).encode())
-        elif not resume:
+            return True
+        if not resume:
             raise UsageError(f"{self._folder} holds a batch: --resume goes on with it, another folder begins anew")
-        elif there != terms.fingerprint:
+        if there != terms.fingerprint:
             raise UsageError(
                 f"{self._folder} holds a batch of another configuration, rig, network or version of coec: its rows "
                 "cannot be compared with new ones; choose another folder"
             )
+        return False
 
     @contextmanager
     def _writing(self, path: Path) -> Iterator[None]:

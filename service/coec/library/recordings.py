@@ -20,6 +20,7 @@ from coec.library.choices import Options
 from coec.library.progress import Progress, Told
 from coec.library.results import Result
 from coec.library.windows import Window
+from coec.reports.page.words import count
 from coec.sources import Recording as Opened
 from coec.sources import open_source, windows
 from coec.sources.recording import KnowsTruth
@@ -82,15 +83,17 @@ class Description:
 
     def __str__(self) -> str:
         width, height = self.intrinsics["width"], self.intrinsics["height"]
-        motion = "none" if self.motion is None else f"{self.motion.frames} samples, {self.motion.rate_hz:.2f} Hz"
+        motion = (
+            "none" if self.motion is None else f"{count(self.motion.frames, 'sample')}, {self.motion.rate_hz:.2f} Hz"
+        )
         # Names and frames are as the recording has them, and whoever prints this has a terminal that would obey them.
         return "\n".join(
             printable(line, None)
             for line in (
                 f"{self.name}: {self.seconds:.1f} s of the pair {self.pair}",
-                f"  camera  {self.camera.frames} frames, {self.camera.rate_hz:.2f} Hz  {self.camera_model}, "
+                f"  camera  {count(self.camera.frames, 'frame')}, {self.camera.rate_hz:.2f} Hz  {self.camera_model}, "
                 f"{width:.0f} x {height:.0f} px, frame {self.camera_frame}",
-                f"  LiDAR   {self.lidar.frames} sweeps, {self.lidar.rate_hz:.2f} Hz  frame {self.lidar_frame}",
+                f"  LiDAR   {count(self.lidar.frames, 'sweep')}, {self.lidar.rate_hz:.2f} Hz  frame {self.lidar_frame}",
                 f"  motion  {motion}",
             )
         )

@@ -12,6 +12,7 @@ from coec.library.calibrating import calibrated
 from coec.library.choices import Choices, Options
 from coec.library.progress import Told
 from coec.library.results import Result
+from coec.reports.page.words import count
 from coec.sources import windows
 from coec.sources.windows import Loaded
 
@@ -26,7 +27,7 @@ class Window:
         self._loaded = loaded
 
     def __repr__(self) -> str:
-        return f"<coec.Window {self.window_id}, {self.pairs} pairs>"
+        return f"<coec.Window {self.window_id}, {count(self.pairs, 'pair')}>"
 
     @property
     def window_id(self) -> str:

@@ -14,6 +14,7 @@ from coec.config import CalibrationConfig
 from coec.geometry import se3
 from coec.geometry.edges.scan_lines import telling
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.schemas.replies import CalibrationResult, Transform, Vector6
 
 DIGITS = 9
@@ -47,7 +48,7 @@ def show(
         camera_fit, time_offset: as `--json` has them; None: not asked for.
         elapsed_s: seconds by stage.
     """
-    console.show(f"{window.window_id}: {result.pairs} pairs, {result.points_in_view} points in view")
+    console.show(f"{window.window_id}: {count(result.pairs, 'pair')}, {result.points_in_view} points in view")
     _show_axes(window, result)
     console.show_verdict(result)
     if result.verdict.decision != "accepted":
@@ -121,9 +122,9 @@ def compensation_text(pairs_by_outcome: Mapping[str, int]) -> str:
     compensated = pairs_by_outcome.get(Compensation.DONE, 0)
     turned = pairs_by_outcome.get(Compensation.ROTATION_ONLY, 0)
     why = [
-        (f"{count} of {total} pairs: " if count < total else "") + reason
+        (f"{some} of {total} pairs: " if some < total else "") + reason
         for outcome, reason in NOT_COMPENSATED.items()
-        if (count := pairs_by_outcome.get(outcome, 0))
+        if (some := pairs_by_outcome.get(outcome, 0))
     ]
     if not why:
         return "motion-compensated" + (", turns only: the source tells no speed" if turned and not compensated else "")

@@ -1,11 +1,13 @@
-"""A configuration as YAML with a comment on every key: for templates, and for people who check a configuration."""
+"""A configuration as YAML: with every key and a comment on each, for templates and for people who check one, or with
+nothing but what differs from the defaults, for people who edit one."""
 
 from __future__ import annotations
 
 import json
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,67 @@ def commented_yaml(model: BaseModel) -> str:
     """Every field of the model with its value, followed by its description. Optional fields without a value appear as
     comments. `load_config` reads the text back to an equal model."""
     return "\n".join(_mapping(model, "")) + "\n"
+
+
+def short_yaml(model: BaseModel, always: Collection[str], remarks: Mapping[str, str]) -> str:
+    """The fields of the model that differ from their defaults. `load_config` reads the text back to an equal model.
+
+    A block is written on one line. One that does not fit has its nested blocks and matrices on lines of their own.
+
+    Args:
+        always: dotted names of fields that are written with their default, too; the entries of a list have no place in
+            such a name.
+        remarks: comments by dotted name, on fields of the top level and of the entries of its lists.
+    """
+    lines: list[str] = []
+    for name, value in _differing(model, "", always).items():
+        if isinstance(value, list):
+            lines.append(f"{name}:")
+            for item in value:
+                written = (_short_lines(key, below, name, remarks) for key, below in item.items())
+                first, *rest = chain.from_iterable(written)
+                lines += [f"{INDENT}- {first}", *(f"{INDENT * 2}{line}" for line in rest)]
+        else:
+            lines += _short_lines(name, value, "", remarks)
+    return "\n".join(lines) + "\n"
+
+
+def _differing(model: BaseModel, place: str, always: Collection[str]) -> dict[str, Any]:
+    """Fields with a value that is not their default, and those of `always`; a list of models as a list of such
+    mappings."""
+    found: dict[str, Any] = {}
+    for name, field in type(model).model_fields.items():
+        value, here = getattr(model, name), f"{place}{name}"
+        if value is None:
+            continue
+        if isinstance(value, BaseModel):
+            block = _differing(value, f"{here}.", always)
+            if block or field.is_required():
+                found[name] = block
+        elif here in always or field.is_required() or value != field.get_default(call_default_factory=True):
+            if _holds_models(value):
+                value = [_differing(item, f"{here}.", always) for item in value]
+            found[name] = value
+    return found
+
+
+def _short_lines(name: str, value: Any, place: str, remarks: Mapping[str, str]) -> Iterator[str]:
+    remark = remarks.get(f"{place}.{name}" if place else name, "")
+    behind = f"  # {remark}" if remark else ""
+    line = f"{name}: {_scalar(value)}"
+    if len(line) <= WIDTH - 2 * len(INDENT) or not isinstance(value, dict | tuple):
+        yield f"{line}{behind}"
+    elif isinstance(value, dict):
+        long = {key: below for key, below in value.items() if isinstance(below, dict) or _is_matrix(below)}
+        first = [f"{key}: {_scalar(below)}" for key, below in value.items() if key not in long]
+        parts = [", ".join(first), *(f"{key}: {_scalar(below)}" for key, below in long.items())]
+        opened, *more = [f"{name}: {{{parts[0]}", *parts[1:]]
+        *before, last = [opened, *(f"{INDENT}{part}" for part in more)]
+        yield from (f"{each},{behind if index == 0 else ''}" for index, each in enumerate(before))
+        yield f"{last}}}{'' if before else behind}"
+    else:
+        yield f"{name}:{behind}"
+        yield from (f"{INDENT}- {_scalar(row)}" for row in value)
 
 
 def _mapping(model: BaseModel, indent: str) -> Iterator[str]:
@@ -80,6 +143,8 @@ def _is_matrix(value: object) -> bool:
 
 
 def _scalar(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_scalar(below)}" for key, below in value.items()) + "}"
     if isinstance(value, tuple | list):
         return "[" + ", ".join(_scalar(item) for item in value) + "]"
     if isinstance(value, Path):

@@ -151,6 +151,16 @@ def figure(value: float | None, digits: int = 3, sign: bool = False) -> str:
     return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}"
 
 
+def attempt(status: str | None) -> Text:
+    """How the latest calibration ended, by the `status` of a reply. None: nothing is known of the pair's sensors yet.
+
+    On the wire, `not_accepted` stands before the first attempt; an attempt whose result is refused has `failed`.
+    """
+    if status in (None, "not_accepted"):
+        return Text("no attempt yet")
+    return Text("latest attempt ").append_text(styled(status))
+
+
 def styled(state: str) -> Text:
     """A state in its colour."""
     return Text(plain(state), style=STATE_STYLES.get(state, "bold"))

@@ -97,7 +97,9 @@ def csv_of(reference: Matrix4, outcomes: Sequence[Outcome]) -> str:
 def show_comparison(report: ComparisonReport) -> None:
     """Prints the methods side by side, and why some are missing."""
     first = next(iter(report.methods.values()))
-    console.show(f"{first.window_id}: {first.pairs} pairs, {first.camera_model} camera, {first.dof} degrees of freedom")
+    console.show(
+        f"{first.window_id}: {count(first.pairs, 'pair')}, {first.camera_model} camera, {first.dof} degrees of freedom"
+    )
     console.show(f"{first.starts} starts {setting(first.start_rotation_deg, first.start_translation_m)}")
     names = list(report.methods)
     table = console.table("", *names, "unit", right=range(1, 1 + len(names)))
@@ -117,8 +119,8 @@ def show_comparison(report: ComparisonReport) -> None:
 def show(report: EvaluationReport) -> None:
     """Prints the figures of one method."""
     console.show(
-        f"{report.window_id}: {report.pairs} pairs, {report.camera_model} camera, objective {report.objective}, "
-        f"{report.dof} degrees of freedom"
+        f"{report.window_id}: {count(report.pairs, 'pair')}, {report.camera_model} camera, objective "
+        f"{report.objective}, {report.dof} degrees of freedom"
     )
     limits = f"{report.hit_rotation_deg:g} deg"
     if report.hit_translation_m is not None:

@@ -76,7 +76,7 @@ def detail(pair: PairNow) -> RenderableType:
         signed = (True, False, True, False)
         cells = [console.figure(value, sign=sign) for value, sign in zip(values, signed, strict=True)]
         figures.add_row(f"{title} [{console.UNITS[axis]}]", *cells)
-    served = f"served: {word.provenance or 'nothing yet'}, latest attempt {word.status or '-'}"
+    served = f"served: {word.provenance or 'nothing yet'}, {console.attempt(word.status)}"
     event = f", newest red event {console.plain(word.event)}" if word.event else ""
     return Group(*lines, Text(served + event), figures)
 

@@ -113,8 +113,8 @@ def _alarms(alarms: FalseAlarms) -> tuple[Block, ...]:
 def _changes(changes: FleetChanges) -> tuple[Block, ...]:
     told = Text(
         (
-            f"{changes.both} windows are in both; {changes.identical} are decided the same to the byte,"
-            f" {changes.newly_accepted} are newly accepted, {changes.newly_refused} newly refused,"
+            f"{count(changes.both, 'window is', 'windows are')} in both; {changes.identical} are decided the same "
+            f"to the byte, {changes.newly_accepted} are newly accepted, {changes.newly_refused} newly refused,"
             f" {changes.newly_failing} have no result any more. Those accepted twice differ by"
             f" {figure(changes.rotation_deg)}° and {figure(changes.translation_m)} m (root mean square).",
         )

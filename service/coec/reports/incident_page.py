@@ -26,6 +26,7 @@ from coec.reports.page import (
     Tone,
     Verdict,
 )
+from coec.reports.page.words import count
 from coec.reports.page_parts import TONES, advice_of, axis_value, title_of
 from coec.reports.provenance import Made
 from coec.reports.replies import entry_text
@@ -117,7 +118,7 @@ def sentences(story: Story) -> Iterable[str]:
             result = decided[window_id]
             why = f": {_said(result.verdict.reasons)}" if result.verdict.reasons else "."
             verdict = f"{result.verdict.decision}{why}"
-            yield f"The window {when} it, {window_id}, holds {result.pairs} pairs and was {verdict}"
+            yield f"The window {when} it, {window_id}, holds {count(result.pairs, 'pair')} and was {verdict}"
         else:
             yield f"The window {when} it is {window_id}; nothing is told of what was decided of it."
     if event.resolution is not None:
@@ -132,8 +133,8 @@ def sentence(report: IncidentReport) -> str:
     size = sum(file.size_bytes for file in report.files) / 1e6
     verified = sum(window.in_history is True for window in report.windows)
     return (
-        f"{len(report.files)} files, {size:.1f} MB, {len(report.windows)} windows with the right sha256, "
-        f"{verified} with the result that the history holds"
+        f"{count(len(report.files), 'file')}, {size:.1f} MB, {count(len(report.windows), 'window')} with the right "
+        f"sha256, {verified} with the result that the history holds"
     )
 
 
@@ -179,7 +180,8 @@ def _timeline(event: EvidenceEvent) -> Iterable[Block]:
     meaning = (
         "The dashed line is the event, the ground the state of health." if drawn else "They hold no figures to draw."
     )
-    yield Text((f"{len(points)} checks, {second(first)} to {second(last)}; states: {states}. {meaning}",), quiet=True)
+    checks = f"{count(len(points), 'check')}, {second(first)} to {second(last)}"
+    yield Text((f"{checks}; states: {states}. {meaning}",), quiet=True)
     yield Charts(drawn, small=True)
     if len(names) > MAX_PLOTS:
         yield Text((f"{len(names) - MAX_PLOTS} figures more are in event.json.",), quiet=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.schemas.matrix import MatrixReport, SolvedWindow, SolveStatistics, WatchStatistics
 
 
@@ -48,7 +49,7 @@ def _largest(window: SolvedWindow, axes: range) -> float | None:
 
 def _show_solves(solves: SolveStatistics) -> None:
     console.show(
-        f"{solves.dof} dof: {solves.windows} windows, {solves.hits} hits, {solves.accepted} accepted "
+        f"{solves.dof} dof: {count(solves.windows, 'window')}, {count(solves.hits, 'hit')}, {solves.accepted} accepted "
         f"({solves.accepted_hits} of them hits), {solves.accepted_wrong} accepted and wrong",
         "bold",
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from math import hypot
 from typing import Final
 
@@ -22,9 +23,8 @@ def extrinsic(payload: bytes) -> None:
     """The current calibration of a pair."""
     reply = from_json(replies.ExtrinsicReply, payload)
     console.out.print(
-        f"{reply.vehicle}/{reply.pair}  {reply.camera_frame} from {reply.lidar_frame}: {reply.provenance}, "
-        "latest attempt ",
-        console.styled(reply.status),
+        f"{reply.vehicle}/{reply.pair}  {reply.camera_frame} from {reply.lidar_frame}: {reply.provenance}, ",
+        console.attempt(reply.status),
         f", open window {reply.percent_complete:.0f} %",
         sep="",
     )
@@ -94,16 +94,19 @@ def health(payload: bytes) -> None:
 def history(payload: bytes) -> None:
     """Past results of a pair."""
     reply = from_json(replies.HistoryReply, payload)
-    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.results)} of {reply.total} results")
+    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.results)} of {count(reply.total, 'result')}")
     console.out.print(results_table(reply))
     table = console.table("#", "service time", "what", "outcome", "why", "sender", "sha256", right=(0,))
     for item in reply.entries:
         entry = item.entry
-        if entry.kind != "estimate":
-            outcome = console.styled(entry.code)
-            row = (str(entry.sequence), second(entry.wall_ns), entry.kind, outcome, entry_text(entry))
-            table.add_row(*row, entry.sender or "", item.sha256[:12])
+        row = (str(entry.sequence), second(entry.wall_ns), entry.kind, console.styled(entry.code), entry_text(entry))
+        table.add_row(*row, entry.sender or "", item.sha256[:12])
     console.out.print(table)
+    numbers = [item.entry.sequence for item in reply.entries]
+    if any(after - before > 1 for before, after in pairwise(numbers)):
+        console.show(
+            "Missing numbers are entries that were not asked for, or older ones that made room (`state.history`)."
+        )
 
 
 def entry_text(entry: replies.HistoryEntry) -> str:
@@ -145,7 +148,7 @@ def windows(payload: bytes) -> None:
 def evidence(payload: bytes) -> None:
     """Red events of a pair."""
     reply = from_json(replies.EvidenceReply, payload)
-    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.events)} red events")
+    console.show(f"{reply.vehicle}/{reply.pair}  {count(len(reply.events), 'red event')}")
     table = console.table("event", "began", "why", "window before", "window after", "now")
     for event in reply.events:
         why = "; ".join(reason.code for reason in event.reasons)
@@ -271,6 +274,10 @@ def _axes(axes: replies.Axes) -> None:
     for name, title in zip(console.AXES, console.AXIS_NAMES, strict=True):
         axis: replies.AxisReply = getattr(axes, name)
         table.add_row(
-            title, console.figure(axis.correction, sign=True), console.figure(axis.sigma), axis.unit, axis.status
+            title,
+            console.figure(axis.correction, sign=True),
+            console.figure(axis.sigma),
+            axis.unit,
+            "no attempt yet" if axis.status == "not_accepted" else axis.status,
         )
     console.out.print(table)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from statistics import median
 
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.schemas.rig import RigDrivesReport, RigMovesReport
 
 
@@ -69,9 +70,9 @@ def show_drives(report: RigDrivesReport) -> None:
                 console.show(f"  {one.name}, {row.fault}: {', '.join(one.wrong)} named {one.wrong_s:+.0f} s after it")
             elif one.named_s is None:
                 console.show(f"  {one.name}, {row.fault}: {' and '.join(one.moved)} not named")
-    of = f"{report.looks} looks on {report.drives} drives with {report.camera}"
+    of = f"{count(report.looks, 'look')} on {count(report.drives, 'drive')} with {report.camera}"
     windows = f"{report.windows} urgent windows: {report.accepted} accepted"
-    console.show(f"{of}: {report.faint} faint, {report.blind} blind; {windows}; {report.failed} drives failed")
+    console.show(f"{of}: {report.faint} faint, {report.blind} blind; {windows}; {count(report.failed, 'drive')} failed")
 
 
 def _ratio(of_all: float, per_axis: Sequence[float]) -> str:

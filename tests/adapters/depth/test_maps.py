@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.depth.maps import CachedDepth, PrecomputedDepth, models_folder, open_depth
+from coec.adapters.depth.maps import CachedDepth, PrecomputedDepth, open_depth
+from coec.adapters.depth.network_files import models_folder
 from coec.adapters.images.codec import encode_depth_png, encode_png, probe
 from coec.calibration.types import CameraFrame, DepthMap
 from coec.config import DepthConfig, LimitsConfig
@@ -104,13 +105,23 @@ def test_wrong_file_under_the_name_of_a_known_network_is_refused(
         open_depth(DepthConfig(model="tcmonodepth_small"), LIMITS)
 
 
-@pytest.mark.parametrize("model", ["midas_small", "no_such_name", "missing/net.onnx"])
-def test_absent_network_says_where_it_was_looked_for_and_what_is_known(
+@pytest.mark.parametrize("model", ["no_such_name", "missing/net.onnx"])
+def test_an_unknown_network_is_refused_with_those_that_are_there(
     model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    with pytest.raises(ModelError, match=f"there is no depth network .*{model}.*{tmp_path}.*dpt_beit_large_512"):
+    with pytest.raises(ModelError, match=f"there is no depth network {model}: .*on this machine: street\\."):
         open_depth(DepthConfig(model=model), LIMITS)
+
+
+def test_a_known_network_without_its_file_says_where_it_was_looked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    with pytest.raises(
+        ModelError, match=f"midas_small is not .*{tmp_path}/coec/models/midas_small.onnx.*isl-org/MiDaS"
+    ):
+        open_depth(DepthConfig(model="midas_small"), LIMITS)
 
 
 def test_cache_asks_once_per_content() -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections import OrderedDict
-from pathlib import Path
 
-from coec.adapters.depth.model_cards import CARDS, ModelCard, built_in_cards, find_card
+from coec.adapters.depth.model_cards import built_in_cards, find_card
+from coec.adapters.depth.network_files import absence, file_of
 from coec.adapters.files.home import from_home
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import decode_depth
@@ -88,7 +87,7 @@ class CachedDepth:
 def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
     """The depth model that a configuration names: `stereo`, an ONNX file, or the name of a built-in card.
 
-    The file of a built-in card is searched in `models_folder()`, then among those that come with the package.
+    The file of a built-in card is searched at `network_files.places_of`.
 
     Raises:
         ModelError: no such file or name, no card for it, a damaged network, or one that does not match its
@@ -100,29 +99,19 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
     if config.model == STEREO:
         return PrecomputedDepth(limits)
     named = built_in_cards().get(config.model)
-    path = _file_of(named) if named is not None else from_home(config.model)
-    if not path.is_file():
+    path = from_home(config.model) if named is None else file_of(named)
+    if named is not None and path is None:
+        raise ModelError(absence(named))
+    if path is None or not path.is_file():
+        present = [card.name for card in built_in_cards().values() if file_of(card) is not None]
         raise ModelError(
-            f"there is no depth network {path}: give an ONNX file, `{STEREO}` for the maps that come with "
-            f"the frames, or the name of a network in {models_folder()}: {', '.join(built_in_cards())}"
+            f"there is no depth network {path}: give an ONNX file, `{STEREO}` for the maps that come with the frames, "
+            f"or the name of a network whose file is on this machine: {', '.join(present)}. `coec models` lists all, "
+            "and where the others come from"
         )
     own, identity = file_identity(path)
     card = find_card(path, own, named)
     return OnnxDepth(path, card, config.providers, config.threads, limits, identity)
-
-
-def models_folder() -> Path:
-    """Folder in which networks are searched by name: `coec/models` in $XDG_DATA_HOME, by default ~/.local/share."""
-    base = os.environ.get("XDG_DATA_HOME", "")
-    return (Path(base) if base else from_home("~/.local/share")) / "coec" / "models"
-
-
-def _file_of(card: ModelCard) -> Path:
-    """`<name>.onnx` in the folder of networks, else the card's usual file name there, else the file that comes with the
-    package. If none exists, the first of these paths."""
-    name = f"{card.name}.onnx"
-    places = [models_folder() / name, models_folder() / (card.file or name), CARDS / name]
-    return next((path for path in places if path.is_file()), places[0])
 
 
 def _content_key(frame: CameraFrame) -> bytes:

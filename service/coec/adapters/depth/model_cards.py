@@ -111,6 +111,7 @@ class ModelCard(_Part):
     licence: str = Field(min_length=1, description="of the weights: SPDX identifier, or what the authors wrote")
     sha256: Sha256 | None = None
     source: str = Field(min_length=1, description="where the network and these numbers come from")
+    obtain: str = Field(default="its authors", min_length=1, description="how somebody gets the file, in a few words")
     rank_correlation: dict[str, Annotated[float, Field(ge=-1, le=1)]] = Field(
         default_factory=dict,
         description="Spearman's, of the output with inverse LiDAR range, median of the frames, by recording",

@@ -49,6 +49,25 @@ def try_file(path: Path) -> None:
         raise OutputError(f"cannot write {path}: Permission denied; name another file with --output")
 
 
+def require_absent(*paths: Path, force: bool) -> None:
+    """Check, before the work, that no file is there whose content is somebody's work: a configuration, a recording, a
+    mask. Reports and pictures that a command has drawn are written anew instead.
+
+    Args:
+        force: the person has said `--force`; then nothing is checked.
+
+    Raises:
+        OutputError: a file is there.
+    """
+    present = [str(path) for path in paths if path.is_file()]  # a device such as /dev/stdout is no file
+    if present and not force:
+        verb = "is" if len(present) == 1 else "are"
+        raise OutputError(
+            f"{' and '.join(present)} {verb} there already, and nothing was written: name another file, or overwrite "
+            f"{'it' if len(present) == 1 else 'them'} with --force"
+        )
+
+
 def write(path: Path, data: bytes) -> Path:
     """Write a whole file, and make its folder if needed.
 

@@ -18,6 +18,7 @@ from typing import Final
 import zenoh
 
 from coec.adapters.files import durable
+from coec.adapters.files.output import require_absent
 from coec.adapters.zenoh.client import ask_one
 from coec.errors import CoecError, NotFoundError, OutputError, RemoteError
 from coec.schemas.base import from_json
@@ -68,6 +69,8 @@ def fetch_window(
     patience_s: float,
     heard: Callable[[int, int], None],
     max_bytes: int = MAX_WINDOW_BYTES,
+    *,
+    replaces: bool = True,
 ) -> Recording:
     """Fetches a window or snippet into a file, which gets its final name only if its sha256 is right.
 
@@ -79,12 +82,14 @@ def fetch_window(
         patience_s: time without any new piece after which to give up.
         heard: called with the number of bytes that are there, and the total.
         max_bytes: largest size that the vehicle may claim; nothing is fetched of a larger one.
+        replaces: whether a file of another content may be replaced. An earlier version of the window is one.
 
     Raises:
         NotFoundError: nobody answered.
         RemoteError: there is no such window, it is larger than `max_bytes`, or its bytes do not have the promised hash.
         NoRoomError: the disk has no room for it.
-        OutputError: the file cannot be written. The received part stays for the next attempt.
+        OutputError: the file cannot be written. The received part stays for the next attempt. Or it holds something
+            else, and must not be replaced.
     """
     info = _digested(session, keys, pair, window_id, timeout_s)
     for attempt in (1, 2):
@@ -97,6 +102,7 @@ def fetch_window(
             if _is_there(path, info):
                 heard(info.size_bytes, info.size_bytes)
                 return info
+            require_absent(path, force=replaces)
             part = path.with_name(f"{path.name}.{info.sha256[:16]}.part")
             _require_room(part, info, window_id)
             if _whole(session, keys.window(pair, window_id), info, part, timeout_s, patience_s, heard):

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from coec.cli.options import Json, Source
+from coec.cli.options import Force, Json, Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +24,11 @@ class Options:
             show_default=False,
         ),
     ]
+    full: Annotated[
+        bool,
+        typer.Option("--full", help="OUT.yaml with every key and a comment on each, not only what has no default."),
+    ] = False
+    force: Force = False
     as_json: Json = False
 
 
@@ -31,4 +36,4 @@ def run(options: Options) -> int:
     """Turn a recording into a ROS 2 MCAP, or into a configuration with which `run` serves it."""
     from coec.cli import convert as work
 
-    return work.run(options.source, options.out, as_json=options.as_json)
+    return work.run(options)

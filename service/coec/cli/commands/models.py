@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import typer
 
-from coec.cli.commands import models_assess, models_show
+from coec.cli.commands import models_add, models_assess, models_show
 from coec.cli.declaring import taking
 from coec.cli.options import Json
 
-app = typer.Typer(help="Depth networks: list the built-in model cards, show which card a file gets, assess one.")
+app = typer.Typer(
+    help="Depth networks: list the known ones and whose file is present, add a file, show its card, assess it."
+)
 
 
 @app.callback(invoke_without_command=True)
@@ -20,4 +22,5 @@ def _models(context: typer.Context, as_json: Json = False) -> None:
 
 
 app.command("show")(taking(models_show.run))
+app.command("add")(taking(models_add.run))
 app.command("assess")(taking(models_assess.run))

@@ -113,6 +113,9 @@ class Options:
             metavar="FILE",
         ),
     ] = None
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a FILE that holds something else than the window.")
+    ] = False
     as_json: Json = False
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from coec.cli.options import Faults, Json, Seed, SimCamera, SimScene, SimSpeed
+from coec.cli.options import Faults, Force, Json, Seed, SimCamera, SimScene, SimSpeed
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +57,7 @@ class Options:
             metavar="RX,RY,RZ[,TX,TY,TZ]",
         ),
     ] = None
+    force: Force = False
     as_json: Json = False
 
 

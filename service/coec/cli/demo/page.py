@@ -9,6 +9,7 @@ from pathlib import Path
 from coec.cli.demo import story
 from coec.cli.demo.outcome import Ending
 from coec.cli.demo.watch import Moment
+from coec.reports import console
 from coec.reports.page import (
     Block,
     Cell,
@@ -26,6 +27,7 @@ from coec.reports.page import (
     Text,
     Verdict,
 )
+from coec.reports.page.words import count
 from coec.reports.page_parts import TONES, copies_of, figures_block
 from coec.reports.provenance import Made
 from coec.schemas import replies
@@ -114,7 +116,7 @@ def _said(happened: Sequence[tuple[Moment, str]]) -> Table:
             f"{moment.t_s:.0f} s",
             f"{moment.drive_s:.1f} s",
             Cell(moment.health, tone=TONES.get(moment.health, "none")),
-            f"{moment.provenance}, {moment.status}",
+            f"{moment.provenance}, {console.attempt(moment.status)}",
             f"{moment.error_deg:.3f}°",
             remark,
         )
@@ -126,8 +128,8 @@ def _said(happened: Sequence[tuple[Moment, str]]) -> Table:
 
 def _repair(result: replies.CalibrationResult, window: Path | None) -> tuple[Block, ...]:
     told = (
-        f"{result.pairs} pairs, verdict {result.verdict.decision}, configuration {result.config_hash}. The figures are "
-        "of its self-diagnosis, without the truth; a result is accepted if it keeps all limits."
+        f"{count(result.pairs, 'pair')}, verdict {result.verdict.decision}, configuration {result.config_hash}. The "
+        "figures are of its self-diagnosis, without the truth; a result is accepted if it keeps all limits."
     )
     left = () if window is None else (_window(window),)
     copies = copies_of(result.camera_from_lidar, result.camera_frame, result.lidar_frame)

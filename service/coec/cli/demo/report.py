@@ -74,7 +74,7 @@ def show(moments: Sequence[Moment], outcome: Ending, left: Left) -> None:
     steps = console.table("elapsed", "drive", "health", "extrinsic", "error", "", right=(0, 1, 4))
     for moment, what in zip(moments, _happenings(moments, outcome), strict=True):
         times = (f"{moment.t_s:.0f} s", f"{moment.drive_s:.1f} s")
-        served = f"{moment.provenance}, {moment.status}"
+        served = f"{moment.provenance}, {console.attempt(moment.status)}"
         steps.add_row(*times, console.styled(moment.health), served, f"{moment.error_deg:.3f}°", what)
     console.out.print(steps)
     console.out.print()

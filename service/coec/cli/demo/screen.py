@@ -16,6 +16,7 @@ from rich.text import Text
 from coec.cli.demo import story
 from coec.cli.demo.watch import Seen, Watch
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.reports.progress import COMPILING, COMPILING_S, CompilingNews
 
 BARS = "▁▂▃▄▅▆▇█"
@@ -89,10 +90,11 @@ def view(watch: Watch, seen: Seen) -> RenderableType:
     rows.add_row("health", Text.assemble(console.styled(moment.health), "  ", _reason(seen)))
     rows.add_row("error against the truth", _error(seen))
     rows.add_row("", curve(watch.series))
-    rows.add_row("extrinsic", f"{moment.provenance}, latest window {moment.status}")
+    rows.add_row("extrinsic", f"{moment.provenance}, {console.attempt(moment.status)}")
     rows.add_row("correction", "  ".join(f"{value:+.3f}°" for value in moment.correction_deg) + "  pitch, yaw, roll")
     rows.add_row("next window", _window(pair.selected))
-    rows.add_row("so far", f"{pair.pairs} pairs, {pair.checks} checks, {pair.solved} windows solved ({_worker(seen)})")
+    so_far = (count(pair.pairs, "pair"), count(pair.checks, "check"), count(pair.solved, "window"))
+    rows.add_row("so far", f"{', '.join(so_far)} solved ({_worker(seen)})")
     return Panel(Group(rows, Text(), _figures(seen)), title=f"coec demo  {moment.t_s:.0f} s", width=CURVE_WIDTH + 30)
 
 

@@ -25,6 +25,7 @@ from coec.cli.doctor.listening import listen
 from coec.config import Config, OpenPairConfig, load_config
 from coec.errors import ConfigError, ModelError
 from coec.reports import console
+from coec.reports.page.words import count
 from coec.runtime.nominal.kept import with_kept
 from coec.schemas.doctor import DoctorReport, Finding, Level
 
@@ -76,7 +77,7 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
         yield router.rules_finding(config, session)
         ros = RosSide(session, config)
         with console.progress(counted=False) as progress:
-            task = progress.add_task("listening", total=seconds, note=f"{len(config.pairs)} pairs")
+            task = progress.add_task("listening", total=seconds, note=count(len(config.pairs), "pair"))
             heard = listen(session, ros, config, seconds, lambda passed_s: progress.update(task, completed=passed_s))
         there = ros.topics()
         ros.close()

@@ -252,9 +252,10 @@ class Commands:
             return self._acknowledge("commission", "too_few_windows", text, accepted=False)
         done = partial(self._decider.commissioned, tuple(path.stem for path in paths))
         self._questions.commission(pose, paths, done)
+        windows = f"{len(paths)} window{'' if len(paths) == 1 else 's'}"
         text = (
-            f"The rig is being commissioned from {len(paths)} windows, between checks; `status` shows how far it is, "
-            "`history` will say how it went."
+            f"The rig is being commissioned from {windows}, between checks; `status` shows how far it is, `history` "
+            "will say how it went."
         )
         return self._acknowledge("commission", "commissioning", text, window_id=paths[-1].stem)
 
@@ -264,7 +265,7 @@ class Commands:
         """Finishes the open window now and solves it, if it has enough pairs; else solves the latest window again."""
         lacking = self._pair.window.min_pairs - self._chooser.chosen.selected
         if lacking <= 0 and (ended := self._chooser.finish()) is not None:
-            text = f"The window of {ended.pairs} pairs is being solved."
+            text = f"The window of {ended.pairs} pair{'' if ended.pairs == 1 else 's'} is being solved."
             return self._acknowledge("calibrate", "window_finished", text, window_id=ended.window_id)
         latest = self._recorder.latest
         if latest is not None and latest.exists():

@@ -321,7 +321,8 @@ class Decider:
             return
         self._baseline.load()
         self._calibrate_with(self._baseline.calibration)
-        text = f"Commissioned from {answer.windows} windows, {answer.pairs} pairs; baseline {answer.baseline_hash}."
+        some = f"{answer.windows} window{'' if answer.windows == 1 else 's'}"
+        text = f"Commissioned from {some}, {answer.pairs} pairs; baseline {answer.baseline_hash}."
         self._store.note_commissioned(text, window_ids)
         pose = answer.pose
         effect = self._step(lambda state: lifecycle.after_commissioning(state, pose), None, completed=False)

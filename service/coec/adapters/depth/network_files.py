@@ -1,0 +1,118 @@
+"""Where the files of known depth networks are on this machine, and how one gets there."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+from coec.adapters.depth.model_cards import CARDS, ModelCard, built_in_cards
+from coec.adapters.files import durable
+from coec.adapters.files.home import from_home
+from coec.config import LimitsConfig
+from coec.errors import ModelError, OutputError, UsageError
+
+OWN_NETWORKS = "docs/own-network.md"
+
+
+def models_folder() -> Path:
+    """Folder in which networks are searched by name: `coec/models` in $XDG_DATA_HOME, by default ~/.local/share."""
+    base = os.environ.get("XDG_DATA_HOME", "")
+    return (Path(base) if base else from_home("~/.local/share")) / "coec" / "models"
+
+
+def places_of(card: ModelCard) -> tuple[Path, ...]:
+    """The paths at which the file of a network is looked for, in this order: `<name>.onnx` in the folder of networks,
+    the card's usual file name there, and the files that come with the package."""
+    name = f"{card.name}.onnx"
+    folder = models_folder()
+    return tuple(dict.fromkeys((folder / name, folder / (card.file or name), CARDS / name)))
+
+
+def file_of(card: ModelCard) -> Path | None:
+    """The file of a network on this machine; None if it is at none of the places."""
+    return next((path for path in places_of(card) if path.is_file()), None)
+
+
+def absence(card: ModelCard) -> str:
+    """What to do about a known network whose file is absent: where it was looked for, where it comes from."""
+    return (
+        f"the file of the depth network {card.name} is not on this machine: it was looked for as "
+        f"{', '.join(str(path) for path in places_of(card)[:-1])}. It comes from: {card.obtain}. "
+        "`coec models add FILE` puts it there; a path to an ONNX file can be given instead of the name"
+    )
+
+
+def add(file: Path, name: str | None, *, force: bool) -> tuple[ModelCard, Path, bool]:
+    """Copies the file of a known network to where it is looked for, atomically and readable for everybody.
+
+    The network is recognised by its sha256. A card without one fits every export of its network: then the file's name
+    or `name` says which it is, and the network is opened and run once as its card says.
+
+    Returns:
+        Its card, where it is now, and whether it was copied: False if the same file is there already.
+
+    Raises:
+        ModelError: the file is absent, of no known network, does not fit its card, or has its weights in other files.
+        UsageError: there is no network called `name`.
+        OutputError: another file is there and `force` is False, or it cannot be written.
+    """
+    from coec.adapters.depth.onnx_network import OnnxDepth, file_identity  # the runtime takes 20 MB
+
+    if not file.is_file():
+        raise ModelError(f"there is no file {file}: name the ONNX file of a network")
+    digest, identity = file_identity(file)
+    card = _card_of(file, digest, name)
+    if identity != digest:
+        raise ModelError(
+            f"{file} has its weights in other files beside it, which the copy would not find: write it as one file "
+            "(Python: `onnx.save(onnx.load(FILE), OTHER)`), or name it by its path (--depth, calibration.depth.model)"
+        )
+    OnnxDepth(file, card, ("cpu",), 1, LimitsConfig(), identity)
+    place = places_of(card)[0]
+    present = file_of(card)
+    if present is not None and file_identity(present)[0] == digest:
+        return card, present, False
+    if place.is_file() and not force:
+        raise OutputError(f"{place} is there already and holds another file: --force replaces it")
+    _copy(file, place)
+    return card, place, True
+
+
+def _card_of(file: Path, digest: str, name: str | None) -> ModelCard:
+    cards = built_in_cards()
+    if name is not None and name not in cards:
+        raise UsageError(f"--as {name}: there is no built-in card of this name; known: {', '.join(cards)}")
+    recognised = next((card for card in cards.values() if card.sha256 == digest), None)
+    named = cards.get(name or file.stem) or next((card for card in cards.values() if card.file == file.name), None)
+    card = recognised if name is None and recognised is not None else named
+    if card is None:
+        open_cards = ", ".join(card.name for card in cards.values() if card.sha256 is None)
+        raise ModelError(
+            f"{file} (sha256 {digest}) is none of the known networks. If it is an export of one of these, say which "
+            f"with --as: {open_cards}. Your own network needs no place here: write a model card beside it, and name it "
+            f"by its path ({OWN_NETWORKS})"
+        )
+    if card.sha256 not in (None, digest):
+        raise ModelError(
+            f"{file} has sha256 {digest}, and the network {card.name} has {card.sha256}: it is another file, or a "
+            f"damaged one. Another export needs a model card of its own ({OWN_NETWORKS})"
+        )
+    return card
+
+
+def _copy(file: Path, place: Path) -> None:
+    part = place.with_name(f"{place.name}.part")
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("rb") as source, os.fdopen(durable.create(part, 0o644), "wb") as target:
+            shutil.copyfileobj(source, target, 2**20)
+            # A service that runs as another user reads it, whatever the umask of this one is.
+            os.fchmod(target.fileno(), 0o644)
+            durable.publish(target, part, place)
+    except OSError as error:
+        raise OutputError(f"cannot write {place}: {error.strerror}") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)

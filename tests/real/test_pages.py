@@ -1,0 +1,91 @@
+"""The README and the tutorial in the environment that they make themselves: a fresh checkout, its own set-up, and every
+block typed there. In the gate the same blocks run in the environment of the checks (tests/test_readme.py)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from conftest import REPOSITORY
+from test_readme import BLOCKS, LONG_S, Block, name_of, play_through
+
+pytestmark = pytest.mark.slow
+
+PAGES = ("README", "tutorial")
+OF_PAGES = [block for block in BLOCKS if block.page.stem in PAGES and block.language == "console"]
+PYTHON = [block for block in BLOCKS if block.page.stem in PAGES and block.language == "python"]
+
+NOT_THE_CHECKOUTS = (".venv", ".venv.lock")
+FOREIGN = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+"""Variables that would let another environment shine through."""
+
+
+def environment() -> dict[str, str]:
+    """The variables of a person's shell."""
+    return {name: value for name, value in os.environ.items() if name not in FOREIGN}
+
+
+def done(words: Sequence[object], cwd: Path) -> subprocess.CompletedProcess[str]:
+    """A command to its end."""
+    command = [str(word) for word in words]
+    return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=LONG_S)
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a clone of the working tree would hold, set up by the first command of the tutorial."""
+    if shutil.which("git") is None or not (REPOSITORY / ".git").exists():
+        pytest.skip(
+            "needs a checkout and git (Debian: apt-get install git): what belongs to the project is what git lists"
+        )
+    probe = tmp_path_factory.mktemp("probe")
+    fetched = done(
+        [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", probe, "hatchling"], probe
+    )
+    if fetched.returncode != 0:
+        pytest.skip(
+            f"needs a package index: connect, or name a mirror in pip's configuration ({fetched.stderr[-300:]})"
+        )
+    folder = tmp_path_factory.mktemp("fresh") / "coec"
+    listed = done(["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], REPOSITORY)
+    for name in listed.stdout.split("\0"):
+        path = REPOSITORY / name
+        if name and name not in NOT_THE_CHECKOUTS and path.is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(path, folder / name)
+    shown = done(["deploy/demo", "--output", folder.parent / "demo"], folder)
+    assert shown.returncode == 0, shown.stderr
+    return folder
+
+
+@pytest.mark.parametrize("block", OF_PAGES, ids=name_of)
+def test_a_block_works_in_the_environment_that_the_page_makes(checkout: Path, block: Block, tmp_path: Path) -> None:
+    own = checkout / ".venv" / "bin"
+    env = environment() | {"PATH": f"{own}{os.pathsep}{os.environ['PATH']}"}
+    play_through(block, tmp_path, LONG_S, short=False, coec=(str(own / "coec"),), env=env)
+
+
+@pytest.mark.parametrize("block", PYTHON, ids=name_of)
+def test_python_of_a_page_works_there(checkout: Path, block: Block, tmp_path: Path) -> None:
+    ran = done([checkout / ".venv" / "bin" / "python", "-c", block.text], tmp_path)
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_every_command_loads_its_extras_there(checkout: Path) -> None:
+    for module in ("duckdb", "embreex", "foxglove", "fsspec", "pyarrow.parquet", "small_gicp"):
+        found = done([checkout / ".venv" / "bin" / "python", "-c", f"import {module}"], checkout)
+        assert found.returncode == 0, found.stderr
+
+
+def test_the_site_is_built_as_the_readme_says(checkout: Path) -> None:
+    for command in (("deploy/setup", "--docs"), (".venv/bin/mkdocs", "build", "--strict")):
+        assert " ".join(command) in (checkout / "README.md").read_text()
+        ran = done(command, checkout)
+        assert ran.returncode == 0, ran.stderr
+    assert (checkout / "build" / "site" / "tutorial.html").is_file()
