@@ -14,7 +14,7 @@ from coec.adapters.images.codec import decode_depth
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import CameraFrame, DepthMap
 from coec.config import DepthConfig, LimitsConfig
-from coec.errors import DecodeError, ModelError
+from coec.errors import DecodeError, ModelError, permission_denied
 
 STEREO = "stereo"
 """Value of `DepthConfig.model` that stands for the maps that come with the frames."""
@@ -101,7 +101,9 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
         return PrecomputedDepth(limits)
     named = built_in_cards().get(config.model)
     path = _file_of(named) if named is not None else from_home(config.model)
-    if not path.is_file():
+    if path.parent.is_dir() and not os.access(path.parent, os.X_OK):
+        raise ModelError(f"depth network {path}: {permission_denied(path, 'r')}")
+    if not os.path.isfile(path):  # noqa: PTH113  of a folder that may not be searched, pathlib raises an error
         raise ModelError(
             f"there is no depth network {path}: give an ONNX file, `{STEREO}` for the maps that come with "
             f"the frames, or the name of a network in {models_folder()}: {', '.join(built_in_cards())}"
@@ -122,7 +124,7 @@ def _file_of(card: ModelCard) -> Path:
     package. If none exists, the first of these paths."""
     name = f"{card.name}.onnx"
     places = [models_folder() / name, models_folder() / (card.file or name), CARDS / name]
-    return next((path for path in places if path.is_file()), places[0])
+    return next((path for path in places if os.path.isfile(path)), places[0])  # noqa: PTH113  as above
 
 
 def _content_key(frame: CameraFrame) -> bytes:
