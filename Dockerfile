@@ -39,7 +39,7 @@ RUN groupadd --gid 10001 coec \
 # The packages, some 600 MB, which change with requirements.lock; then coec itself, some 20 MB.
 COPY --from=build /opt/coec /opt/coec
 COPY --from=build /own /
-COPY deploy/check-live /usr/local/bin/check-live
+COPY deploy/check-live /opt/coec/bin/check-live
 # Compiled kernels are cached below XDG_CACHE_HOME/coec: keep that folder on a volume for quick restarts. The heartbeat
 # is what the health check looks at; it lies in memory, where also a read-only container can write.
 ENV PATH=/opt/coec/bin:$PATH \

@@ -26,6 +26,7 @@ from coec.config import (
     load_config,
 )
 from coec.errors import RemoteError
+from coec.exit_codes import ExitCode
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas import last_word
 from coec.schemas.base import from_msgpack
@@ -41,7 +42,6 @@ SHORT_S = 12
 LATER_S = 60.0
 """When the second drive begins, after the first."""
 
-EXIT_THREAD_DIED = 70
 EXIT_TRY_AGAIN = 75
 FRONT, REAR = "sim", "rear"
 ERROR, STALE = 2, 3
@@ -239,7 +239,7 @@ def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
         )
         sweep = next(frame for frame in drive.frames if isinstance(frame, LidarFrame))
         router.session.put("sensors/sim/lidar", encode_lidar(sweep), encoding=MSGPACK)
-        assert running.process.wait(PATIENCE_S) == EXIT_THREAD_DIED
+        assert running.process.wait(PATIENCE_S) == ExitCode.FAULT
         subscriber.undeclare()
     health = from_msgpack(HealthReply, said[-1])
     (why,) = (reason for reason in health.reasons if reason.code == "thread_died")
@@ -364,5 +364,5 @@ def test_a_damaged_state_is_said_and_nominal_is_served(tmp_path: Path, drive: Dr
 @pytest.mark.fault("the depth network is not there", "a clear error")
 def test_a_missing_network_ends_the_service_with_a_clear_error(tmp_path: Path, drive: Drive, router: Router) -> None:
     with service(configured(tmp_path, drive, router, depth="absent.onnx"), router, warm=False) as running:
-        assert running.process.wait(PATIENCE_S) == 1
+        assert running.process.wait(PATIENCE_S) == ExitCode.CONFIGURATION
     assert "absent.onnx" in (tmp_path / "coec.log").read_text()

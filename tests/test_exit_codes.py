@@ -4,23 +4,45 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import re
+import shutil
+import signal
 import socket
+import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
+from ruamel.yaml import YAML
 
+from certificates import TestAuthority
 from coec import daemon
-from coec.cli.check_config import example
+from coec.cli import check_config
+from coec.cli.check_config import example, template
+from coec.cli.stopping import ended_by_sigterm
 from coec.config import Config, StateConfig, ZenohConfig
-from coec.errors import CoecError, ConfigError, UnavailableError
+from coec.daemon.service import exit_code_of
+from coec.daemon.state_folder import locked
+from coec.errors import CoecError, ConfigError
+from coec.exit_codes import MAY_BE_CURED, MEANINGS, NOT_CURED_BY_RESTART, ExitCode
 from conftest import REPOSITORY
+from deploy.written import compose
+from e2e.processes import COMMAND, PATIENCE_S, environment
+from fakes import wait_until
+from ports import free_port
 
 pytestmark = pytest.mark.usefixtures("process")
 UNIT = (REPOSITORY / "deploy" / "coec.service").read_text()
 TEMPFAIL = 75
+
+
+def every_error(base: type[CoecError]) -> Iterator[type[CoecError]]:
+    yield base
+    for below in base.__subclasses__():
+        yield from every_error(below)
 
 
 @pytest.fixture
@@ -44,12 +66,33 @@ def never_again() -> set[int]:
     return {int(code) for code in line.split()}
 
 
-@pytest.mark.fault("a bad configuration", "exit code 78: the unit gives up on it, and on nothing else")
-def test_the_unit_gives_up_on_a_bad_configuration_and_on_nothing_else() -> None:
-    ends = {CoecError.exit_code, UnavailableError.exit_code, daemon.EXIT_THREAD_DIED, ConfigError.exit_code}
-    assert ends & never_again() == {ConfigError.exit_code}
+@pytest.mark.fault("a bad configuration", "exit code 78: the unit gives up on it, and on nothing that may be cured")
+def test_the_unit_gives_up_on_what_no_restart_cures_and_on_nothing_else() -> None:
+    assert never_again() == NOT_CURED_BY_RESTART
     assert "Restart=on-failure" in UNIT
     assert re.search(r"^StartLimitIntervalSec=0$", UNIT, re.MULTILINE), "the fifth quick failure would be the last"
+
+
+def test_containers_are_started_again_as_the_page_says() -> None:
+    """Engines have no exit code after which they give up, and `on-failure` would not start at the next boot."""
+    assert {service["restart"] for service in compose().values()} == {"unless-stopped"}
+    page = (REPOSITORY / "docs" / "operations.md").read_text()
+    assert "`restart: unless-stopped`" in page
+    for code, meaning in MEANINGS.items():
+        again = "no" if code in never_again() else "yes" if code in MAY_BE_CURED else ""
+        assert re.search(rf"^\| {code.value} \| {re.escape(meaning)} \| {again} ?\|$", page, re.MULTILINE), code
+
+
+def test_every_exit_code_has_a_meaning() -> None:
+    assert set(MEANINGS) == set(ExitCode)
+
+
+@pytest.mark.parametrize("error", [*every_error(CoecError)], ids=lambda error: error.__name__)
+def test_a_service_never_ends_as_failed_work_does(error: type[CoecError]) -> None:
+    """Whatever error ends it: a person must see to it, or a later start may succeed."""
+    status = exit_code_of(error.__new__(error))
+    assert status in (ExitCode.CONFIGURATION, ExitCode.UNAVAILABLE)
+    assert error.exit_code not in (ExitCode.CONFIGURATION, ExitCode.UNAVAILABLE) or status == error.exit_code
 
 
 def test_a_reload_of_the_unit_is_the_signal_that_the_service_heeds() -> None:
@@ -65,12 +108,39 @@ def test_a_port_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("a state directory that is read-only or full at the start", "exit code 75: the unit tries again")
-def test_a_disk_that_takes_no_file_may_take_one_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("code", [errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO])
+def test_a_disk_that_takes_no_file_may_take_one_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
     def refused(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
+        raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(Path, "mkdir", refused)
     assert daemon.run(configured(tmp_path / "state", 0)) == TEMPFAIL
+
+
+@pytest.mark.fault("a disk that fills up while the service starts", "exit code 75: the unit tries again")
+@pytest.mark.parametrize("place", ["coec.daemon.service.WindowStore", "coec.daemon.service.StateStore"])
+def test_a_disk_that_is_full_when_the_state_is_opened_may_have_room_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(place, refused)
+    assert daemon.run(configured(tmp_path / "state", free_port())) == TEMPFAIL
+
+
+@pytest.mark.fault("another daemon has the state directory", "exit code 75: the unit tries again")
+def test_a_directory_that_another_daemon_has_may_be_free_later(tmp_path: Path) -> None:
+    with locked(tmp_path / "state"):
+        assert daemon.run(configured(tmp_path / "state", 0)) == TEMPFAIL
+
+
+def test_a_file_in_the_place_of_the_state_directory_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "state").touch()
+    assert daemon.run(configured(tmp_path / "state", 0)) == ExitCode.CONFIGURATION
+    assert daemon.run(configured(tmp_path / "state" / "below", 0)) == ExitCode.CONFIGURATION
 
 
 def test_an_endpoint_that_is_none_stays_none(tmp_path: Path) -> None:
@@ -83,3 +153,222 @@ def test_a_door_for_everybody_is_a_mistake_unless_spelled_out(tmp_path: Path) ->
     config = configured(tmp_path, 0)
     wide = config.zenoh.model_copy(update={"listen": ("tcp/0.0.0.0:0",)})
     assert daemon.run(config.model_copy(update={"zenoh": wide})) == ConfigError.exit_code
+
+
+# ------------------------------------------------------------------------------------------------ as whole processes
+UNPRIVILEGED = ("setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-dac_override,-dac_read_search")
+"""Root without the right to read what the mode of a file forbids."""
+
+
+def started(*arguments: object, log: Path) -> subprocess.Popen[bytes]:
+    """`coec ARGUMENTS` as a user whom the modes of files hold for; what it says is in `log`."""
+    prefix: Sequence[str] = () if os.geteuid() else UNPRIVILEGED
+    if prefix and shutil.which(prefix[0]) is None:
+        pytest.skip("needs setpriv (Debian: apt-get install util-linux), or another user than root")
+    with log.open("wb") as stream:
+        command = [*prefix, *COMMAND, *(str(argument) for argument in arguments)]
+        return subprocess.Popen(command, stdout=stream, stderr=stream, env=environment())
+
+
+def ended(*arguments: object, log: Path) -> int:
+    """Exit status of `coec ARGUMENTS`."""
+    process = started(*arguments, log=log)
+    try:
+        return process.wait(PATIENCE_S)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def written(folder: Path, **changes: Any) -> Path:
+    """The template with a state directory in the folder, and other values; `a__b` is the place `a.b`."""
+    document = YAML(typ="safe").load(template())
+    port = free_port()
+    document["zenoh"] |= {"embedded_router": True, "listen": [f"tcp/127.0.0.1:{port}"]}
+    document["state"] |= {"directory": str(folder / "state"), "min_free_bytes": 0}
+    document["pairs"][0]["calibration"]["depth"]["model"] = "stereo"
+    for place, value in changes.items():
+        *head, last = place.split("__")
+        inside = document
+        for name in head:
+            inside = inside[int(name)] if name.isdigit() else inside[name]
+        inside[last] = value
+    path = folder / "coec.yaml"
+    with path.open("w") as stream:
+        YAML().dump(document, stream)
+    return path
+
+
+def closed(path: Path) -> str:
+    """Takes every right to a file or folder; what a message about it must say."""
+    path.chmod(0)
+    return (
+        f"permission denied: {path} belongs to user {os.geteuid()}, group {os.getegid()}, with mode 0000, and this "
+        f"process has user {os.geteuid()}"
+    )
+
+
+NETWORK = "pairs__0__calibration__depth__model"
+
+
+def no_configuration(folder: Path, _: TestAuthority) -> str:
+    path = written(folder)
+    path.unlink()
+    return f"cannot read {path}: No such file or directory"
+
+
+def configuration_of_others(folder: Path, _: TestAuthority) -> str:
+    return closed(written(folder))
+
+
+def no_network(folder: Path, _: TestAuthority) -> str:
+    written(folder, **{NETWORK: "absent.onnx"})
+    return f"there is no depth network {folder / 'absent.onnx'}"
+
+
+def network_of_others(folder: Path, _: TestAuthority) -> str:
+    (folder / "own.onnx").touch()
+    written(folder, **{NETWORK: "own.onnx"})
+    return closed(folder / "own.onnx")
+
+
+def folder_of_networks_of_others(folder: Path, _: TestAuthority) -> str:
+    (folder / "networks").mkdir()
+    (folder / "networks" / "own.onnx").touch()
+    written(folder, **{NETWORK: "networks/own.onnx"})
+    return closed(folder / "networks")
+
+
+def mask_of_others(folder: Path, _: TestAuthority) -> str:
+    (folder / "mask.png").touch()
+    written(folder, pairs__0__camera__mask="mask.png")
+    return closed(folder / "mask.png")
+
+
+def own_certificates(folder: Path, authority: TestAuthority) -> TestAuthority:
+    shutil.copytree(authority.folder, folder / "tls")
+    return TestAuthority(folder / "tls")
+
+
+def key_of_others(folder: Path, authority: TestAuthority) -> str:
+    own = own_certificates(folder, authority)
+    written(folder, authority=own.of_service().model_dump(mode="json"))
+    return closed(own.folder / "vehicle-key.pem")
+
+
+def zenoh_key_of_others(folder: Path, authority: TestAuthority) -> str:
+    own = own_certificates(folder, authority)
+    file = own.session("vehicle", "tls/127.0.0.1:7448", "peer")
+    written(folder, zenoh={"file": str(file)})
+    return closed(own.folder / "vehicle-key.pem")
+
+
+def zenoh_key_of_another_certificate(folder: Path, authority: TestAuthority) -> str:
+    own = own_certificates(folder, authority)
+    shutil.copy(own.folder / "ros-key.pem", own.folder / "vehicle-key.pem")
+    written(folder, zenoh={"file": str(own.session("vehicle", "tls/127.0.0.1:7448", "peer"))})
+    return f"{own.folder / 'vehicle.pem'} and {own.folder / 'vehicle-key.pem'} are no certificate and its"
+
+
+def zenoh_file_that_is_a_folder(folder: Path, _: TestAuthority) -> str:
+    (folder / "session.json5").mkdir()
+    written(folder, zenoh={"file": "session.json5"})
+    return "it is a folder; container engines make one if the file to mount does not exist"
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        no_configuration,
+        configuration_of_others,
+        no_network,
+        network_of_others,
+        folder_of_networks_of_others,
+        mask_of_others,
+        key_of_others,
+        zenoh_key_of_others,
+        zenoh_key_of_another_certificate,
+        zenoh_file_that_is_a_folder,
+    ],
+    ids=lambda spoil: spoil.__name__,
+)
+@pytest.mark.fault(
+    "a file that a start needs is absent, or may not be read",
+    "`run` and `check-config` end with 78 alike and name the file, its mode, the user, and what to do",
+)
+def test_what_a_start_cannot_read_ends_run_and_check_config_alike(
+    tmp_path: Path, authority: TestAuthority, spoil: Any
+) -> None:
+    words, path = spoil(tmp_path, authority), tmp_path / "coec.yaml"
+    logs = {"check-config": tmp_path / "checked", "run": tmp_path / "ran"}
+    arguments = {"check-config": (path,), "run": ("--config", path)}
+    # Both at once: they wait for each other in nothing.
+    processes = {command: started(command, *arguments[command], log=log) for command, log in logs.items()}
+    try:
+        for command, process in processes.items():
+            code, said = process.wait(PATIENCE_S), logs[command].read_text()
+            assert (code, words in said.replace("\n", " ")) == (ExitCode.CONFIGURATION, True), said
+    finally:
+        for process in processes.values():
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.fault(
+    "a state directory that belongs to somebody else",
+    "exit code 78, with its owner, its mode, the user of the service, and what to do",
+)
+def test_a_state_directory_of_others_stays_theirs(tmp_path: Path) -> None:
+    path, log = written(tmp_path), tmp_path / "log"
+    (tmp_path / "state").mkdir()
+    words = closed(tmp_path / "state")
+    try:
+        assert ended("run", "--config", path, log=log) == ExitCode.CONFIGURATION
+    finally:
+        (tmp_path / "state").chmod(0o700)
+    assert words in log.read_text()
+
+
+def test_a_command_line_that_does_not_fit_never_does(tmp_path: Path) -> None:
+    assert ended("run", "--no-such-option", log=tmp_path / "log") in never_again()
+
+
+@pytest.mark.fault(
+    "the key of a router's certificate may not be read",
+    "the router ends with 78, and names the file, its mode, the user, and what to do",
+)
+def test_a_router_that_may_not_read_its_key_names_it(tmp_path: Path, authority: TestAuthority) -> None:
+    own, log = own_certificates(tmp_path, authority), tmp_path / "log"
+    text = (REPOSITORY / "deploy" / "router.json5").read_text().replace("/etc/zenoh/tls", str(own.folder))
+    (tmp_path / "router.json5").write_text(text.replace(":7447", f":{free_port()}").replace(":7448", f":{free_port()}"))
+    words = closed(own.folder / "router-key.pem")
+    assert ended("router", "--config", tmp_path / "router.json5", log=log) == ExitCode.CONFIGURATION
+    assert words in log.read_text().replace("\n", " ")
+
+
+@pytest.mark.fault("SIGTERM while the service starts, without a router", "exit code 0: it was stopped")
+def test_a_signal_during_the_start_is_a_stop(tmp_path: Path) -> None:
+    path, log = written(tmp_path, zenoh={"connect": [f"tcp/127.0.0.1:{free_port()}"]}), tmp_path / "log"
+    process = started("run", "--config", path, log=log)
+    try:
+        wait_until(
+            lambda: "the worker starts" in log.read_text() or process.poll() is not None, "the start", PATIENCE_S
+        )
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE_S) == ExitCode.SUCCESS, log.read_text()
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_signal_before_the_service_handles_it_is_a_stop() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ending, ended_by_sigterm():
+        signal.raise_signal(signal.SIGTERM)
+    assert ending.value.code == ExitCode.SUCCESS
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_check_config_of_the_template_of_these_tests_succeeds(tmp_path: Path) -> None:
+    """Without a fault, none is found."""
+    assert check_config.run(written(tmp_path), defaults=False, as_json=True) == ExitCode.SUCCESS

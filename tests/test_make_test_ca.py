@@ -16,6 +16,7 @@ from coec.adapters.tls.conversation import Listener, Speaker, credentials_of
 from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.config import AuthorityConfig, load_yaml
 from conftest import REPOSITORY
+from deploy.written import stages
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
 
@@ -32,10 +33,31 @@ def test_its_certificates_pass_the_strictest_look(authority: TestAuthority) -> N
         subprocess.run(command, cwd=authority.folder, check=True, capture_output=True)
 
 
-def test_keys_are_their_owners_alone(authority: TestAuthority) -> None:
+def test_keys_are_for_their_owner_and_group_alone(authority: TestAuthority) -> None:
     keys = list(authority.folder.glob("*-key.pem"))
     assert {f"{name}-key.pem" for name in (*NAMES, "ca")} <= {key.name for key in keys}
-    assert {stat.S_IMODE((authority.folder / f"{name}-key.pem").stat().st_mode) for name in NAMES} == {0o600}
+    assert {stat.S_IMODE((authority.folder / f"{name}-key.pem").stat().st_mode) for name in NAMES} == {0o640}
+    assert stat.S_IMODE((authority.folder / "ca-key.pem").stat().st_mode) == 0o600, "who has it is everybody"
+    assert {stat.S_IMODE((authority.folder / f"{name}.pem").stat().st_mode) for name in (*NAMES, "ca")} == {0o644}
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files to a group that it is not in")
+def test_the_group_of_the_image_may_read_the_keys(tmp_path: Path) -> None:
+    _, group = stages()[-1].last("USER").text.split(":")
+    for given, folder in ((int(group), tmp_path / "image"), (4711, tmp_path / "other")):
+        assert make(folder, **({} if given == int(group) else {"GROUP": str(given)})).returncode == 0
+        assert {key.stat().st_gid for key in folder.glob("*-key.pem") if key.name != "ca-key.pem"} == {given}
+        assert (folder / "ca-key.pem").stat().st_gid == os.getegid()
+
+
+def test_who_cannot_give_the_keys_to_the_image_is_shown_how(tmp_path: Path) -> None:
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    (tools / "chgrp").write_text("#!/bin/sh\nexit 1\n")
+    (tools / "chgrp").chmod(0o755)
+    told = make(tmp_path / "a folder", PATH=f"{tools}:{os.environ['PATH']}")
+    assert told.returncode == 0, told.stderr
+    assert re.search(r"sudo chgrp 10001 .*a\\ folder/\{router,vehicle,viewer\}-key\.pem", told.stdout)
 
 
 def test_what_it_says_is_a_configuration_that_can_be_used(tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
 
+from coec.exit_codes import ExitCode
 from coec.untrusted import Untrusted, printable
 
 MAX_MESSAGE = 4000
@@ -23,7 +26,7 @@ class CoecError(Exception):
         details: figures that `--json` gives beside the message, by name.
     """
 
-    exit_code = 1
+    exit_code = ExitCode.FAILED
     reply_code = "internal"
     details: Mapping[str, object] = {}
 
@@ -36,14 +39,14 @@ class CoecError(Exception):
 class UsageError(CoecError):
     """A command, selector or payload that does not fit its own grammar."""
 
-    exit_code = 2
+    exit_code = ExitCode.USAGE
     reply_code = "bad_request"
 
 
 class ConfigError(CoecError):
     """A configuration that cannot be used: unknown key, wrong type, value out of range, missing file."""
 
-    exit_code = 78  # EX_CONFIG of sysexits.h, so that systemd does not restart on it
+    exit_code = ExitCode.CONFIGURATION
     reply_code = "bad_configuration"
 
 
@@ -51,7 +54,7 @@ class UnavailableError(CoecError):
     """The service needs something that it cannot have now: the port, the state directory or the vehicle's place on
     the network is taken, absent or not writable. The configuration is right, and a later start may succeed."""
 
-    exit_code = 75  # EX_TEMPFAIL of sysexits.h: a service manager tries again
+    exit_code = ExitCode.UNAVAILABLE
     reply_code = "unavailable"
 
 
@@ -152,3 +155,45 @@ class NotProvenError(CoecError):
     """The sender has not shown a certificate that the service accepts."""
 
     reply_code = "not_proven"
+
+
+def cannot_read(path: Path, error: OSError, what: str = "") -> str:
+    """A sentence about a file that this process cannot read. If the permission is missing, it names what refuses it,
+    its owner and mode, the user of this process, and what to do. `what` says which file it is, as `mask`."""
+    named = f"cannot read {what} {path}" if what else f"cannot read {path}"
+    if isinstance(error, PermissionError):
+        return f"{named}: {permission_denied(path, 'r')}"
+    if isinstance(error, IsADirectoryError):
+        return f"{named}: it is a folder; container engines make one if the file to mount does not exist"
+    return f"{named}: {error.strerror or type(error).__name__}"
+
+
+def require_readable(path: Path, where: str) -> None:
+    """Checks that this process can read a file that the configuration names at `where`.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    try:
+        with path.open("rb"):
+            pass
+    except FileNotFoundError:
+        raise ConfigError(f"{where}: there is no file {path}") from None
+    except OSError as error:
+        raise ConfigError(f"{where}: {cannot_read(path, error)}") from None
+
+
+def permission_denied(path: Path, access: str) -> str:
+    """Who is refused by what, and how to permit it. `access` is `r` for a file to read, `rwx` for a folder to write."""
+    folders = [folder for folder in reversed(path.parents) if folder.is_dir() and not os.access(folder, os.X_OK)]
+    refusing, needed = (folders[0], "x") if folders else (path, access)
+    user, group = os.geteuid(), os.getegid()
+    try:
+        status = refusing.stat()
+    except OSError:
+        return f"permission denied for user {user}, group {group}; see to the owner and the mode of {refusing}"
+    return (
+        f"permission denied: {refusing} belongs to user {status.st_uid}, group {status.st_gid}, with mode "
+        f"{status.st_mode & 0o7777:04o}, and this process has user {user}, group {group}; permit it, for example with "
+        f"`chgrp {group} {refusing} && chmod g+{needed} {refusing}`"
+    )

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 import coec
-from coec import daemon
-from coec.cli import exit_codes, pages
+from coec.cli import pages
 from coec.errors import CoecError
+from coec.exit_codes import MEANINGS, ExitCode
 from coec.runtime.api.troubles import TROUBLES
 from coec.runtime.edges.plan import NOT_INSTALLED
 from conftest import REPOSITORY
@@ -48,8 +48,8 @@ def all_errors(base: type[CoecError]) -> Iterator[type[CoecError]]:
 
 def test_every_way_to_end_is_in_the_table() -> None:
     codes = {error.exit_code for error in all_errors(CoecError)}
-    others = {exit_codes.SUCCESS, daemon.EXIT_THREAD_DIED, exit_codes.INTERRUPTED, exit_codes.BROKEN_PIPE}
-    assert codes | others == set(exit_codes.EXIT_CODES)
+    others = {ExitCode.SUCCESS, ExitCode.FAULT, ExitCode.INTERRUPTED, ExitCode.BROKEN_PIPE}
+    assert codes | others == set(MEANINGS) == set(ExitCode)
 
 
 def reasons_made() -> set[str]:

@@ -6,7 +6,6 @@ import dataclasses
 import getpass
 import hashlib
 import json
-import re
 import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -157,19 +156,14 @@ def test_what_is_no_question_is_a_usage_error_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.fault("the health check of the container image", "its command works as it is written")
-def test_the_health_check_of_the_image_asks_the_service_of_its_configuration(
+def test_the_configuration_of_a_service_says_where_it_is_asked(
     coec: Coec, vehicle: str, endpoint: str, tmp_path: Path
 ) -> None:
-    (written,) = re.findall(r"HEALTHCHECK .*?CMD (\[.*?\])", (REPOSITORY / "Dockerfile").read_text(), re.DOTALL)
-    program, *arguments = json.loads(written)
-    assert program == "coec"
     shipped = (REPOSITORY / "deploy" / "coec.yaml").read_text()
-    mounted = tmp_path / "coec.yaml"
-    typed = [str(mounted) if argument == "/etc/coec/coec.yaml" else argument for argument in arguments]
+    config = tmp_path / "coec.yaml"
     for router, status in ((vehicle, 0), (endpoint, 1)):
-        mounted.write_text(shipped.replace("tcp/127.0.0.1:7447", router))
-        assert coec(*typed).status == status
+        config.write_text(shipped.replace("tcp/127.0.0.1:7447", router))
+        assert coec("query", "status", "--config", str(config)).status == status
 
 
 def test_what_is_typed_comes_before_the_configuration(coec: Coec, vehicle: str, endpoint: str, tmp_path: Path) -> None:

@@ -210,8 +210,8 @@ def test_nothing_stands_in_an_example_that_need_not(path: Path) -> None:
 
 # ------------------------------------------------------------------------------------------------------ the wheel
 def test_the_wheel_of_the_dockerfile_runs_beside_the_packages_of_this_environment(tmp_path: Path) -> None:
-    """The short form of what `test_vehicle` builds from nothing: the wheel by its own command, then the image's health
-    check, of a configuration that is not there."""
+    """The short form of what `test_vehicle` builds from nothing: the wheel by its own command, then what the image
+    starts, of a configuration that is not there."""
     (build,) = [step.text for step in stages()[0].steps if "hatchling build" in step.text]
     context = tmp_path / "build"
     context.mkdir()
@@ -226,6 +226,6 @@ def test_the_wheel_of_the_dockerfile_runs_beside_the_packages_of_this_environmen
     assert (target / "coec" / "adapters" / "depth" / "cards" / "street.onnx").is_file()
     program = f"import sys; sys.path.insert(0, {str(target)!r}); from coec.cli import main; sys.exit(main())"
     checked = [sys.executable, "-I", "-c", program]
-    ended = subprocess.run([*checked, *stages()[-1].health_check[1:]], capture_output=True, text=True, cwd=tmp_path)
+    ended = subprocess.run([*checked, *stages()[-1].last("CMD").words()], capture_output=True, text=True, cwd=tmp_path)
     assert ended.returncode == ConfigError.exit_code
     assert "cannot read /etc/coec/coec.yaml" in ended.stderr

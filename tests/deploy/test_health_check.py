@@ -117,7 +117,7 @@ def test_a_service_that_ends_takes_its_heartbeat_along(heartbeat: Path) -> None:
 def test_no_health_check_that_runs_often_starts_an_interpreter() -> None:
     image = stages()[-1]
     assert image.environment["COEC_HEARTBEAT_FILE"].startswith("/dev/shm/"), "memory, of the container's own"
-    assert any(step.text == "deploy/check-live /usr/local/bin/check-live" for step in image.steps)
+    assert any(step.text == "deploy/check-live /opt/coec/bin/check-live" for step in image.steps)
     commands = {"image": image.health_check, "router": compose()["router"]["healthcheck"]["test"]}
     for name, command in commands.items():
         assert not {"python", "coec"} & set(command), name

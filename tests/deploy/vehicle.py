@@ -198,7 +198,8 @@ def prepare(*, build: bool) -> None:
                 source = Path("/etc/made") / Path(origin).name if "/tls/" in origin else DEPLOY / origin
                 Path(target).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy(source, target)
-                os.chown(target, *owner_of_image())
+                # A mounted file keeps its owner: who may read the keys is for `make-test-ca` to see to.
+                os.chown(target, source.stat().st_uid, source.stat().st_gid)
     kernels = kernel_cache_directory(Path(geometry.__file__).parent)
     if not build:
         # Compiling them is no part of what is looked at.

@@ -15,7 +15,7 @@ from baselines import a_baseline
 from coec.adapters.files.baseline_file import BASELINES, load_baseline, save_baseline
 from coec.adapters.files.scribe import Scribe
 from coec.daemon.state_folder import locked
-from coec.errors import UnavailableError
+from coec.errors import ConfigError, UnavailableError
 from coec.runtime.decisions.rig_baseline import RigBaseline
 from coec.runtime.rig.rig_file import FILE as RIG_FILE
 from fakes import wait_until
@@ -196,7 +196,7 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
     folder = tmp_path / "state"
     folder.mkdir()
     (folder / "lock").symlink_to(other)
-    with pytest.raises(UnavailableError, match="Too many levels of symbolic links"), locked(folder):
+    with pytest.raises(ConfigError, match="Too many levels of symbolic links"), locked(folder):
         pass
     assert other.read_bytes() == b"kept"
 

@@ -1,7 +1,7 @@
 """The command line. `commands` declares the options of each command; the module of the same name here does its work.
 
-Exit codes (CONTRACT, "Command line") are those of `exit_codes`. With `--json`, standard output holds one JSON document
-and nothing else.
+Exit codes (CONTRACT, "Command line") are those of `coec.exit_codes`. With `--json`, standard output holds one JSON
+document and nothing else.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import Annotated, Any
 import typer
 
 from coec.cli.declaring import taking
-from coec.cli.exit_codes import BROKEN_PIPE, FAULT
 from coec.cli.stopping import no_interrupt_lost
 from coec.errors import CoecError, UsageError
+from coec.exit_codes import ExitCode
 from coec.reports import plain_text
 from coec.untrusted import json_printable
 
@@ -133,7 +133,7 @@ def main() -> int:
             plain_text.write("coec: interrupted\n", on_error=True)
             if as_json:
                 _print_error("interrupted", "ended by Ctrl-C before there was a result")
-        if status == UsageError.exit_code and as_json:
+        if status == ExitCode.USAGE and as_json:
             _print_error("bad_request", "the command line does not fit; standard error says how")
         return status
     except CoecError as error:
@@ -148,18 +148,18 @@ def main() -> int:
             sys.stdout = None
             message = f"coec: cannot write: {error.strerror}; make room where the output goes\n"
             plain_text.write(message, on_error=True)
-            return CoecError.exit_code
+            return ExitCode.FAILED
         plain_text.write_traceback(error)
         if as_json:
             _print_error("internal", f"{type(error).__name__}: {error}")
-        return FAULT
+        return ExitCode.FAULT
     return 0
 
 
 def _unread() -> int:
     """The reader of our output has gone, so nothing more is printed, not even by the interpreter at its exit."""
     sys.stdout = None
-    return BROKEN_PIPE
+    return ExitCode.BROKEN_PIPE
 
 
 def _with_signs_of(encoding: str, command: Any) -> None:

@@ -21,7 +21,7 @@ from coec.config import (
     config_hash,
     load_config,
 )
-from coec.errors import ConfigError, ModelError, UsageError
+from coec.errors import ConfigError, ModelError, UsageError, require_readable
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
 
@@ -124,6 +124,5 @@ def _check_network(pair: OpenPairConfig, config: Config) -> str:
 
 
 def _check_file(path: Path, key: str) -> str:
-    if not path.is_file():
-        raise ConfigError(f"{key}: there is no file {path}")
+    require_readable(path, key)
     return f"{key} {path}"

@@ -10,12 +10,12 @@ from rich.progress import Progress
 from coec.adapters.files import output
 from coec.cli.chosen import choices_of
 from coec.cli.commands.evaluate import Options
-from coec.cli.exit_codes import INTERRUPTED
 from coec.cli.lens_refusal import drawn_if_refused
 from coec.config import WindowConfig
 from coec.errors import CalibrationError
 from coec.evaluation.experiments import Stages
 from coec.evaluation.statistics import Outcome
+from coec.exit_codes import ExitCode
 from coec.library.evaluating import Plan, Subject, bench_of, report_of, subject_of, tried
 from coec.reports import console, evaluation_tables, page, provenance
 from coec.reports.evaluation_page import comparison_page, evaluation_page
@@ -66,7 +66,7 @@ def run(options: Options) -> int:
         page.write(options.output / "report.html", told())
     if document.interrupted:
         console.say("coec: interrupted: the figures are of what was finished")
-    return INTERRUPTED if document.interrupted else 0
+    return ExitCode.INTERRUPTED if document.interrupted else 0
 
 
 def plan_of(options: Options) -> Plan:

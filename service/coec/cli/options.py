@@ -21,7 +21,14 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on s
 Force = Annotated[bool, typer.Option("--force", help="Overwrite files that are there already.")]
 Source = Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP, show_default=False)]
 ConfigFile = Annotated[
-    Path, typer.Option("--config", help="Configuration of the daemon (YAML).", metavar="FILE", show_default=False)
+    Path,
+    typer.Option(
+        "--config",
+        help="Configuration of the daemon (YAML).",
+        metavar="FILE",
+        show_default=False,
+        readable=False,  # whoever reads it says what is wrong, and ends with 78
+    ),
 ]
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
 """The same as in `config`, which takes too long to import for a help text."""
@@ -81,7 +88,12 @@ Vehicle = Annotated[str | None, typer.Option(help="Name of the vehicle.", show_d
 Prefix = Annotated[str | None, typer.Option(help="Prefix of all keys.", show_default="coec")]
 SessionFile = Annotated[
     Path | None,
-    typer.Option("--zenoh", help="Zenoh configuration of the session (JSON5): endpoint, certificate.", metavar="FILE"),
+    typer.Option(
+        "--zenoh",
+        help="Zenoh configuration of the session (JSON5): endpoint, certificate.",
+        metavar="FILE",
+        readable=False,  # as `ConfigFile`
+    ),
 ]
 RouterTimeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the router.", min=0.01)]
 

@@ -17,8 +17,8 @@ def run(file: Path) -> int:
     """Routes until told to stop.
 
     Raises:
-        ConfigError: the configuration cannot be used.
-        UnavailableError: a port is taken, or a certificate cannot be used.
+        ConfigError: the configuration, or a certificate that it names, cannot be used.
+        UnavailableError: a port is taken.
     """
     logs.configure("info", "auto")
     notifier = Notifier.from_environment()

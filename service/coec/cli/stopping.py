@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from coec.exit_codes import ExitCode
+
 
 @contextmanager
 def until_signal() -> Iterator[threading.Event]:
@@ -26,6 +28,22 @@ def until_signal() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def ended_by_sigterm() -> Iterator[None]:
+    """Ends the process with success on SIGTERM while a service is loaded, before it handles signals itself. The first
+    process of a container has no default for a signal: the kernel would drop it, and the engine would wait for nothing.
+    """
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        sys.exit(ExitCode.SUCCESS)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 LATER_S = 0.05

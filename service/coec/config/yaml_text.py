@@ -9,7 +9,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-from coec.errors import ConfigError
+from coec.errors import ConfigError, cannot_read
 
 MAX_YAML_BYTES = 2**20
 """Largest YAML file: enough for the 10,000 frames of a manifest, and for far more than the allowed pairs. A file of
@@ -35,7 +35,7 @@ def load_yaml(path: Path) -> Any:
         with path.open("rb") as stream:
             data = stream.read(MAX_YAML_BYTES + 1)
     except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+        raise ConfigError(cannot_read(path, error)) from error
     if not data.strip():
         raise ConfigError(f"{path} is empty")
     try:

@@ -10,11 +10,10 @@ from coec.adapters.system import logs
 from coec.adapters.system.notify import Notifier
 from coec.config import Config
 from coec.daemon.asked import received
-from coec.daemon.service import EXIT_THREAD_DIED, Daemon
+from coec.daemon.service import Daemon, exit_code_of
 from coec.daemon.state_folder import locked
-from coec.errors import CoecError
-
-__all__ = ["EXIT_THREAD_DIED", "run"]
+from coec.errors import CoecError, UnavailableError
+from coec.exit_codes import ExitCode
 
 _log = logging.getLogger(__name__)
 
@@ -32,4 +31,8 @@ def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
             return Daemon(config, Notifier.from_environment(), lock).serve(signals, reread)
     except CoecError as error:
         _log.error(str(error), extra={"fields": {"code": error.reply_code}})
-        return error.exit_code
+        return exit_code_of(error)
+    except OSError as error:
+        # Of the disk, as what it says is not foreseen: a full one, a failing one.
+        _log.exception(f"the service cannot start: {error}", extra={"fields": {"code": UnavailableError.reply_code}})
+        return ExitCode.UNAVAILABLE

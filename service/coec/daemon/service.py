@@ -30,7 +30,8 @@ from coec.config import AuthorityConfig, Config, config_hash
 from coec.daemon.asked import Signals
 from coec.daemon.ending import attempt, joined, stopped
 from coec.daemon.state_folder import FolderLock
-from coec.errors import CoecError, UnavailableError
+from coec.errors import CoecError, ConfigError, ModelError, UsageError
+from coec.exit_codes import ExitCode
 from coec.runtime.api import metrics
 from coec.runtime.api.authority import Authority
 from coec.runtime.api.awaited import AwaitedAnswers, AwaitedCommands
@@ -72,9 +73,6 @@ from coec.schemas.keys import Keys
 
 _log = logging.getLogger(__name__)
 
-EXIT_THREAD_DIED = 70
-"""EX_SOFTWARE of sysexits.h."""
-
 TOKENS_HIDDEN = Reason(
     "tokens_hidden",
     "The router hides the liveliness tokens of this vehicle: a second daemon could serve it unseen. Its rules must "
@@ -97,6 +95,14 @@ start gets no more time."""
 # With these time limits, and because the worker is killed, the service ends in less than 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, RIG_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 0.5, 1.5
 QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
+
+
+def exit_code_of(error: CoecError) -> ExitCode:
+    """The exit status of a service that ends with an error: whether a later start may succeed or only a person can cure
+    it. What commands report as failed work, such as a folder of windows that cannot be made, is a matter of the disk
+    here."""
+    wrong = isinstance(error, ConfigError | ModelError | UsageError)
+    return ExitCode.CONFIGURATION if wrong else ExitCode.UNAVAILABLE
 
 
 class Daemon:
@@ -192,10 +198,10 @@ class Daemon:
                     self._reload(reread)
         except CoecError as error:
             _log.error(str(error), extra={"fields": {"code": error.reply_code}})
-            status = error.exit_code
+            status = exit_code_of(error)
         except Exception:
             _log.exception("the main loop failed")
-            status = EXIT_THREAD_DIED
+            status = ExitCode.FAULT
         finally:
             if not self._stop():
                 logging.shutdown()
@@ -292,8 +298,9 @@ class Daemon:
         self._renew()
         if self._fault is not None:
             if dead:
-                return EXIT_THREAD_DIED
-            return CoecError.exit_code if self._presence.rival is None else UnavailableError.exit_code
+                return ExitCode.FAULT
+            # Without a rival it is the worker that cannot use the configuration.
+            return ExitCode.CONFIGURATION if self._presence.rival is None else ExitCode.UNAVAILABLE
         if all(thread.silence_s < STALLED_S for thread in self._prompt_threads()):
             self._progress_s = time.monotonic()
             self._notifier.watchdog(None if self._door.server is None else self._config.metrics.address)

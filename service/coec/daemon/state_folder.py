@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import logging
 import os
@@ -11,11 +12,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from coec.adapters.files import durable
-from coec.errors import StateError, UnavailableError
+from coec.errors import ConfigError, StateError, UnavailableError, permission_denied
 
 _log = logging.getLogger(__name__)
 
 LOCK = "lock"
+
+NO_DIRECTORY = frozenset({errno.ENOTDIR, errno.EEXIST, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.EISDIR})
+"""Errors that say that a path cannot be that of a state directory, whatever the disk does later."""
 
 FORBIDDEN = 0o777 & ~durable.PRIVATE_FOLDER
 """Permissions that nothing in the state directory may have: writing for the group, anything for other users."""
@@ -30,14 +34,20 @@ def locked(folder: Path) -> Iterator[FolderLock]:
     its files what other users of the machine may do with them.
 
     Raises:
-        UnavailableError: the directory cannot be made or written, or another daemon uses it.
+        ConfigError: this user may not make or write the directory, or its path cannot be that of a directory.
+        UnavailableError: the disk refuses it (full, read-only, failing), or another daemon uses it.
     """
     try:
         durable.make_folder(folder)
         lock = FolderLock(folder)
     except OSError as error:
-        text = f"state.directory {folder} cannot be made or written: {error.strerror}; see to its disk and its owner"
-        raise UnavailableError(text) from error
+        what = f"state.directory {folder} cannot be made or written"
+        if isinstance(error, PermissionError):
+            existing = next(place for place in (folder, *folder.parents) if os.path.exists(place))  # noqa: PTH110
+            raise ConfigError(f"{what}: {permission_denied(existing, 'rwx')}") from error
+        if error.errno in NO_DIRECTORY:
+            raise ConfigError(f"{what}: {error.strerror}; name another directory") from error
+        raise UnavailableError(f"{what}: {error.strerror}; see to its disk") from error
     try:
         tightened = close_to_others(folder)
         if tightened:

@@ -15,7 +15,7 @@ from typing import Any
 from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.zenoh.settings import settings_of
 from coec.config import Config, OpenPairConfig, PairConfig, config_hash
-from coec.errors import ConfigError
+from coec.errors import require_readable
 
 RELOADED: Mapping[str, str] = {
     "log.*": "at once in the service; its worker logs as it was started until the next start",
@@ -85,8 +85,8 @@ def reload_of(running: Config, read: Config) -> Reload:
 def _network_of(pair: OpenPairConfig) -> None:
     """Checks only that the file exists: the worker opens networks, this process never does."""
     model = pair.calibration.depth.model
-    if model.endswith(".onnx") and not Path(model).is_file():
-        raise ConfigError(f"pair {pair.name}, calibration.depth.model: there is no file {model}")
+    if model.endswith(".onnx"):
+        require_readable(Path(model), f"pair {pair.name}, calibration.depth.model")
 
 
 def settings_hash(pair: PairConfig) -> str:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections import OrderedDict
 
 from coec.adapters.depth.model_cards import built_in_cards, find_card
-from coec.adapters.depth.network_files import absence, file_of
+from coec.adapters.depth.network_files import absence, file_of, places_of
 from coec.adapters.files.home import from_home
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import decode_depth
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import CameraFrame, DepthMap
 from coec.config import DepthConfig, LimitsConfig
-from coec.errors import DecodeError, ModelError
+from coec.errors import DecodeError, ModelError, permission_denied
 
 STEREO = "stereo"
 """Value of `DepthConfig.model` that stands for the maps that come with the frames."""
@@ -99,14 +100,19 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
     if config.model == STEREO:
         return PrecomputedDepth(limits)
     named = built_in_cards().get(config.model)
-    path = from_home(config.model) if named is None else file_of(named)
-    if named is not None and path is None:
-        raise ModelError(absence(named))
-    if path is None or not path.is_file():
+    places = (from_home(config.model),) if named is None else places_of(named)
+    # Of a path below a folder that may not be searched, pathlib raises an error.
+    path = next((place for place in places if os.path.isfile(place)), None)  # noqa: PTH113
+    if path is None:
+        for place in places:
+            if os.path.isdir(place.parent) and not os.access(place.parent, os.X_OK):  # noqa: PTH112
+                raise ModelError(f"depth network {place}: {permission_denied(place, 'r')}")
+        if named is not None:
+            raise ModelError(absence(named))
         present = [card.name for card in built_in_cards().values() if file_of(card) is not None]
         raise ModelError(
-            f"there is no depth network {path}: give an ONNX file, `{STEREO}` for the maps that come with the frames, "
-            f"or the name of a network whose file is on this machine: {', '.join(present)}. `coec models` lists all, "
+            f"there is no depth network {places[0]}: give an ONNX file, `{STEREO}` for the maps that come with the "
+            f"frames, or the name of a network whose file is on this machine: {', '.join(present)}. `coec models` lists all, "
             "and where the others come from"
         )
     own, identity = file_identity(path)

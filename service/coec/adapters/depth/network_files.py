@@ -32,7 +32,8 @@ def places_of(card: ModelCard) -> tuple[Path, ...]:
 
 def file_of(card: ModelCard) -> Path | None:
     """The file of a network on this machine; None if it is at none of the places."""
-    return next((path for path in places_of(card) if path.is_file()), None)
+    # Of a path below a folder that may not be searched, pathlib raises an error.
+    return next((path for path in places_of(card) if os.path.isfile(path)), None)  # noqa: PTH113
 
 
 def absence(card: ModelCard) -> str:

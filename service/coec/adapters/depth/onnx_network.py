@@ -18,7 +18,7 @@ from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import decode_bgr
 from coec.calibration.types import CameraFrame, DepthMap
 from coec.config import LimitsConfig
-from coec.errors import DecodeError, ModelError
+from coec.errors import DecodeError, ModelError, cannot_read
 
 logger = logging.getLogger(__name__)
 
@@ -207,7 +207,7 @@ def file_identity(path: Path) -> tuple[str, str]:
             if sibling.name.startswith((f"{path.name}.", f"{path.name}_")) and sibling.is_file():
                 _feed(digest, sibling)
     except OSError as error:
-        raise ModelError(f"cannot read the depth network {error.filename}: {error.strerror}") from error
+        raise ModelError(cannot_read(Path(error.filename), error, "the depth network")) from error
     return own, digest.hexdigest()
 
 

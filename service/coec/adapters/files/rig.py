@@ -26,7 +26,7 @@ from coec.config import (
     SweepConfig,
     describe,
 )
-from coec.errors import ConfigError, DecodeError, WindowError
+from coec.errors import ConfigError, DecodeError, WindowError, cannot_read, require_readable
 from coec.geometry import cameras, se3
 
 NOT_ALWAYS_THERE = ("sweep", "cloud")
@@ -102,8 +102,8 @@ def check_given(pair: OpenPairConfig) -> None:
     where = f"pair {pair.name}"
     if pair.camera.intrinsics is not None:
         _camera(pair.camera.intrinsics, f"{where}, camera.intrinsics")
-    if pair.camera.mask is not None and not pair.camera.mask.is_file():
-        raise ConfigError(f"{where}, camera.mask: there is no file {pair.camera.mask}")
+    if pair.camera.mask is not None:
+        require_readable(pair.camera.mask, f"{where}, camera.mask")
     matrices = {
         "T_camera_lidar": pair.T_camera_lidar,
         "lidar.T_cloud_lidar": pair.lidar.T_cloud_lidar,
@@ -144,7 +144,7 @@ def load_mask(path: Path, camera: cameras.Camera) -> NDArray[np.bool_]:
     try:
         return mask_from_image(path.read_bytes(), camera)
     except OSError as error:
-        raise ConfigError(f"cannot read mask {path}: {error.strerror}") from error
+        raise ConfigError(cannot_read(path, error, "mask")) from error
     except DecodeError as error:
         raise ConfigError(f"mask {path}: {error}") from error
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.config import AuthorityConfig
-from coec.errors import CoecError, ConfigError, NotProvenError
+from coec.errors import CoecError, ConfigError, NotProvenError, cannot_read
 
 WAITED_S = 5.0
 """How long the listener waits for the second question; a later one is refused. A carrier that holds a question back
@@ -241,6 +241,7 @@ def _sealing(line: _Line) -> Callable[[bytes], bytes]:
 
 
 def _context(credentials: Credentials, protocol: int) -> ssl.SSLContext:
+    _digest(credentials)  # names a file that cannot be read, which OpenSSL does not
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
@@ -261,7 +262,7 @@ def _digest(credentials: Credentials) -> str:
         try:
             digest.update(hashlib.sha256(path.read_bytes()).digest())
         except OSError as error:
-            raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+            raise ConfigError(cannot_read(path, error)) from None
     return digest.hexdigest()
 
 

@@ -95,7 +95,7 @@ def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
 
     Raises:
         ConfigError: as `settings_of`.
-        UnavailableError: a port is taken, an address is not there, or a certificate cannot be used.
+        UnavailableError: a port is taken, or an address is not there.
     """
     zenoh.init_log_from_env_or("error")
     settings = settings_of(config, limits)

@@ -15,6 +15,7 @@ from pathlib import Path
 import zenoh
 
 from coec.adapters.zenoh.endpoints import redacted
+from coec.adapters.zenoh.settings import check_certificates
 from coec.adapters.zenoh.settings_file import read_settings
 from coec.errors import ConnectionFailedError, DecodeError, NotFoundError, RemoteError, UsageError
 from coec.schemas.base import from_json, from_msgpack
@@ -103,7 +104,7 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int = MAX_MESSAGE_B
 
     Raises:
         UsageError: an endpoint is malformed.
-        ConfigError: the file cannot be used.
+        ConfigError: the file, or a certificate that it names, cannot be used.
         ConnectionFailedError: no router answered within `wait_s`.
     """
     settings = zenoh.Config() if way.file is None else read_settings(way.file)
@@ -123,6 +124,7 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int = MAX_MESSAGE_B
     settings.insert_json5("timestamping/enabled", "true")
     try:
         settings.insert_json5("connect/endpoints", json.dumps(way.endpoints))
+        check_certificates(settings, str(way.file or "--connect"))
         session = zenoh.open(settings)
     except (zenoh.ZError, ValueError) as error:
         asked = ", ".join(redacted(endpoint) for endpoint in way.endpoints)

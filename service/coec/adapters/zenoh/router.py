@@ -7,7 +7,7 @@ from pathlib import Path
 import zenoh
 
 from coec.adapters.zenoh.endpoints import without_secrets
-from coec.adapters.zenoh.settings import mode_of, unguarded
+from coec.adapters.zenoh.settings import check_certificates, mode_of, unguarded
 from coec.adapters.zenoh.settings_file import read_settings
 from coec.errors import ConfigError, UnavailableError
 
@@ -18,13 +18,14 @@ def open_router(file: Path) -> zenoh.Session:
     """A session that routes between all clients by the rules of the file, until it is closed.
 
     Raises:
-        ConfigError: the file cannot be used, is not a router's, or lets anybody in.
-        UnavailableError: a port is taken, an address is not there, or a certificate cannot be used.
+        ConfigError: the file cannot be used, is not a router's, or lets anybody in, or a certificate cannot be used.
+        UnavailableError: a port is taken, or an address is not there.
     """
     zenoh.init_log_from_env_or("error")
     settings = read_settings(file)
     if mode_of(settings) != ROUTER:
         raise ConfigError(f'{file}: its mode is {mode_of(settings)}: a router says `mode: "router"`')
+    check_certificates(settings, str(file))
     doors = unguarded(settings)
     if doors:
         raise ConfigError(

@@ -8,8 +8,9 @@ from typing import Any
 
 import zenoh
 
-from coec.adapters.zenoh.endpoints import Endpoint, redacted, without_secrets
+from coec.adapters.zenoh.endpoints import CERTIFIED, Endpoint, redacted, without_secrets
 from coec.adapters.zenoh.settings_file import TLS, read_settings
+from coec.adapters.zenoh.tls import Role, check_material, material_of
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
 
@@ -23,8 +24,8 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
     listens and searches for others only if told to.
 
     Raises:
-        ConfigError: the file or an endpoint cannot be used, or an endpoint lets anybody in and `config.insecure` is not
-            set.
+        ConfigError: the file, an endpoint or a certificate cannot be used, or an endpoint lets anybody in and
+            `config.insecure` is not set.
     """
     listen = config.listen if config.embedded_router else ()
     connect = tuple(endpoint for endpoint in config.connect if endpoint not in listen)
@@ -52,6 +53,7 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
         settings.insert_json5("transport/shared_memory/enabled", "false")
     except (zenoh.ZError, ValueError) as error:
         raise ConfigError(f"{where(config)}: {without_secrets(str(error), endpoints_of(config))}") from None
+    check_certificates(settings, where(config))
     doors = unguarded(settings)
     if doors and not config.insecure:
         raise ConfigError(
@@ -60,6 +62,23 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
             "`zenoh.insecure: true`, and health will say so"
         )
     return settings
+
+
+def check_certificates(settings: zenoh.Config, place: str) -> None:
+    """Checks that this process can read the certificates and keys of a session, which Zenoh reports without their
+    names, and that each key belongs to its certificate. `place` stands before the message.
+
+    Raises:
+        ConfigError: a file cannot be used; names it.
+    """
+    roles: tuple[tuple[Role, tuple[str, ...]], ...] = (
+        ("listen", listened_of(settings)),
+        ("connect", connected_of(settings)),
+    )
+    for role, endpoints in roles:
+        for endpoint in map(Endpoint.parse, endpoints):
+            if endpoint.protocol in CERTIFIED:
+                check_material(material_of(settings, endpoint, role), f"{place}, {TLS}")
 
 
 def unguarded(settings: zenoh.Config) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import zenoh
 
 from coec.adapters.tls.conversation import Credentials
 from coec.adapters.zenoh.endpoints import HIDDEN
-from coec.errors import ConfigError
+from coec.errors import ConfigError, cannot_read
 
 TLS = "transport/link/tls"
 
@@ -37,7 +37,7 @@ def read_settings(path: Path) -> zenoh.Config:
             data = stream.read(MAX_BYTES + 1)
         text = data.decode("utf-8")
     except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+        raise ConfigError(cannot_read(path, error)) from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path} is no text in UTF-8") from None
     brackets = text.count("{") + text.count("[")

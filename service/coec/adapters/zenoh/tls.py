@@ -15,9 +15,13 @@ import zenoh
 
 from coec.adapters.zenoh.endpoints import Endpoint
 from coec.adapters.zenoh.settings_file import TLS
+from coec.errors import ConfigError, require_readable
 
 X509_V_FLAG_NO_CHECK_TIME = 0x200000
 """OpenSSL flag: do not check the validity period, so that an expired certificate can be read, too."""
+
+Role = Literal["connect", "listen"]
+"""Which end of a link an endpoint is."""
 
 HEARD_OUT_S = 0.5
 """How long to listen after the handshake, s: in TLS 1.3 the other end refuses a certificate only after it, if at
@@ -55,7 +59,7 @@ class CertificateError(Exception):
     """A certificate cannot be used; says why."""
 
 
-def material_of(settings: zenoh.Config, endpoint: Endpoint, role: Literal["connect", "listen"]) -> Material:
+def material_of(settings: zenoh.Config, endpoint: Endpoint, role: Role) -> Material:
     """The files for an endpoint to connect to or listen on. What the endpoint sets itself overrides the common TLS
     settings."""
     of_all: Mapping[str, Any] = json.loads(settings.get_json(TLS))
@@ -74,7 +78,27 @@ def material_of(settings: zenoh.Config, endpoint: Endpoint, role: Literal["conne
     )
 
 
-def read_certificate(material: Material, role: Literal["connect", "listen"]) -> Certificate:
+def check_material(material: Material, where: str) -> None:
+    """Checks that this process can read the files of one end of a link, and that the key belongs to the certificate.
+    Validity periods are left to Zenoh: at a start the clock may not be set yet.
+
+    Raises:
+        ConfigError: it is not so; names the file.
+    """
+    files = [path for path in (material.authority, material.certificate, material.key) if path is not None]
+    for path in files:
+        require_readable(path, where)
+    if material.certificate is None or material.key is None:
+        return
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(material.certificate, material.key, password="")
+    except (OSError, ValueError) as error:
+        why = _words(error) if isinstance(error, ssl.SSLError) else str(error)
+        both = f"{material.certificate} and {material.key}"
+        raise ConfigError(f"{where}: {both} are no certificate and its unencrypted key in PEM: {why}") from None
+
+
+def read_certificate(material: Material, role: Role) -> Certificate:
     """The certificate of the material, which must be signed by its authority and fit its key. The caller has to check
     whether it has expired.
 

@@ -15,7 +15,9 @@ from coec.cli.options import Json
 class Options:
     """The arguments of the command; None = not given."""
 
-    file: Annotated[Path | None, typer.Argument(help="Configuration (YAML).", show_default=False)] = None
+    file: Annotated[Path | None, typer.Argument(help="Configuration (YAML).", show_default=False, readable=False)] = (
+        None
+    )
     defaults: Annotated[bool, typer.Option("--defaults", help="Print a commented template instead.")] = False
     as_json: Json = False
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from coec.cli.options import ConfigFile
+from coec.cli.stopping import ended_by_sigterm
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the service until SIGTERM or SIGINT; SIGHUP reads the configuration again. Logs go to standard output."""
-    from coec.cli import run as work
+    with ended_by_sigterm():
+        from coec.cli import run as work
 
-    return work.run(options.config, embedded_router=options.embedded_router, state_dir=options.state_dir)
+        return work.run(options.config, embedded_router=options.embedded_router, state_dir=options.state_dir)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from coec.cli.exit_codes import EXIT_CODES
 from coec.cli.pages.markdown import WRITTEN, table
+from coec.exit_codes import MAY_BE_CURED, MEANINGS, NOT_CURED_BY_RESTART
 from coec.runtime.api.metrics import FAMILIES
 from coec.runtime.api.troubles import TROUBLES
 from coec.runtime.reload import RELOADED
@@ -36,6 +36,9 @@ OPERATIONS = """\
 
 {written}
 ## Exit codes
+
+Container engines start a service again whatever its exit code (`restart: unless-stopped`), after pauses that grow to a
+minute. Code 78 ends alike each time: see to the log.
 
 {codes}
 ## What may ail the service
@@ -119,7 +122,13 @@ def operations_page() -> str:
     """Markdown: exit codes, troubles, values that are reloaded, what an update keeps."""
     return OPERATIONS.format(
         written=WRITTEN,
-        codes=table(("code", "meaning"), [(str(code), meaning) for code, meaning in EXIT_CODES.items()]),
+        codes=table(
+            ("code", "meaning", "systemd starts `run` again"),
+            [
+                (str(code.value), text, "no" if code in NOT_CURED_BY_RESTART else "yes" if code in MAY_BE_CURED else "")
+                for code, text in MEANINGS.items()
+            ],
+        ),
         troubles=table(
             ("code", "meaning", "what to do"),
             [(f"`{code}`", trouble.meaning, trouble.advice) for code, trouble in TROUBLES.items()],
