@@ -353,8 +353,10 @@ def found_with(authority: Path, port: int, name: str, folder: Path, vehicle: str
     with_session = router.session_beside(config)
     found.append(router.session_finding(config, with_session))
     if with_session is not None:
-        with with_session:
-            found.append(router.rules_finding(config, with_session))
+        as_of_service = router.session_as_of_service(config)
+        assert as_of_service is not None
+        with with_session, as_of_service:
+            found.append(router.rules_finding(config, as_of_service, with_session))
     return {one.check: one for one in found}
 
 

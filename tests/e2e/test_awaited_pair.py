@@ -1,8 +1,11 @@
-"""A vehicle of ROS 2 with eight lines of configuration: what they leave out is found on the bus, kept, and watched."""
+"""A vehicle of ROS 2 with eight lines of configuration: what they leave out is found on the bus, kept, and watched.
+
+Its router and its nodes have the default settings of rmw_zenoh.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,12 +14,13 @@ import numpy as np
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.client import ask_one, connected
+import rmw_zenoh_defaults
+from coec.adapters.zenoh.client import ask_one
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.errors import RemoteError
 from coec.geometry import se3
 from e2e.drives import Drive, rendered
-from e2e.processes import PATIENCE_S, Router, Service, service
+from e2e.processes import PATIENCE_S, Router, Service, free_endpoint, service
 from e2e.ros_vehicle import (
     BLOCK,
     CAMERA,
@@ -55,10 +59,17 @@ def drive() -> Drive:
     return rendered(DRIVE)
 
 
+@pytest.fixture(scope="module")
+def router() -> Iterator[Router]:
+    endpoint = free_endpoint()
+    with rmw_zenoh_defaults.router(endpoint) as session:
+        yield Router(session, endpoint)
+
+
 @pytest.fixture
-def driver(router: Router) -> Any:
+def driver(router: Router) -> Iterator[zenoh.Session]:
     """A session of the vehicle's own."""
-    with connected((router.endpoint,), PATIENCE_S) as session:
+    with rmw_zenoh_defaults.node(router.endpoint) as session:
         yield session
 
 

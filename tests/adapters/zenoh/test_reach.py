@@ -61,10 +61,22 @@ def test_whatever_else_is_not(config: ZenohConfig, waiting: Iterable[tuple[Trans
     assert why in str(outside(config, *waiting))
 
 
-def test_gossip_may_tell_of_anybody(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("said", "finds"),
+    [
+        ('mode: "peer", scouting: { gossip: { enabled: true } }', True),
+        ('mode: "router", scouting: { gossip: { enabled: true, autoconnect: ["peer"] } }', True),
+        ('mode: "peer", scouting: { gossip: { enabled: true, autoconnect: { router: ["peer"], peer: [] } } }', False),
+        ('mode: "peer"', False),
+        ('mode: "router", scouting: { gossip: { enabled: true } }', False),
+        ("scouting: { gossip: { enabled: true } }", True),
+        ('mode: "client", scouting: { gossip: { enabled: true } }', False),  # it has its router alone
+    ],
+)
+def test_a_peer_that_gossips_may_connect_to_anybody(tmp_path: Path, said: str, finds: bool) -> None:
     file = tmp_path / "zenoh.json5"
-    file.write_text("{ scouting: { gossip: { enabled: true } } }")
-    assert outside(ZenohConfig(file=file)) == "it connects to peers that it learns of by gossip"
+    file.write_text(f'{{ {said}, listen: {{ endpoints: ["tcp/127.0.0.1:0"] }} }}')
+    assert outside(ZenohConfig(file=file)) == ("it connects to peers that it learns of by gossip" if finds else None)
 
 
 def test_what_cannot_be_told_is_not_this_computers_alone() -> None:

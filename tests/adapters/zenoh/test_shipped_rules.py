@@ -116,7 +116,7 @@ class Town:
 @pytest.fixture(scope="module", params=["on the router's computer", "on another computer"])
 def town(request: pytest.FixtureRequest, door: Door, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
     away = request.param == "on another computer"
-    file = door.authority.session("vehicle", door.certified, mode="peer") if away else None
+    file = door.authority.session("vehicle", door.certified) if away else None
     config = ZenohConfig(connect=(door.loopback,), file=file)
     frames: list[bytes] = []
     images: list[bytes] = []
@@ -408,7 +408,7 @@ def test_a_session_ends_with_its_certificate(
 def test_a_second_daemon_on_another_computer_sees_the_first(authority: TestAuthority, tmp_path: Path) -> None:
     with ExitStack() as stack:
         door = stack.enter_context(opened(authority, tmp_path))
-        service = ZenohConfig(file=authority.session("vehicle", door.certified, mode="peer"))
+        service = ZenohConfig(file=authority.session("vehicle", door.certified))
         here, there = (stack.enter_context(open_session(service, LIMITS)) for _ in range(2))
         first, second = (Presence(session, service, LIMITS, KEYS, 1) for session in (here, there))
         first.claim(threading.Event())

@@ -112,8 +112,8 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
         present = [card.name for card in built_in_cards().values() if file_of(card) is not None]
         raise ModelError(
             f"there is no depth network {places[0]}: give an ONNX file, `{STEREO}` for the maps that come with the "
-            f"frames, or the name of a network whose file is on this machine: {', '.join(present)}. `coec models` lists all, "
-            "and where the others come from"
+            f"frames, or the name of a network whose file is on this machine: {', '.join(present)}. "
+            "`coec models` lists all, and where the others come from"
         )
     own, identity = file_identity(path)
     card = find_card(path, own, named)

@@ -23,7 +23,8 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.endpoints import without_secrets
 from coec.adapters.zenoh.inputs import Input, Sample
-from coec.adapters.zenoh.settings import endpoints_of, settings_of, where
+from coec.adapters.zenoh.opening import open_waiting
+from coec.adapters.zenoh.settings import endpoints_of, mode_of, second, settings_of, where
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
 from coec.schemas.base import to_json, to_msgpack
@@ -90,8 +91,9 @@ class Route:
     lane: Lane
 
 
-def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
-    """The session of a peer that connects and reconnects to the router, or of the router itself.
+def open_session(config: ZenohConfig, limits: LimitsConfig, *, again: bool = False) -> zenoh.Session:
+    """The service's session: by default that of a client, which connects and reconnects to the router, or that of the
+    router itself. `again`: one of the same kind that may run at the same time as the service's.
 
     Raises:
         ConfigError: as `settings_of`.
@@ -99,11 +101,18 @@ def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
     """
     zenoh.init_log_from_env_or("error")
     settings = settings_of(config, limits)
+    if again:
+        settings = second(settings)
     try:
-        return zenoh.open(settings)
+        return open_waiting(settings) if mode_of(settings) == "client" else zenoh.open(settings)
     except zenoh.ZError as error:
         text = without_secrets(str(error), endpoints_of(config))
         raise UnavailableError(f"cannot open the Zenoh session ({where(config)}): {text}") from None
+
+
+def is_connected(session: zenoh.Session) -> bool:
+    """Whether a session is connected to a router or a peer now."""
+    return bool(list(session.info.routers_zid()) or list(session.info.peers_zid()))
 
 
 def closed(session: zenoh.Session, deadline_s: float) -> bool:
@@ -248,8 +257,7 @@ class Bus:
 
     def reaches_somebody(self) -> bool:
         """Whether the session is connected to a router or a peer now."""
-        info = self._session.info
-        return bool(list(info.routers_zid()) or list(info.peers_zid()))
+        return is_connected(self._session)
 
     def close(self, deadline_s: float) -> bool:
         """Close the session; False if it did not close within `deadline_s`."""

@@ -15,6 +15,7 @@ from pathlib import Path
 import zenoh
 
 from coec.adapters.zenoh.endpoints import redacted
+from coec.adapters.zenoh.opening import open_client
 from coec.adapters.zenoh.settings import check_certificates
 from coec.adapters.zenoh.settings_file import read_settings
 from coec.errors import ConnectionFailedError, DecodeError, NotFoundError, RemoteError, UsageError
@@ -117,15 +118,13 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int = MAX_MESSAGE_B
     settings.insert_json5("mode", '"client"')
     settings.insert_json5("listen/endpoints", "[]")
     settings.insert_json5("scouting/multicast/enabled", "false")
-    settings.insert_json5("connect/timeout_ms", str(round(wait_s * 1000)))
-    settings.insert_json5("connect/exit_on_failure", "true")
     settings.insert_json5("transport/link/rx/max_message_size", str(max_message_bytes))
     # Publishers that keep their last message for late subscribers need timestamps.
     settings.insert_json5("timestamping/enabled", "true")
     try:
         settings.insert_json5("connect/endpoints", json.dumps(way.endpoints))
         check_certificates(settings, str(way.file or "--connect"))
-        session = zenoh.open(settings)
+        session = open_client(settings, wait_s)
     except (zenoh.ZError, ValueError) as error:
         asked = ", ".join(redacted(endpoint) for endpoint in way.endpoints)
         by_certificate = any(endpoint.startswith(("tls/", "quic/")) for endpoint in way.endpoints)

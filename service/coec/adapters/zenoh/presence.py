@@ -1,9 +1,10 @@
 """Ensures one daemon per vehicle: daemons show themselves by liveliness tokens and look for others, and only one stays.
 
 A daemon holds a claim from before it looks for others until it stops answering: first `starting`, then `serving`. A
-claim is a liveliness token, and a queryable on the same key. Routers forward nothing between two peers, so that a peer
-looks through a separate client session, which sees what the router holds. Once a daemon sees its own claim there, every
-daemon that looks later sees it, too. Therefore, of two that start at the same time, at least one sees the other:
+claim is a liveliness token, and a queryable on the same key. A daemon looks through a separate client session, which
+sees what the router holds; its own session would see its own claim at once, wherever else that is known. Once a daemon
+sees its own claim there, every daemon that looks later sees it, too. Therefore, of two that start at the same time, at
+least one sees the other:
 
 - A daemon leaves if it sees another that serves, or one that starts with a smaller Zenoh id.
 - A daemon waits if it sees others that start with larger ids. Either they leave, or they had looked before it started
@@ -34,6 +35,7 @@ import zenoh
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import closed
 from coec.adapters.zenoh.client import GRACE_S
+from coec.adapters.zenoh.opening import open_client
 from coec.adapters.zenoh.settings import beside, mode_of, settings_of
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import DecodeError, UnavailableError, UsageError
@@ -356,13 +358,13 @@ class Presence:
                 )
 
     def _looking_glass(self) -> zenoh.Session | None:
-        """The session to look through: the daemon's own, or, if that is a peer, a client session, which sees the tokens
-        of other peers. None: there is no router."""
+        """The session to look through: the daemon's own if it is the router, otherwise a client session beside it.
+        None: there is no router."""
         settings = settings_of(self._config, self._limits)
-        if mode_of(settings) != "peer":
+        if mode_of(settings) == "router":
             return self._session
         try:
-            return zenoh.open(beside(settings, CONNECT_S))
+            return open_client(beside(settings), CONNECT_S)
         except zenoh.ZError:
             return None
 

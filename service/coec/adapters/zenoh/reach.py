@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 
 import zenoh
 
 from coec.adapters.system.listening import Address, Transport, addresses_of_port
 from coec.adapters.zenoh.endpoints import WITH_PORT, Endpoint, redacted
-from coec.adapters.zenoh.settings import connected_of, listened_of
+from coec.adapters.zenoh.settings import connected_of, finds_peers, listened_of
 
 OVER_UDP = frozenset({"udp", "quic"})
 
@@ -27,13 +26,13 @@ class Reach:
         """
         self._listened = listened_of(settings)
         self._connected = connected_of(settings)
-        self._gossip = bool(json.loads(settings.get_json("scouting/gossip/enabled")))
+        self._finds_peers = finds_peers(settings)
         self._addresses = addresses
 
     def outside(self) -> str | None:
         """A clause that says why programs on other computers may reach the session; None: as far as this computer can
         tell they cannot. Examined anew at each call, because a router may be started or stopped at any time."""
-        if self._gossip:
+        if self._finds_peers:
             return "it connects to peers that it learns of by gossip"
         for text in (*self._listened, *self._connected):
             endpoint = Endpoint.parse(text)

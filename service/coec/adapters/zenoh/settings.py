@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import uuid
 from typing import Any
 
@@ -14,14 +15,28 @@ from coec.adapters.zenoh.tls import Role, check_material, material_of
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
 
+GOSSIP = "scouting/gossip/enabled"
+
 DEAF_US = 2_000_000
 """A receiver that has not taken 64 kB for this long, microseconds, is cut off when a message for it may not be dropped.
 Until then the router forwards nothing from that sender to anybody. Zenoh's default is 5 s for each receiver."""
 
 
+OPEN_MS = 5_000
+"""How long an endpoint may take to accept the session, ms. One that never answers delays the start, and the endpoints
+behind it, by so much. Zenoh's default is 10 s."""
+
+RETRY = {"period_init_ms": 1000, "period_max_ms": 1000, "period_increase_factor": 1.0}
+"""Pause between two attempts to reach a router. Zenoh's own grows to 4 s."""
+
+
 def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
     """The session's settings. What `config.file` sets stands. Whatever it leaves out gets a safe value: the session
     listens and searches for others only if told to.
+
+    The session is a client of the router. A router hands nothing on between two peers, since it expects them to find
+    each other by gossip and to connect; nodes of rmw_zenoh are peers. Clients get everything from the router. A file
+    that names no mode, but where to listen, or gossip, makes it a peer: clients do neither.
 
     Raises:
         ConfigError: the file, an endpoint or a certificate cannot be used, or an endpoint lets anybody in and
@@ -32,19 +47,26 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
     for endpoint in (*listen, *connect):
         Endpoint.parse(endpoint)
     silent = {
-        "mode": "router" if config.embedded_router else "peer",
+        "mode": "router" if config.embedded_router else "client",
         "listen/endpoints": listen,
         "connect/endpoints": connect,
-        "scouting/gossip/enabled": False,
+        "connect/retry": RETRY,
+        "transport/unicast/open_timeout": OPEN_MS,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": DEAF_US,
     }
     try:
         settings = read_settings(config.file) if config.file else zenoh.Config()
         unsaid = zenoh.Config()
+        if not config.embedded_router and _wants_peers(settings, unsaid):
+            silent["mode"] = "peer"
         for key, value in silent.items():
             # By default a peer listens on every interface, at any port.
             if settings.get_json(key) == unsaid.get_json(key):
                 settings.insert_json5(key, json.dumps(value))
+        if settings.get_json(GOSSIP) == unsaid.get_json(GOSSIP):
+            # By gossip a router makes its peers known to each other, without which they exchange nothing: default
+            # nodes of rmw_zenoh. It connects to none of them itself.
+            settings.insert_json5(GOSSIP, json.dumps(mode_of(settings) == "router"))
         settings.insert_json5("scouting/multicast/enabled", "false")
         settings.insert_json5("timestamping/enabled", "true")
         settings.insert_json5("transport/link/rx/max_message_size", str(limits.max_message_bytes))
@@ -95,19 +117,39 @@ def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
     )
 
 
-def beside(settings: zenoh.Config, connect_s: float) -> zenoh.Config:
+def beside(settings: zenoh.Config) -> zenoh.Config:
     """Changes a session's settings, in place, into those of a client beside it, which sees what the router gives to
-    others. Opening the client takes at most `connect_s` or fails."""
+    others."""
     own = {
+        "id": _new_id(),
+        "connect/endpoints": connected_of(settings),
         "mode": "client",
-        "id": uuid.uuid4().hex.lstrip("0"),  # a new id, as the file may set the service's
         "listen/endpoints": [],
-        "connect/timeout_ms": round(connect_s * 1000),
-        "connect/exit_on_failure": True,
     }
     for key, value in own.items():
         settings.insert_json5(key, json.dumps(value))
     return settings
+
+
+def second(settings: zenoh.Config) -> zenoh.Config:
+    """Changes a session's settings, in place, into those of a session of the same kind that may run at the same time:
+    with an id of its own, and listening at free ports of the same addresses."""
+    ports = re.compile(r":\d+(?=$|[?#])")
+    listen = [ports.sub(":0", endpoint, count=1) for endpoint in listened_of(settings)]
+    settings.insert_json5("id", json.dumps(_new_id()))
+    settings.insert_json5("listen/endpoints", json.dumps(listen))
+    return settings
+
+
+def finds_peers(settings: zenoh.Config) -> bool:
+    """Whether the session connects to peers that it learns of by gossip."""
+    mode = mode_of(settings)
+    if mode == "client" or json.loads(settings.get_json(GOSSIP)) is False:
+        return False
+    connects = json.loads(settings.get_json("scouting/gossip/autoconnect"))
+    if isinstance(connects, dict):
+        connects = connects.get(mode)
+    return mode == "peer" if connects is None else bool(connects)
 
 
 def listened_of(settings: zenoh.Config) -> tuple[str, ...]:
@@ -138,8 +180,21 @@ def where(config: ZenohConfig) -> str:
     return f"zenoh.listen {listen}, connect {[redacted(endpoint) for endpoint in config.connect]}"
 
 
+def _wants_peers(settings: zenoh.Config, unsaid: zenoh.Config) -> bool:
+    """Whether a file sets what only a peer does: it listens, or finds others by gossip."""
+    listens = settings.get_json("listen/endpoints")
+    if listens != unsaid.get_json("listen/endpoints") and _of_mode(json.loads(listens), "peer"):
+        return True
+    return json.loads(settings.get_json(GOSSIP)) is True
+
+
+def _new_id() -> str:
+    """An id of a session; the file may set the service's, and no two sessions have one."""
+    return uuid.uuid4().hex.lstrip("0")
+
+
 def _of_mode(value: Any, mode: str) -> tuple[str, ...]:
-    """The endpoints of a mode. `value` is a list of endpoints, or holds one such list per mode; a list within the list
-    is a choice of endpoints."""
+    """The endpoints of a mode. `value` is a list of endpoints, or holds one such list per mode; within the list,
+    `locators` of an object are several endpoints."""
     found = value.get(mode, []) if isinstance(value, dict) else value
-    return tuple(one for item in found or [] for one in ([item] if isinstance(item, str) else item))
+    return tuple(one for item in found or [] for one in ([item] if isinstance(item, str) else item["locators"]))

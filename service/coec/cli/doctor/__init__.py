@@ -7,8 +7,10 @@ the streams, the service. It changes nothing that runs, and works with and witho
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
+import zenoh
 from rich.text import Text
 
 from coec.adapters.depth.maps import open_depth
@@ -69,26 +71,40 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
     yield from reached
     if not any(one.check == "router" and one.level == "ok" for one in reached):
         return
-    session = router.session_beside(config)
-    yield router.session_finding(config, session)
-    if session is None:
+    beside = router.session_beside(config)
+    yield router.session_finding(config, beside)
+    if beside is None:
         return
-    try:
-        yield router.rules_finding(config, session)
-        ros = RosSide(session, config)
-        with console.progress(counted=False) as progress:
-            task = progress.add_task("listening", total=seconds, note=count(len(config.pairs), "pair"))
-            heard = listen(session, ros, config, seconds, lambda passed_s: progress.update(task, completed=passed_s))
-        there = ros.topics()
-        ros.close()
-        if config.middleware != "native":
-            yield from topics.topic_findings(there, config)
-        for pair, streams_heard in zip(config.pairs, heard, strict=True):
-            yield from streams.stream_findings(pair, streams_heard, config, seconds, there)
-        yield from (_awaited(pair, there) for pair in config.awaited)
-        yield from service.service_findings(session, config)
-    finally:
-        closed(session, router.CLOSE_S)
+    with ExitStack() as sessions:
+        sessions.callback(closed, beside, router.CLOSE_S)
+        yield router.mode_finding(config)
+        session = router.session_as_of_service(config)
+        if session is None:
+            yield warn("rules", config.vehicle, "the router takes one session, not two", "raise its `max_sessions`")
+            return
+        sessions.callback(closed, session, router.CLOSE_S)
+        yield router.rules_finding(config, session, beside)
+        yield from _received(config, session, beside, seconds)
+        yield from service.service_findings(beside, config)
+
+
+def _received(config: Config, session: zenoh.Session, beside: zenoh.Session, seconds: float) -> Iterator[Finding]:
+    """Findings on what comes through a session as the service has it, compared with the client `beside` it."""
+    ros, known = RosSide(session, config), RosSide(beside, config)
+    with console.progress(counted=False) as progress:
+        task = progress.add_task("listening", total=seconds, note=count(len(config.every_pair), "pair"))
+        heard = listen(
+            session, beside, ros, config, seconds, lambda passed_s: progress.update(task, completed=passed_s)
+        )
+    here, there = ros.topics(), known.topics()
+    ros.close()
+    known.close()
+    if config.middleware != "native":
+        yield from topics.topic_findings(here, there, config)
+    for pair, streams_heard in zip(config.pairs, heard.pairs, strict=True):
+        yield from streams.stream_findings(pair, streams_heard, config, seconds, there)
+    yield from (_awaited(pair, there) for pair in config.awaited)
+    yield from streams.awaited_findings(heard.awaited, config, seconds, there)
 
 
 def _configuration(path: Path) -> tuple[Config | None, Finding]:

@@ -14,10 +14,13 @@ from dataclasses import dataclass, field
 import zenoh
 
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.bus import Bus
+from coec.adapters.zenoh.inputs import Input, Sample
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.config import Config, PairConfig
 from coec.runtime.ingest.decoder import EGO, Decoder, Frame, StreamCounts
+from coec.runtime.nominal.findings import info_topic_of, needs_transforms
+from coec.schemas.ros_names import TF_STATIC
 
 SAMPLES_WAITING = 8
 """Most samples of a stream that wait to be decoded; further ones are only counted."""
@@ -39,21 +42,31 @@ class Heard:
 
     Attributes:
         place: its key or topic.
+        expressions: key expressions that its samples match.
         arrivals_s: when (steady clock) each sample came.
         sizes: bytes of each.
         stamps: sensor time of each frame, and the wall clock when its sample came, ns, in the order of arrival.
         refused: samples that made no frame, by reason.
         latest: the last frame.
         counts: counts of the senders, at the end.
+        elsewhere: number of samples that a client of the same router got.
     """
 
     place: str
+    expressions: tuple[str, ...] = ()
     arrivals_s: list[float] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     stamps: list[tuple[int, int]] = field(default_factory=list)
     refused: Counter[str] = field(default_factory=Counter)
     latest: Frame | None = None
     counts: StreamCounts | None = None
+    elsewhere: int = 0
+
+    def count(self, sample: Sample) -> None:
+        """Counts a sample that is not decoded."""
+        if len(self.arrivals_s) < SAMPLES_COUNTED:
+            self.arrivals_s.append(time.monotonic())
+            self.sizes.append(len(sample.payload))
 
     @property
     def rate_hz(self) -> float | None:
@@ -64,11 +77,33 @@ class Heard:
         return (len(self.arrivals_s) - 1) / spread_s if spread_s > 0 else None
 
 
+@dataclass(frozen=True, slots=True)
+class AllHeard:
+    """What came in the time.
+
+    Attributes:
+        pairs: by stream, for each complete pair of the configuration.
+        awaited: by place, what pairs wait for whose configuration leaves something out. Nothing of it is decoded.
+    """
+
+    pairs: list[dict[str, Heard]]
+    awaited: dict[str, Heard]
+
+
 def listen(
-    session: zenoh.Session, ros: RosSide, config: Config, seconds: float, heard: Callable[[float], None]
-) -> list[dict[str, Heard]]:
-    """What comes on the streams of each pair; `heard` is called now and then with the seconds that have passed."""
+    session: zenoh.Session,
+    beside: zenoh.Session,
+    ros: RosSide,
+    config: Config,
+    seconds: float,
+    heard: Callable[[float], None],
+) -> AllHeard:
+    """What comes through a session as the service has it, and how much of it comes to the client `beside` it. `heard`
+    is called now and then with the seconds that have passed."""
     ears = [_Ear(session, ros, pair, config) for pair in config.pairs]
+    awaited, bus = _awaited(session, ros, config)
+    every = [one for ear in ears for one in ear.heard.values()] + list(awaited.values())
+    counters = [counter for one in every for counter in _count_elsewhere(beside, one)]
     begun_s = time.monotonic()
     try:
         while (passed_s := time.monotonic() - begun_s) < seconds:
@@ -78,7 +113,38 @@ def listen(
     finally:
         for ear in ears:
             ear.close()
-    return [ear.heard for ear in ears]
+        bus.undeclare_inputs()
+        for counter in counters:
+            counter.undeclare()
+    return AllHeard([ear.heard for ear in ears], awaited)
+
+
+def _awaited(session: zenoh.Session, ros: RosSide, config: Config) -> tuple[dict[str, Heard], Bus]:
+    """Listens, as the service does, for what the awaited pairs leave out."""
+    bus, awaited = Bus(session), dict[str, Heard]()
+
+    def listen_to(place: str, stream: Input, subscribe: Callable[[Input, Callable[[Sample], None]], object]) -> None:
+        if place not in awaited:
+            awaited[place] = Heard(place, stream.expressions)
+            subscribe(stream, awaited[place].count)
+
+    for pair in config.awaited:
+        for stream in pair.streams.values():
+            listen_to(stream.place, ros.input_of(stream), bus.subscribe)
+        topic = info_topic_of(pair)
+        if topic is not None:
+            listen_to(topic, ros.input_of_info(topic), bus.subscribe_latched)
+        if needs_transforms(pair):
+            listen_to(TF_STATIC, ros.input_of_static_transforms(), bus.subscribe_latched)
+    return awaited, bus
+
+
+def _count_elsewhere(beside: zenoh.Session, heard: Heard) -> list[zenoh.Subscriber[None]]:
+    def count(sample: zenoh.Sample) -> None:
+        heard.elsewhere += sample.kind == zenoh.SampleKind.PUT
+
+    receiver = zenoh.handlers.Callback(count, indirect=False)
+    return [beside.declare_subscriber(expression, receiver) for expression in heard.expressions]
 
 
 class _Ear:
@@ -86,7 +152,7 @@ class _Ear:
 
     def __init__(self, session: zenoh.Session, ros: RosSide, pair: PairConfig, config: Config) -> None:
         inputs = {name: ros.input_of(stream) for name, stream in pair.streams.items()}
-        self.heard = {name: Heard(stream.place) for name, stream in pair.streams.items()}
+        self.heard = {name: Heard(stream.place, inputs[name].expressions) for name, stream in pair.streams.items()}
         self._waiting: dict[str, deque[tuple[int, Sample]]] = {
             name: deque(maxlen=MOTIONS_WAITING if name == EGO else SAMPLES_WAITING) for name in self.heard
         }
@@ -143,9 +209,8 @@ class _Ear:
         def receive(sample: zenoh.Sample) -> None:
             if sample.kind != zenoh.SampleKind.PUT or len(heard.arrivals_s) >= SAMPLES_COUNTED:
                 return
-            heard.arrivals_s.append(time.monotonic())
             came = read(sample)
-            heard.sizes.append(len(came.payload))
+            heard.count(came)
             waiting.append((time.time_ns(), came))
 
         return session.declare_subscriber(expression, zenoh.handlers.Callback(receive, indirect=False))

@@ -12,9 +12,10 @@ from typing import Literal
 
 import zenoh
 
-from coec.adapters.zenoh.bus import closed
+from coec.adapters.zenoh.bus import closed, is_connected, open_session
 from coec.adapters.zenoh.endpoints import CERTIFIED, WITH_PORT, Endpoint, redacted
-from coec.adapters.zenoh.settings import beside, connected_of, listened_of, mode_of, settings_of
+from coec.adapters.zenoh.opening import open_client
+from coec.adapters.zenoh.settings import beside, connected_of, finds_peers, listened_of, mode_of, settings_of
 from coec.adapters.zenoh.tls import (
     Certificate,
     CertificateError,
@@ -25,6 +26,7 @@ from coec.adapters.zenoh.tls import (
 )
 from coec.cli.doctor.found import fail, ok, warn
 from coec.config import Config
+from coec.errors import UnavailableError
 from coec.schemas.doctor import Finding
 from coec.schemas.keys import Keys
 
@@ -80,16 +82,35 @@ def router_findings(config: Config) -> Iterator[Finding]:
 
 
 def session_beside(config: Config) -> zenoh.Session | None:
-    """A session with the router that uses the certificate of the service; None when none comes about."""
+    """A client session with the router that uses the certificate of the service; None when none comes about."""
     zenoh.init_log_from_env_or("off")
     settings = settings_of(config.zenoh, config.limits)
     endpoints = _endpoints(settings, config)
-    settings = beside(settings, CONNECT_S)
+    settings = beside(settings)
     settings.insert_json5("connect/endpoints", json.dumps(endpoints))
     try:
-        return zenoh.open(settings)
+        return open_client(settings, CONNECT_S)
     except zenoh.ZError:
         return None
+
+
+def session_as_of_service(config: Config) -> zenoh.Session | None:
+    """A session as the service opens it, which therefore receives what the service receives; None when none comes
+    about. Where the service is the router itself: a client of it."""
+    if mode_of(settings_of(config.zenoh, config.limits)) == "router":
+        return session_beside(config)
+    zenoh.init_log_from_env_or("off")
+    try:
+        session = open_session(config.zenoh, config.limits, again=True)
+    except UnavailableError:
+        return None
+    deadline_s = time.monotonic() + CONNECT_S
+    while not is_connected(session):
+        if time.monotonic() > deadline_s:
+            closed(session, CLOSE_S)
+            return None
+        time.sleep(ASK_AGAIN_S)
+    return session
 
 
 def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
@@ -107,26 +128,55 @@ def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
     return ok("session", where, f"a session with router {', '.join(routers) or 'none, but a peer'}")
 
 
-def rules_finding(config: Config, session: zenoh.Session) -> Finding:
-    """Whether the router lets this session, which uses the service's certificate, publish what the service must. To
-    test that, a liveliness token that nobody else reads has to come back."""
+def mode_finding(config: Config) -> Finding:
+    """How the service takes part, and from whom it therefore receives."""
+    settings = settings_of(config.zenoh, config.limits)
+    mode = mode_of(settings)
+    where = "zenoh" if config.zenoh.file is None else str(config.zenoh.file)
+    if mode == "router":
+        return ok("mode", where, "the service is the router itself: it receives from clients and from peers")
+    if mode == "client":
+        return ok("mode", where, "the service is a client: it receives from clients and peers of its router")
+    if finds_peers(settings):
+        text = "the service is a peer: it receives from clients of its router, and from peers that gossip makes known"
+        return ok("mode", where, text)
+    cause, advice = cause_of_silence(config)
+    return warn("mode", where, cause, advice)
+
+
+def cause_of_silence(config: Config) -> tuple[str, str]:
+    """Why the service does not receive what a client of the same router receives, and what to do about it."""
+    settings = settings_of(config.zenoh, config.limits)
+    if mode_of(settings) != "peer":
+        return "the router hands it on to others", "see to the router's rules for this certificate (docs/security.md)"
+    client = "leave `mode`, `listen` and `scouting` out of zenoh.file, so that the service is a client"
+    if finds_peers(settings):
+        cause = (
+            "the service is a peer, to which a router hands nothing from other peers, and it has no connection to them"
+        )
+        advice = f"{client}; or enable gossip at the router, and have peers listen where others can reach them"
+        return cause, advice
+    cause = (
+        "the service is a peer without gossip: a router hands nothing on between two peers, so that it exchanges "
+        "nothing with nodes of rmw_zenoh, which are peers"
+    )
+    return cause, f'{client}; or enable gossip there, and listen at "tcp/localhost:0"'
+
+
+def rules_finding(config: Config, session: zenoh.Session, other: zenoh.Session) -> Finding:
+    """Whether the router lets a session with the service's certificate publish what the service must. To test that,
+    a liveliness token that nobody else reads has to arrive at the other session."""
     keys = Keys(config.prefix, config.vehicle)
     token_key = f"{keys.root}/alive/doctor/{session.info.zid()}/{time.time_ns()}"
-    other = session_beside(config)
-    if other is None:
-        return warn("rules", keys.root, "the router takes one session, not two", "raise its `max_sessions`")
+    token = session.liveliness().declare_token(token_key)
+    deadline_s = time.monotonic() + SEEN_S
     try:
-        token = session.liveliness().declare_token(token_key)
-        deadline_s = time.monotonic() + SEEN_S
-        try:
-            while time.monotonic() < deadline_s:
-                if any(reply.ok is not None for reply in other.liveliness().get(token_key, timeout=1.0)):
-                    return ok("rules", keys.root, "the router hands on what is said there")
-                time.sleep(ASK_AGAIN_S)
-        finally:
-            token.undeclare()
+        while time.monotonic() < deadline_s:
+            if any(reply.ok is not None for reply in other.liveliness().get(token_key, timeout=1.0)):
+                return ok("rules", keys.root, "the router hands on what is said there")
+            time.sleep(ASK_AGAIN_S)
     finally:
-        closed(other, CLOSE_S)
+        token.undeclare()
     return fail(
         "rules",
         keys.root,

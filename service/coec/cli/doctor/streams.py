@@ -14,6 +14,7 @@ from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.cli.doctor.found import fail, ok, warn
 from coec.cli.doctor.listening import Heard
+from coec.cli.doctor.router import cause_of_silence
 from coec.config import Config, PairConfig
 from coec.errors import DecodeError
 from coec.runtime.api.streams import troubles_of
@@ -63,7 +64,9 @@ def _stream(
     pair: PairConfig, name: str, heard: Heard, config: Config, seconds: float, topics: Topics
 ) -> Iterator[Finding]:
     if not heard.arrivals_s:
-        yield _silent(pair, name, heard, seconds, topics)
+        stream = pair.streams[name]
+        absent = None if stream.topic is None else topics.absent(stream.topic, stream.types)
+        yield _silent(name, heard, config, seconds, absent)
         return
     yield _rate(pair, name, heard, seconds)
     largest, limit = max(heard.sizes), config.limits.max_message_bytes
@@ -81,10 +84,26 @@ def _stream(
         yield _clock(name, heard)
 
 
-def _silent(pair: PairConfig, name: str, heard: Heard, seconds: float, topics: Topics) -> Finding:
+def awaited_findings(awaited: Mapping[str, Heard], config: Config, seconds: float, topics: Topics) -> Iterator[Finding]:
+    """Findings on what pairs wait for whose configuration leaves something out."""
+    for place, heard in awaited.items():
+        if heard.arrivals_s:
+            count = len(heard.arrivals_s)
+            told = f"{heard.rate_hz:.1f} Hz" if heard.rate_hz else f"{count} message{'s' if count > 1 else ''}"
+            yield ok("stream", place, f"{told}, {median(heard.sizes) / 1e3:.1f} kB each")
+        else:
+            absent = None if topics.of(place) else f"no publisher of {place}"
+            yield _silent("awaited", heard, config, seconds, absent)
+
+
+def _silent(name: str, heard: Heard, config: Config, seconds: float, absent: str | None) -> Finding:
+    """The finding on a stream of which nothing came; `absent` says that nobody publishes its topic."""
     text = f"{name}: nothing came in {seconds:g} s"
-    stream = pair.streams[name]
-    if stream.topic is not None and (absent := topics.absent(stream.topic, stream.types)):
+    if heard.elsewhere:
+        cause, advice = cause_of_silence(config)
+        got = f"a client of the same router got {heard.elsewhere} samples"
+        return fail("stream", heard.place, f"{text}, while {got}: {cause}", advice)
+    if absent is not None:
         return fail("stream", heard.place, f"{text}: {absent}", "start its node, or name the topic that is meant")
     advice = (
         "see that its publisher runs, on this router, with this key or topic; and that the router's rules let this "
