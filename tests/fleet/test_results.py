@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -125,11 +126,27 @@ def test_a_torn_or_damaged_line_of_the_journal_costs_its_own_window(tmp_path: Pa
 
 
 def test_a_folder_with_a_batch_is_gone_on_with_only_if_asked_and_on_the_same_terms(tmp_path: Path) -> None:
-    Results(tmp_path, Terms(), resume=True)
+    batch = Results(tmp_path, Terms(), resume=True)
+    batch.add(next(rows(1)))
     with pytest.raises(UsageError, match="--resume"):
         Results(tmp_path, Terms(), resume=False)
     with pytest.raises(UsageError, match="another configuration"):
         Results(tmp_path, Terms(depth="street"), resume=True)
+
+
+@pytest.mark.fault("a batch fails before its first row", "its folder does not refuse the next try, on whatever terms")
+def test_a_folder_without_a_row_holds_no_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "batch"
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pyarrow", None)  # as if not installed
+        patch.setitem(sys.modules, "pyarrow.parquet", None)
+        with pytest.raises(SourceError, match=r"coec\[fleet\]"):
+            Results(folder, Terms(), resume=False)
+    assert not folder.exists()
+    Results(folder, Terms(), resume=False).finish()
+    Results(folder, Terms(depth="street"), resume=False).add(next(rows(1)))
+    with pytest.raises(UsageError, match="another configuration"):
+        Results(folder, Terms(), resume=True)
 
 
 @pytest.mark.fault(

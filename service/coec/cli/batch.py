@@ -6,10 +6,12 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from coec.cli.commands.batch import Options
+from coec.errors import UsageError
 from coec.fleet import batch
 from coec.fleet.engines.engine import Bounds, Engine
 from coec.fleet.places import jobs_of
@@ -28,11 +30,11 @@ def run(options: Options) -> int:
     """Judges every window that has no row yet; returns 1 if one of them has no result.
 
     Raises:
-        UsageError: no window, or the folder holds another batch.
+        UsageError: no window, the folder holds another batch, or options do not belong together.
         ConfigError: the configuration cannot be used.
         SourceError: a store cannot be read, or an optional extra is not installed.
         OutputError: the folder cannot be written.
-        FleetError: the engine failed.
+        FleetError: the engine failed, or windows could not be judged for a common cause.
     """
     terms = terms_of(options.with_config, options.rig, options.depth)
     jobs = jobs_of(options.windows)
@@ -48,10 +50,14 @@ def run(options: Options) -> int:
 
 def _engine(options: Options) -> Engine:
     bounds = Bounds(options.deadline_s, options.memory_mib * MIB)
+    if options.keep_going:
+        bounds = replace(bounds, alike=None)
     if options.engine == "ray":
         from coec.fleet.engines.ray import RayEngine
 
-        return RayEngine(options.jobs, bounds)
+        return RayEngine(options.jobs, bounds, options.ray_address, send_credentials=options.send_credentials)
+    if options.ray_address is not None:
+        raise UsageError("--ray-address is for --engine ray")
     from coec.fleet.engines.local import LocalEngine
 
     return LocalEngine(options.jobs or len(os.sched_getaffinity(0)), bounds)

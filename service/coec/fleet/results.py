@@ -9,12 +9,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from coec.adapters.files import durable, output
 from coec.errors import DecodeError, OutputError, UsageError
 from coec.fleet import tables
+from coec.fleet.extra import library
 from coec.fleet.terms import Terms
 from coec.schemas.base import from_json, to_json
 from coec.schemas.fleet import WindowRow
@@ -29,14 +30,16 @@ class Results:
     """The results of one batch. Call `finish` at its end, however it ends."""
 
     def __init__(self, folder: Path, terms: Terms, *, resume: bool) -> None:
-        """Begins a folder, or continues one.
+        """Begins a folder, or continues one. A batch without a row, which failed before its first window, counts as
+        none.
 
         Raises:
             UsageError: the folder holds a batch already, or one on other terms.
             OutputError: the folder cannot be written.
-            SourceError: a table in it is damaged.
+            SourceError: a table in it is damaged, or the libraries for tables are not installed.
         """
         self._folder = folder
+        library("pyarrow.parquet")  # before anything is written
         self._claim(terms, resume=resume)
         self._made = tables.urls(folder)
         self._rows: list[WindowRow] = []
@@ -93,7 +96,7 @@ class Results:
             there = None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UsageError(f"{path} cannot be read ({error}): choose another folder") from error
-        if there is None:
+        if there is None or not self._has_rows():
             document = {"fingerprint": terms.fingerprint, "terms": terms.model_dump(mode="json")}
             output.replace(path, json.dumps(document, sort_keys=True, indent=1).encode())
         elif not resume:
@@ -103,6 +106,13 @@ class Results:
                 f"{self._folder} holds a batch of another configuration, rig, network or version of coec: its rows "
                 "cannot be compared with new ones; choose another folder"
             )
+
+    def _has_rows(self) -> bool:
+        """Whether a window of the batch in the folder has a row, readable or not."""
+        with suppress(OSError):
+            if (self._folder / JOURNAL).stat().st_size > 0:
+                return True
+        return next(self._folder.glob("date=*/vehicle=*/*.parquet"), None) is not None
 
     @contextmanager
     def _writing(self, path: Path) -> Iterator[None]:
