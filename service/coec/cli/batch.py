@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
+from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
@@ -38,9 +39,14 @@ def run(options: Options) -> int:
     """
     terms = terms_of(options.with_config, options.rig, options.depth)
     jobs = jobs_of(options.windows)
-    engine = _engine(options)
-    with _progress(len(jobs)) as told:
-        report = batch.run(jobs, terms, engine, options.output, told, resume=options.resume)
+    # Ray prints what happens to its nodes on standard output, which is for the report. Its log files have it, too.
+    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+        engine = _engine(options)
+        try:
+            with _progress(len(jobs)) as told:
+                report = batch.run(jobs, terms, engine, options.output, told, resume=options.resume)
+        finally:
+            engine.close()
     if options.as_json:
         console.print_json(report.model_dump(mode="json"))
     else:

@@ -70,3 +70,6 @@ class Engine(Protocol):
         Raises:
             FleetError: the engine itself fails, or windows could not be judged for a common cause. Those have no row.
         """
+
+    def close(self) -> None:
+        """Releases what the engine holds beside its processes; it is not used again."""

@@ -109,6 +109,9 @@ class LocalEngine:
         """See `Engine`."""
         yield from Pool(_Processes(terms.model_dump_json(), self._bounds), self._bounds).rows(jobs, self.cores)
 
+    def close(self) -> None:
+        """See `Engine`."""
+
 
 # --- in the process -------------------------------------------------------------------------------------------------
 

@@ -204,6 +204,8 @@ class Pool:
         if event.blame:
             yield from queue.give_back(jobs, event.code, event.text)
         else:
+            fields = {"reason": event.text, "windows": [job.url for job in jobs]}
+            _log.warning("windows of a lost process are judged by others", extra={"fields": fields})
             yield from queue.return_unblamed(jobs, event.text)
 
     def _retire(self, worker: Worker, row: WindowRow, queue: Queue) -> None:

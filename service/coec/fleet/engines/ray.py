@@ -235,3 +235,7 @@ class RayEngine:
         credentials = StoreCredentials.from_environment(stores, os.environ)
         actors = _Actors(self._ray, terms.model_dump_json(), credentials, self._bounds)
         yield from Pool(actors, self._bounds).rows(jobs, self.cores)
+
+    def close(self) -> None:
+        """Leaves the cluster, or ends it if it was started here."""
+        self._ray.shutdown()
