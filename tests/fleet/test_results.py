@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -126,7 +127,8 @@ def test_a_torn_or_damaged_line_of_the_journal_costs_its_own_window(tmp_path: Pa
 
 
 def test_a_folder_with_a_batch_is_gone_on_with_only_if_asked_and_on_the_same_terms(tmp_path: Path) -> None:
-    Results(tmp_path, Terms(), resume=True)
+    batch = Results(tmp_path, Terms(), resume=True)
+    batch.add(next(rows(1)))
     with pytest.raises(UsageError, match="--resume"):
         Results(tmp_path, Terms(), resume=False)
     with pytest.raises(UsageError, match="another configuration"):
@@ -156,17 +158,25 @@ def test_a_batch_without_a_row_leaves_nothing_that_refuses_the_next(tmp_path: Pa
     for terms in (Terms(), Terms(depth="street")):
         with pytest.raises(FleetError):
             run(folder, terms, FailingEngine(0))
-        assert list(tmp_path.iterdir()) == []
     with pytest.raises(FleetError):
         run(folder, Terms(), FailingEngine(1))
     with pytest.raises(UsageError, match="--resume"):
         run(folder, Terms(), FailingEngine(1))
 
 
-def test_a_batch_that_goes_on_is_not_withdrawn(tmp_path: Path) -> None:
-    Results(tmp_path, Terms(), resume=False)
-    Results(tmp_path, Terms(), resume=True).finish()
-    assert [path.name for path in tmp_path.iterdir()] == [results.TERMS]
+@pytest.mark.fault("a batch fails before its first row", "its folder does not refuse the next try, on whatever terms")
+def test_a_folder_without_a_row_holds_no_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "batch"
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pyarrow", None)  # as if not installed
+        patch.setitem(sys.modules, "pyarrow.parquet", None)
+        with pytest.raises(SourceError, match=r"coec\[fleet\]"):
+            Results(folder, Terms(), resume=False)
+    assert not folder.exists()
+    Results(folder, Terms(), resume=False).finish()
+    Results(folder, Terms(depth="street"), resume=False).add(next(rows(1)))
+    with pytest.raises(UsageError, match="another configuration"):
+        Results(folder, Terms(), resume=True)
 
 
 @pytest.mark.fault(

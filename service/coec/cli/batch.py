@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from coec.cli.commands.batch import Options
+from coec.errors import UsageError
 from coec.fleet import batch
 from coec.fleet.engines.engine import Bounds, Engine
 from coec.fleet.places import jobs_of
@@ -29,17 +32,22 @@ def run(options: Options) -> int:
     """Judges every window that has no row yet; returns 1 if one of them has no result.
 
     Raises:
-        UsageError: no window, or the folder holds another batch.
+        UsageError: no window, the folder holds another batch, or options do not belong together.
         ConfigError: the configuration cannot be used.
         SourceError: a store cannot be read, or an optional extra is not installed.
         OutputError: the folder cannot be written.
-        FleetError: the engine failed.
+        FleetError: the engine failed, or windows could not be judged for a common cause.
     """
     terms = terms_of(options.with_config, options.rig, options.depth)
     jobs = jobs_of(options.windows)
-    engine = _engine(options)
-    with _progress(len(jobs)) as told:
-        report = batch.run(jobs, terms, engine, options.output, told, resume=options.resume)
+    # Ray prints what happens to its nodes on standard output, which is for the report. Its log files have it, too.
+    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+        engine = _engine(options)
+        try:
+            with _progress(len(jobs)) as told:
+                report = batch.run(jobs, terms, engine, options.output, told, resume=options.resume)
+        finally:
+            engine.close()
     if options.as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
@@ -49,10 +57,14 @@ def run(options: Options) -> int:
 
 def _engine(options: Options) -> Engine:
     bounds = Bounds(options.deadline_s, options.memory_mib * MIB)
+    if options.keep_going:
+        bounds = replace(bounds, alike=None)
     if options.engine == "ray":
         from coec.fleet.engines.ray import RayEngine
 
-        return RayEngine(options.jobs, bounds)
+        return RayEngine(options.jobs, bounds, options.ray_address, send_credentials=options.send_credentials)
+    if options.ray_address is not None:
+        raise UsageError("--ray-address is for --engine ray")
     from coec.fleet.engines.local import LocalEngine
 
     return LocalEngine(options.jobs or len(os.sched_getaffinity(0)), bounds)

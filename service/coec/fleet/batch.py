@@ -35,7 +35,7 @@ def run(
 
     Raises:
         UsageError, OutputError, SourceError: the folder cannot be used; see `Results`.
-        FleetError: the engine failed. Finished rows are kept.
+        FleetError: the engine failed, or windows could not be judged for a common cause. Finished rows are kept.
     """
     results = Results(folder, terms, resume=resume)
     known = results.urls

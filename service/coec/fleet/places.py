@@ -14,6 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from coec.errors import SourceError, UsageError
+from coec.fleet.credentials import redacted
 
 SUFFIX = ".mcap"
 
@@ -31,6 +32,36 @@ _DEEP = re.compile(r"(^|/)\*\*([^/]+)$")
 
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs", "az": "az", "abfs": "az", "abfss": "az"}
 """coec's optional extra that installs the client of a store, by the scheme of the store's URLs."""
+
+
+STORE_FAILURES = frozenset(
+    {
+        # no credentials, or refused ones: Python, botocore, google-auth, azure-core
+        "PermissionError",
+        "NoCredentialsError",
+        "PartialCredentialsError",
+        "CredentialRetrievalError",
+        "TokenRetrievalError",
+        "ProfileNotFound",
+        "GoogleAuthError",
+        "ClientAuthenticationError",
+        # no connection: Python, botocore, aiohttp, azure-core
+        "ConnectionError",
+        "TimeoutError",
+        "gaierror",
+        "HTTPClientError",
+        "ClientConnectionError",
+        "ServiceRequestError",
+    }
+)
+"""Classes of errors of stores' libraries that concern every window in the store, by name, because the libraries are
+optional. Classes derived from them count, too."""
+
+
+class StoreError(SourceError):
+    """A store that cannot be used from this machine: no client package, no connection, or no valid credentials."""
+
+    reply_code = "store_unavailable"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +95,16 @@ def jobs_of(patterns: Sequence[str]) -> list[Job]:
     urls = sorted(found)
     sums = {folder: _sums(folder) for folder in sorted({_folder(url) for url in urls})}
     return [Job(url, sums[_folder(url)].get(_name(url))) for url in urls]
+
+
+def stores_of(jobs: Sequence[Job]) -> frozenset[str]:
+    """Kinds of stores in which windows are, each as coec's optional extra for it."""
+    return frozenset(EXTRAS[scheme] for scheme in {_scheme(job.url) for job in jobs} if scheme in EXTRAS)
+
+
+def is_path(url: str) -> bool:
+    """Whether a URL is a path on this machine."""
+    return not _scheme(url)
 
 
 @contextmanager
@@ -165,13 +206,13 @@ def _store(url: str) -> tuple[Any, str]:
     try:
         import fsspec
     except ImportError as error:
-        raise SourceError(f"{url}: URLs need the optional extra `fleet`: pip install 'coec[fleet]'") from error
+        raise StoreError(f"{url}: URLs need the optional extra `fleet`: pip install 'coec[fleet]'") from error
     try:
         store, place = fsspec.core.url_to_fs(url)
     except ImportError as error:
         extra = EXTRAS.get(_scheme(url))
         hint = "" if extra is None else f": pip install 'coec[{extra}]'"
-        raise SourceError(f"{url}: the package that reads {_scheme(url)}:// is not installed{hint}") from error
+        raise StoreError(f"{url}: the package that reads {_scheme(url)}:// is not installed{hint}") from error
     except ValueError as error:
         raise UsageError(f"{url}: {error}") from error
     return store, place
@@ -179,13 +220,14 @@ def _store(url: str) -> tuple[Any, str]:
 
 @contextmanager
 def _asking(url: str) -> Iterator[None]:
-    """Turns whatever a store's library raises into a `SourceError`, because these libraries share no error class."""
+    """Turns whatever a store's library raises into a `SourceError`, because these libraries share no error class. A
+    failure that concerns the whole store becomes a `StoreError`."""
     try:
         yield
     except (SourceError, UsageError):
         raise
     except Exception as error:
         where = urlsplit(url)
-        raise SourceError(
-            f"{where.scheme}://{where.hostname or ''}{where.path}: {type(error).__name__}: {error}"
-        ) from error
+        text = f"{where.scheme}://{where.hostname or ''}{where.path}: {type(error).__name__}: {redacted(str(error))}"
+        names = {kind.__name__ for kind in type(error).__mro__}
+        raise (SourceError(text) if names.isdisjoint(STORE_FAILURES) else StoreError(text)) from error

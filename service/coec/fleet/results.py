@@ -30,16 +30,17 @@ class Results:
     """The results of one batch. Call `finish` at its end, however it ends."""
 
     def __init__(self, folder: Path, terms: Terms, *, resume: bool) -> None:
-        """Begins a folder, or continues one.
+        """Begins a folder, or continues one. A batch without a row, which failed before its first window, counts as
+        none.
 
         Raises:
             UsageError: the folder holds a batch already, or one on other terms.
             OutputError: the folder cannot be written.
-            SourceError: a table in it is damaged, or the extra that writes tables is not installed.
+            SourceError: a table in it is damaged, or the libraries for tables are not installed.
         """
-        library("pyarrow.parquet")  # before anything is written: what fails later must not leave a folder that is taken
         self._folder = folder
-        self._begun = self._claim(terms, resume=resume)
+        library("pyarrow.parquet")  # before anything is written
+        self._claim(terms, resume=resume)
         self._made = tables.urls(folder)
         self._rows: list[WindowRow] = []
         self._journal = durable.Log(folder / JOURNAL, 2 * ROWS_A_FILE, self._lines)
@@ -67,15 +68,12 @@ class Results:
             self.finish()
 
     def finish(self) -> None:
-        """Writes the waiting rows into tables. A batch that this object began and that has no row is withdrawn: its
-        folder can be used again, on any terms.
+        """Writes the waiting rows into tables.
 
         Raises:
             OutputError: a table cannot be written. The rows stay in the journal, and the next run writes the tables.
         """
         if not self._rows:
-            if self._begun and not self._made:
-                self._withdraw()
             return
         # The name depends on the rows in the file, so that no file replaces one with other rows.
         urls = [row.url for row in self._rows]
@@ -90,14 +88,7 @@ class Results:
     def _lines(self) -> Iterator[bytes]:
         return (to_json(row) for row in self._rows)
 
-    def _withdraw(self) -> None:
-        with suppress(OSError):
-            for name in (JOURNAL, TERMS):
-                (self._folder / name).unlink(missing_ok=True)
-            self._folder.rmdir()
-
-    def _claim(self, terms: Terms, *, resume: bool) -> bool:
-        """Whether the folder held no batch. Then it holds the terms of this one."""
+    def _claim(self, terms: Terms, *, resume: bool) -> None:
         path = self._folder / TERMS
         try:
             there = json.loads(path.read_bytes())["fingerprint"]
@@ -105,18 +96,23 @@ class Results:
             there = None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UsageError(f"{path} cannot be read ({error}): choose another folder") from error
-        if there is None:
+        if there is None or not self._has_rows():
             document = {"fingerprint": terms.fingerprint, "terms": terms.model_dump(mode="json")}
             output.replace(path, json.dumps(document, sort_keys=True, indent=1).encode())
-            return True
-        if not resume:
+        elif not resume:
             raise UsageError(f"{self._folder} holds a batch: --resume goes on with it, another folder begins anew")
-        if there != terms.fingerprint:
+        elif there != terms.fingerprint:
             raise UsageError(
                 f"{self._folder} holds a batch of another configuration, rig, network or version of coec: its rows "
                 "cannot be compared with new ones; choose another folder"
             )
-        return False
+
+    def _has_rows(self) -> bool:
+        """Whether a window of the batch in the folder has a row, readable or not."""
+        with suppress(OSError):
+            if (self._folder / JOURNAL).stat().st_size > 0:
+                return True
+        return next(self._folder.glob("date=*/vehicle=*/*.parquet"), None) is not None
 
     @contextmanager
     def _writing(self, path: Path) -> Iterator[None]:

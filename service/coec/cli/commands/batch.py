@@ -25,6 +25,21 @@ class Options:
     engine: Annotated[
         Literal["local", "ray"], typer.Option(help="local: processes on this machine; ray: a Ray cluster.")
     ] = "local"
+    ray_address: Annotated[
+        str | None,
+        typer.Option(
+            help="Ray cluster: HOST:PORT; auto: the one on this machine; local: start one for this batch.",
+            metavar="ADDRESS",
+            show_default="$RAY_ADDRESS, else auto",
+        ),
+    ] = None
+    send_credentials: Annotated[
+        bool,
+        typer.Option(
+            "--send-credentials/--no-send-credentials",
+            help="Send the credentials for stores in this environment to the Ray nodes.",
+        ),
+    ] = True
     with_config: Annotated[
         Path | None,
         typer.Option("--with-config", help="Judge by this configuration instead of each window's own.", metavar="FILE"),
@@ -41,6 +56,14 @@ class Options:
         None
     )
     resume: Annotated[bool, typer.Option("--resume", help="Continue the batch that is in the folder.")] = False
+    keep_going: Annotated[
+        bool,
+        typer.Option(
+            "--keep-going",
+            help="Write a row for each window that fails for a common cause, such as an unreachable store, instead of "
+            "stopping early.",
+        ),
+    ] = False
     deadline_s: Annotated[float, typer.Option("--deadline", help="Time limit for one window, s.", min=1.0)] = 600.0
     memory_mib: Annotated[int, typer.Option("--memory", help="Memory limit for one process, MiB.", min=256)] = 2048
     as_json: Json = False

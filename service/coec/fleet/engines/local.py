@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
@@ -14,14 +13,12 @@ from typing import cast
 from coec.adapters.system.cores import one_thread_each
 from coec.adapters.system.memory import resident_bytes
 from coec.fleet.desk import Desk
-from coec.fleet.engines.engine import DEADLINE, PROCESS_DIED, TOO_LARGE, Bounds, FleetError
-from coec.fleet.engines.queue import AHEAD, Queue
+from coec.fleet.engines.engine import PROCESS_DIED, TOO_LARGE, Bounds
+from coec.fleet.engines.pool import Ended, Event, Judged, Pool, Started, Worker
+from coec.fleet.engines.queue import AHEAD
 from coec.fleet.places import Job
 from coec.fleet.terms import Terms
 from coec.schemas.fleet import WindowRow
-
-LOOK_S = 0.5
-"""Time between two checks of the processes' time and memory, s."""
 
 END_S = 5.0
 """Longest wait for a process that was told to end, s."""
@@ -30,67 +27,74 @@ READY = ""
 """The first message of a process."""
 
 
-class _Seat:
-    """A process, and the windows that it has."""
+class _Process:
+    """A process on this machine."""
 
     def __init__(self, terms: str) -> None:
         context = multiprocessing.get_context("spawn")
         self.link, theirs = context.Pipe()
         with one_thread_each():
-            self.process = context.Process(target=_work, args=(theirs, terms), daemon=True)
-            self.process.start()
+            self._process = context.Process(target=_work, args=(theirs, terms), daemon=True)
+            self._process.start()
         theirs.close()  # so that the pipe ends when the process does
-        self.has: dict[str, Job] = {}
-        self._ready = self._ended = False
-        self._told_s = time.monotonic()
+        self.ready = False
 
-    def give(self, job: Job) -> None:
-        """Gives the process another window."""
-        if not self.has:
-            self._told_s = time.monotonic()
-        self.has[job.url] = job
-        with suppress(OSError):  # the process has ended, which `trouble` will report
+    def submit(self, job: Job) -> None:
+        """See `Worker`."""
+        with suppress(OSError):  # the process has ended, which `received` will report
             self.link.send(job)
 
-    def hear(self) -> WindowRow | None:
-        """The row that has come through the pipe; None if it was something else."""
+    def received(self) -> Event:
+        """What has come through the pipe."""
         try:
-            told = self.link.recv()
+            message = self.link.recv()
         except (EOFError, OSError):
-            self._ended = True
-            return None
-        self._told_s = time.monotonic()
-        if told == READY:
-            self._ready = True
-            return None
-        row = WindowRow.model_validate_json(told)
-        del self.has[row.url]
-        return row
+            self._process.join(END_S)
+            status = self._process.exitcode
+            if not self.ready:
+                return Ended(
+                    self, PROCESS_DIED, f"a process for judging windows ended at its start, with status {status}"
+                )
+            return Ended(self, PROCESS_DIED, f"the process that judged it ended with status {status}")
+        if message == READY:
+            self.ready = True
+            return Started(self)
+        return Judged(self, WindowRow.model_validate_json(message))
 
-    def trouble(self, bounds: Bounds) -> tuple[str, str] | None:
-        """Code and text of why the process has to be replaced; None if it has not.
+    @property
+    def resident_bytes(self) -> int:
+        """Memory that it holds, bytes."""
+        return resident_bytes(self._process.pid)
 
-        Raises:
-            FleetError: the process ended during its start.
-        """
-        if self._ended:
-            self.process.join(END_S)
-            status = self.process.exitcode
-            if not self._ready:
-                raise FleetError(f"a process for judging windows ended at its start, with status {status}")
-            return PROCESS_DIED, f"the process that judged it ended with status {status}"
-        if self.has and time.monotonic() - self._told_s > bounds.seconds:
-            return DEADLINE, bounds.late
-        held = resident_bytes(self.process.pid)
-        if held > bounds.bytes:
-            return TOO_LARGE, f"its process held {held >> 20} MiB, of {bounds.bytes >> 20} (--memory)"
-        return None
-
-    def end(self) -> None:
-        """Kills the process, whatever it is doing."""
+    def close(self) -> None:
+        """See `Worker`."""
         self.link.close()
-        self.process.kill()
-        self.process.join(END_S)
+        self._process.kill()
+        self._process.join(END_S)
+
+
+class _Processes:
+    """Starts processes on this machine, and bounds their memory."""
+
+    def __init__(self, terms: str, bounds: Bounds) -> None:
+        self._terms = terms
+        self._bounds = bounds
+
+    def start(self) -> Worker:
+        """See `Workers`."""
+        return _Process(self._terms)
+
+    def events(self, workers: Sequence[Worker], timeout_s: float) -> Iterator[Event]:
+        """See `Workers`."""
+        processes = cast("Sequence[_Process]", workers)
+        for process in processes:
+            held = process.resident_bytes if process.ready else 0
+            if held > self._bounds.bytes:
+                text = f"its process held {held >> 20} MiB, of {self._bounds.bytes >> 20} (--memory)"
+                yield Ended(process, TOO_LARGE, text)
+        by_link = {process.link: process for process in processes if not process.link.closed}
+        for link in wait(list(by_link), timeout_s):
+            yield by_link[cast("Connection", link)].received()
 
 
 class LocalEngine:
@@ -103,27 +107,10 @@ class LocalEngine:
 
     def rows(self, jobs: Sequence[Job], terms: Terms) -> Iterator[WindowRow]:
         """See `Engine`."""
-        queue, told = Queue(jobs), terms.model_dump_json()
-        seats = [_Seat(told) for _ in range(min(self.cores, len(jobs)))]
-        try:
-            while queue or any(seat.has for seat in seats):
-                for seat in seats:
-                    while (job := queue.next_for(seat.has.values())) is not None:
-                        seat.give(job)
-                by_link = {seat.link: seat for seat in seats}
-                for link in wait(list(by_link), LOOK_S):
-                    row = by_link[cast("Connection", link)].hear()
-                    if row is not None:
-                        yield row
-                for index, seat in enumerate(seats):
-                    trouble = seat.trouble(self._bounds)
-                    if trouble is not None:
-                        seat.end()
-                        seats[index] = _Seat(told)
-                        yield from queue.give_back(seat.has.values(), *trouble)
-        finally:  # also if the caller stops before the end
-            for seat in seats:
-                seat.end()
+        yield from Pool(_Processes(terms.model_dump_json(), self._bounds), self._bounds).rows(jobs, self.cores)
+
+    def close(self) -> None:
+        """See `Engine`."""
 
 
 # --- in the process -------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The engine of a Ray cluster: an existing one (`RAY_ADDRESS`, or started on this machine), else a fresh one.
+"""The engine of a Ray cluster.
 
 Each process is an actor on one core. It declares the memory that a window may take, so that the cluster places no more
 actors than it can hold.
@@ -8,59 +8,195 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import socket
 import time
-from collections.abc import Generator, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, cast
 
+from coec import __version__
 from coec.adapters.system.cores import ONE_THREAD
 from coec.errors import SourceError
-from coec.fleet.engines.engine import DEADLINE, PROCESS_DIED, Bounds, FleetError
-from coec.fleet.engines.queue import AHEAD, Queue
-from coec.fleet.places import Job
+from coec.fleet.credentials import StoreCredentials
+from coec.fleet.engines.engine import NODE_LOST, NOT_ON_NODE, PROCESS_DIED, Bounds, FleetError
+from coec.fleet.engines.pool import Ended, Event, Judged, Pool, Started, Worker
+from coec.fleet.engines.queue import AHEAD
+from coec.fleet.places import Job, is_path, stores_of
 from coec.fleet.terms import Terms
+from coec.fleet.trouble import failed
 from coec.schemas.fleet import WindowRow
 
-LOOK_S = 1.0
-"""Time between two checks of how long windows take, s."""
+ADDRESS = "RAY_ADDRESS"
+"""Environment variable of Ray with the address of the cluster."""
+
+PING_S, SILENCE_S = 5.0, 45.0
+"""Time between two pings of an actor, and longest time without an answer to one, s. Ray itself finds a lost node after
+15 s if its connections break, but after more than a minute if it just falls silent."""
+
+GET_S = 30.0
+"""Longest time for fetching a row that is finished, s."""
+
+NODE_DIED = "because its node has died"
+"""What Ray's error says of an actor whose node was lost."""
+
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class _Judge:
     """Runs on a node of the cluster, which has coec installed."""
 
-    def __init__(self, terms: str) -> None:
+    def __init__(self, terms: str, credentials: StoreCredentials) -> None:
+        credentials.install()  # before the clients of stores are imported, which may read them then
         from coec.fleet.desk import Desk  # only the nodes need what calibrates
 
         self._desk = Desk(Terms.model_validate_json(terms))
+
+    def versions(self) -> tuple[str, str]:
+        """Host name of the node, and the version of coec on it."""
+        return socket.gethostname(), __version__
+
+    def ping(self) -> None:
+        """Returns at once."""
 
     def row(self, job: Job) -> str:
         """The row of a window, as JSON. For several threads."""
         return self._desk.row(job).model_dump_json()
 
 
-class _Seat:
-    """An actor and the windows that it has, by the reference of their future row."""
+class _Actor:
+    """An actor, and the references of the answers that it owes."""
 
-    def __init__(self, actor: Any) -> None:
+    def __init__(self, actor: Any, ray: Any) -> None:
         self.actor = actor
-        self.has: dict[Any, Job] = {}
-        self.told_s = time.monotonic()
+        self.versions: Any = actor.versions.remote()
+        self.rows: list[Any] = []
+        self.ping: Any = None
+        self.pinged_s = self.alive_s = 0.0
+        self._ray = ray
 
-    def give(self, job: Job) -> None:
-        """Gives the actor another window."""
-        if not self.has:
-            self.told_s = time.monotonic()
-        self.has[self.actor.row.remote(job)] = job
+    @property
+    def owed(self) -> list[Any]:
+        """References of all answers that have not come."""
+        return [*self.rows, *(one for one in (self.versions, self.ping) if one is not None)]
+
+    def submit(self, job: Job) -> None:
+        """See `Worker`."""
+        self.rows.append(self.actor.row.remote(job))
+
+    def close(self) -> None:
+        """See `Worker`."""
+        self._ray.kill(self.actor)
+
+
+class _Actors:
+    """Starts actors on the cluster, and reports what happens to them."""
+
+    def __init__(self, ray: Any, terms: str, credentials: StoreCredentials, bounds: Bounds) -> None:
+        self._ray = ray
+        self._arguments = (terms, credentials)
+        self._options = {
+            "num_cpus": 1,
+            "memory": bounds.bytes,
+            "max_concurrency": AHEAD + 1,  # one more for pings
+            "runtime_env": {"env_vars": dict(ONE_THREAD)},
+        }
+
+    def start(self) -> Worker:
+        """See `Workers`."""
+        return _Actor(self._ray.remote(_Judge).options(**self._options).remote(*self._arguments), self._ray)
+
+    def events(self, workers: Sequence[Worker], timeout_s: float) -> Iterator[Event]:
+        """See `Workers`."""
+        actors = cast("Sequence[_Actor]", workers)
+        owed = [one for actor in actors for one in actor.owed]
+        done: list[Any] = []
+        if not owed:
+            time.sleep(timeout_s)
+        elif self._ray.wait(owed, num_returns=1, timeout=timeout_s)[0]:
+            done, _ = self._ray.wait(owed, num_returns=len(owed), timeout=0)
+        for actor in actors:
+            yield from self._received(actor, set(done))
+
+    def _received(self, actor: _Actor, done: set[Any]) -> Iterator[Event]:
+        """What an actor has answered, and whether it still does."""
+        now_s = time.monotonic()
+        try:
+            if actor.versions in done:
+                answer, actor.versions = self._ray.get(actor.versions, timeout=GET_S), None
+                actor.alive_s = now_s
+                event = self._started(actor, *answer)
+                yield event
+                if isinstance(event, Ended):
+                    return
+            for row in [row for row in actor.rows if row in done]:
+                document = self._ray.get(row, timeout=GET_S)
+                actor.rows.remove(row)
+                actor.alive_s = now_s
+                yield Judged(actor, _explained(WindowRow.model_validate_json(document)))
+            if actor.ping in done:
+                self._ray.get(actor.ping, timeout=GET_S)
+                actor.ping, actor.alive_s = None, now_s
+        except self._ray.exceptions.RayError as error:
+            yield self._ended(actor, error)
+            return
+        if actor.versions is not None:
+            return
+        if now_s - actor.alive_s > SILENCE_S:
+            yield Ended(actor, NODE_LOST, f"the node that had it has not answered for {SILENCE_S:g} s", blame=False)
+        elif actor.ping is None and now_s - actor.pinged_s > PING_S:
+            actor.ping, actor.pinged_s = actor.actor.ping.remote(), now_s
+
+    def _started(self, actor: _Actor, host: str, version: str) -> Event:
+        if version == __version__:
+            return Started(actor)
+        text = f"the node {host} has coec {version}, but this machine {__version__}"
+        return Ended(actor, PROCESS_DIED, _unusable(text))
+
+    def _ended(self, actor: _Actor, error: Exception) -> Event:
+        """Why an actor does not answer any more: its process ended, or its node was lost."""
+        text = _COLOUR.sub("", str(error)).strip()
+        if isinstance(error, (self._ray.exceptions.ActorUnavailableError, self._ray.exceptions.GetTimeoutError)) or (
+            NODE_DIED in text
+        ):
+            return Ended(actor, NODE_LOST, "the node that had it was lost", blame=False)
+        if actor.versions is not None:
+            return Ended(actor, PROCESS_DIED, _unusable(text.rpartition("\n")[2].strip()))
+        return Ended(actor, PROCESS_DIED, f"the process that judged it ended: {type(error).__name__}")
+
+
+def _unusable(text: str) -> str:
+    return (
+        f"no process can judge windows on the Ray cluster: {text}; every node needs coec {__version__} with the same "
+        "extras as this machine, in the Python that runs `ray start`"
+    )
+
+
+def _explained(row: WindowRow) -> WindowRow:
+    """The row of a window; if the node lacks a file that this machine has, the row says so."""
+    if row.error is None or row.sha256 is not None or not is_path(row.url) or not Path(row.url).is_file():
+        return row
+    return failed(row, NOT_ON_NODE, f"a node of the cluster cannot read {row.url}, which exists on this machine")
 
 
 class RayEngine:
     """Judges windows on a Ray cluster."""
 
-    def __init__(self, cores: int | None, bounds: Bounds) -> None:
-        """`cores`: how many cores are used at most; None: all of the cluster.
+    def __init__(
+        self, cores: int | None, bounds: Bounds, address: str | None = None, *, send_credentials: bool = True
+    ) -> None:
+        """Connects to a cluster.
+
+        Args:
+            cores: how many cores are used at most; None: all of the cluster.
+            bounds: limits for each window.
+            address: `HOST:PORT` of the cluster; `auto`: one that runs on this machine; `local`: one is started on this
+                machine, and ends with this process. None: `RAY_ADDRESS`, else `auto`.
+            send_credentials: whether this process's credentials for stores are sent to the nodes.
 
         Raises:
             SourceError: Ray is not installed.
-            FleetError: there is no cluster, and none can be started.
+            FleetError: there is no cluster, or it has no room for a process.
         """
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # otherwise Ray reports to its vendor
         try:
@@ -69,52 +205,37 @@ class RayEngine:
             raise SourceError("the engine `ray` needs the optional extra `ray`: pip install 'coec[ray]'") from error
         self._ray = ray
         self._bounds = bounds
+        self._send_credentials = send_credentials
+        address = address or os.environ.get(ADDRESS) or "auto"
+        ours = {"include_dashboard": False} if address == "local" else {}
         try:
-            ray.init(
-                ignore_reinit_error=True,
-                include_dashboard=False,
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-                runtime_env={"env_vars": dict(ONE_THREAD)},
-            )
-            there = int(ray.cluster_resources().get("CPU", 0.0))
+            ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR, **ours)
+            nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         except Exception as error:  # of Ray, of the system, or of a library in between
-            raise FleetError(f"no Ray cluster: {type(error).__name__}: {error}") from error
-        self.cores = max(min(cores or there, there), 1)
+            raise FleetError(
+                f"no Ray cluster at {address}: {_COLOUR.sub('', str(error)).strip()}",
+                f"{ADDRESS}=HOST:6379 or --ray-address names one that runs (`ray start --head` starts it); "
+                "--ray-address local starts one on this machine for this batch; --engine local needs none",
+            ) from error
+        there = sum(int(min(node.get("CPU", 0.0), node.get("memory", 0.0) // bounds.bytes)) for node in nodes)
+        if there == 0:
+            raise FleetError(
+                f"no node of the Ray cluster at {address} has a core and {bounds.bytes >> 20} MiB for a process "
+                "(--memory)"
+            )
+        self.cores = min(cores or there, there)
 
     def rows(self, jobs: Sequence[Job], terms: Terms) -> Iterator[WindowRow]:
-        """See `Engine`."""
-        queue, told = Queue(jobs), terms.model_dump_json()
-        seats = [_Seat(self._actor(told)) for _ in range(min(self.cores, len(jobs)))]
-        try:
-            while queue or any(seat.has for seat in seats):
-                for seat in seats:
-                    while (job := queue.next_for(seat.has.values())) is not None:
-                        seat.give(job)
-                done, _ = self._ray.wait([row for seat in seats for row in seat.has], timeout=LOOK_S)
-                for index, seat in enumerate(seats):
-                    trouble = yield from self._heard(seat, done)
-                    if trouble is not None:
-                        self._ray.kill(seat.actor)
-                        seats[index] = _Seat(self._actor(told))
-                        yield from queue.give_back(seat.has.values(), *trouble)
-        finally:  # also if the caller stops before the end
-            for seat in seats:
-                self._ray.kill(seat.actor)
+        """See `Engine`. Credentials are sent for those stores only in which windows are.
 
-    def _heard(self, seat: _Seat, done: Sequence[Any]) -> Generator[WindowRow, None, tuple[str, str] | None]:
-        """Yields the finished rows of a process. Returns code and text of why it has to be replaced, or None."""
-        for row in [row for row in done if row in seat.has]:
-            try:
-                document = self._ray.get(row)
-            except self._ray.exceptions.RayError as error:
-                return PROCESS_DIED, f"the process that judged it ended: {type(error).__name__}"
-            seat.told_s = time.monotonic()
-            del seat.has[row]
-            yield WindowRow.model_validate_json(document)
-        late = seat.has and time.monotonic() - seat.told_s > self._bounds.seconds
-        return (DEADLINE, self._bounds.late) if late else None
+        Raises:
+            SourceError: credentials that should be sent cannot be read.
+        """
+        stores = stores_of(jobs) if self._send_credentials else ()
+        credentials = StoreCredentials.from_environment(stores, os.environ)
+        actors = _Actors(self._ray, terms.model_dump_json(), credentials, self._bounds)
+        yield from Pool(actors, self._bounds).rows(jobs, self.cores)
 
-    def _actor(self, terms: str) -> Any:
-        judge = self._ray.remote(_Judge)
-        return judge.options(num_cpus=1, memory=self._bounds.bytes, max_concurrency=AHEAD).remote(terms)
+    def close(self) -> None:
+        """Leaves the cluster, or ends it if it was started here."""
+        self._ray.shutdown()

@@ -1,0 +1,255 @@
+"""Distributes windows over the processes of an engine, wherever they run.
+
+A process gets windows when it has started, never before: one that no machine has room for holds none back. A window
+counts as tried only if it was with a process that ran. What a process does to its windows, and what is done about it:
+
+| the process | its windows |
+|---|---|
+| ended, or exceeded a bound | each is tried once more, alone; the second end is a row with an error |
+| was lost with its machine | are judged by others; the third loss is a row with an error |
+| failed several times in succession for a common cause | are judged by others; this process gets no more |
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from coec.fleet.engines.engine import COMMON_CAUSES, DEADLINE, Bounds, FleetError
+from coec.fleet.engines.queue import AHEAD, Queue
+from coec.fleet.places import Job
+from coec.schemas.fleet import WindowRow
+
+_log = logging.getLogger(__name__)
+
+POLL_S = 0.5
+"""Longest wait for an event of a process, s."""
+
+START_S = 300.0
+"""Longest wait for the first process, and for another one when all have ended, s. A busy cluster may need minutes to
+make room."""
+
+REPLACEMENT_S = 30.0
+"""The same when others gave up for a common cause, s: the processes that still start will hardly fare better."""
+
+START_TRIES = 3
+"""How many processes may fail at their start, while none runs."""
+
+
+class Worker(Protocol):
+    """A process that judges windows."""
+
+    def submit(self, job: Job) -> None:
+        """Sends a window to the process, which has started. Does not raise if it has ended meanwhile."""
+
+    def close(self) -> None:
+        """Ends the process at once, whatever it is doing. What it still sends is dropped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """A process runs and can judge windows."""
+
+    worker: Worker
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A process has judged a window."""
+
+    worker: Worker
+    row: WindowRow
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A process has ended, could not start, or must be ended.
+
+    Attributes:
+        worker: the process.
+        code: error code for its windows.
+        text: why, for people.
+        blame: whether a window may have caused it. False: the machine was lost.
+    """
+
+    worker: Worker
+    code: str
+    text: str
+    blame: bool = True
+
+
+Event = Started | Judged | Ended
+
+
+class Workers(Protocol):
+    """Starts processes, and reports what happens to them."""
+
+    def start(self) -> Worker:
+        """Begins to start a process; returns at once."""
+
+    def events(self, workers: Sequence[Worker], timeout_s: float) -> Iterable[Event]:
+        """What has happened to these processes; waits for the first event, at most for so long."""
+
+
+@dataclass(slots=True)
+class _Slot:
+    """What the pool knows about a process.
+
+    Attributes:
+        started: whether it runs.
+        jobs: the windows that it has, by URL.
+        progress_s: when it last finished something, or got windows after it had none.
+        alike: how many windows in succession failed for a common cause.
+    """
+
+    progress_s: float
+    started: bool = False
+    jobs: dict[str, Job] = field(default_factory=dict)
+    alike: int = 0
+
+
+class Pool:
+    """The processes that judge one batch."""
+
+    def __init__(self, workers: Workers, bounds: Bounds, clock: Callable[[], float] = time.monotonic) -> None:
+        self._workers = workers
+        self._bounds = bounds
+        self._clock = clock
+        self._slots: dict[Worker, _Slot] = {}
+        self._failed_starts = 0
+        self._common: WindowRow | None = None
+        self._available_s = clock()
+
+    def rows(self, jobs: Sequence[Job], cores: int) -> Iterator[WindowRow]:
+        """A row for each window, exactly one, in the order in which they are finished.
+
+        Args:
+            jobs: the windows, each once.
+            cores: largest number of processes at a time.
+
+        Raises:
+            FleetError: no process can be started, or windows could not be judged for a common cause. Those have no row.
+        """
+        queue = Queue(jobs)
+        self._available_s = self._clock()
+        try:
+            for _ in range(min(cores, len(jobs))):
+                self._start()
+            while queue or any(slot.jobs for slot in self._slots.values()):
+                self._assign(queue)
+                for event in self._workers.events(list(self._slots), POLL_S):
+                    yield from self._handle(event, queue)
+                yield from self._end_late(queue)
+                self._check_available()
+            if queue.unjudged:
+                raise self._error(f"{queue.unjudged} of {len(jobs)} windows could not be judged")
+        finally:  # also if the caller stops before the end
+            for worker in self._slots:
+                worker.close()
+
+    def _start(self) -> None:
+        self._slots[self._workers.start()] = _Slot(self._clock())
+
+    def _assign(self, queue: Queue) -> None:
+        # One window each before anybody gets a second one, so that the last windows run side by side.
+        for has in range(AHEAD):
+            for worker, slot in self._slots.items():
+                if slot.started and len(slot.jobs) == has and (job := queue.next_for(slot.jobs.values())) is not None:
+                    if not slot.jobs:
+                        slot.progress_s = self._clock()
+                    slot.jobs[job.url] = job
+                    worker.submit(job)
+
+    def _handle(self, event: Event, queue: Queue) -> Iterator[WindowRow]:
+        slot = self._slots.get(event.worker)
+        if slot is None:  # it has been given up, and its windows are with others
+            return
+        if isinstance(event, Started):
+            slot.started = True
+            self._failed_starts = 0
+        elif isinstance(event, Ended):
+            yield from self._end(event, queue)
+        else:
+            slot.progress_s = self._clock()
+            job = slot.jobs.pop(event.row.url, None)
+            if job is None:  # answered already
+                return
+            if self._bounds.alike is None or event.row.error_code not in COMMON_CAUSES:
+                slot.alike = 0
+                yield event.row
+                return
+            self._common = event.row
+            queue.postpone(job)
+            slot.alike += 1
+            if slot.alike >= self._bounds.alike:
+                self._retire(event.worker, event.row, queue)
+
+    def _end(self, event: Ended, queue: Queue) -> Iterator[WindowRow]:
+        """Replaces a process, and passes its windows on."""
+        slot = self._slots.pop(event.worker)
+        event.worker.close()
+        if slot.started or not event.blame:
+            self._start()
+        elif not self._any_started():
+            self._failed_starts += 1
+            if self._failed_starts >= START_TRIES:
+                raise FleetError(event.text)
+            self._start()
+        else:
+            _log.warning("a process for judging windows could not start", extra={"fields": {"reason": event.text}})
+        jobs = slot.jobs.values()
+        if event.blame:
+            yield from queue.give_back(jobs, event.code, event.text)
+        else:
+            fields = {"reason": event.text, "windows": [job.url for job in jobs]}
+            _log.warning("windows of a lost process are judged by others", extra={"fields": fields})
+            yield from queue.return_unblamed(jobs, event.text)
+
+    def _retire(self, worker: Worker, row: WindowRow, queue: Queue) -> None:
+        """Gives a process up that fails every window for the same cause; its windows go to others."""
+        slot = self._slots.pop(worker)
+        worker.close()
+        queue.put_back(slot.jobs.values())
+        _log.warning(
+            "a process for judging windows fails every window and gets no more",
+            extra={"fields": {"code": row.error_code, "reason": row.error}},
+        )
+
+    def _end_late(self, queue: Queue) -> Iterator[WindowRow]:
+        now_s = self._clock()
+        for worker, slot in list(self._slots.items()):
+            if slot.jobs and now_s - slot.progress_s > self._bounds.seconds:
+                yield from self._end(Ended(worker, DEADLINE, self._bounds.late), queue)
+
+    def _any_started(self) -> bool:
+        return any(slot.started for slot in self._slots.values())
+
+    def _check_available(self) -> None:
+        """Raises:
+        FleetError: no process runs, and none can be expected.
+        """
+        now_s = self._clock()
+        if self._any_started():
+            self._available_s = now_s
+            return
+        waited_s = now_s - self._available_s
+        if self._common is not None and (not self._slots or waited_s > REPLACEMENT_S):
+            raise self._error("the batch stops early")
+        if not self._slots or waited_s > START_S:
+            raise FleetError(
+                f"no process for judging windows has started within {START_S:g} s: each needs a core and "
+                f"{self._bounds.bytes >> 20} MiB (--memory); finished rows are kept, and --resume continues"
+            )
+
+    def _error(self, what: str) -> FleetError:
+        """The error of a batch with windows that failed for a common cause."""
+        row = self._common
+        assert row is not None
+        advice = COMMON_CAUSES[str(row.error_code)]
+        return FleetError(
+            f"{what}, because of a failure that does not depend on the window: {str(row.error).rstrip('.')}; {advice}. "
+            "These windows have no row: --resume tries them again, --keep-going writes a row with the error for each"
+        )
