@@ -65,6 +65,26 @@ def test_the_figures_of_a_recording() -> None:
     assert seen.standing == 0.0
 
 
+def test_clocks_that_are_apart_are_named_with_the_way_out() -> None:
+    (remark,) = (r for r in fitness_of(a_recording(late_ms=-3_600_000)).remarks if r.code == "no_pairs")
+    assert "the clouds are 3600.000 s ahead of the images" in remark.text
+    assert "PTP" in remark.text
+
+
+def test_points_that_are_left_out_are_named() -> None:
+    recording = a_recording()
+    assert "not_finite" not in codes(recording)
+
+    def with_some(frame: RecordedFrame) -> RecordedFrame:
+        return replace(frame, load_lidar=lambda: replace(frame.load_lidar(), not_finite=1))
+
+    frames = tuple(map(with_some, recording.frames))
+    seen = fitness_of(replace(recording, frames=frames))
+    assert seen.not_finite == pytest.approx(0.2)
+    (remark,) = (r for r in seen.remarks if r.code == "not_finite")
+    assert (remark.level, remark.text[:17]) == ("ok", "20% of the points")
+
+
 def test_a_cadence_tells_its_longest_gap() -> None:
     told = cadence([0, 100 * MS, 200 * MS, 1200 * MS])
     np.testing.assert_allclose([told.rate_hz, told.longest_gap_s], [10.0, 1.0])

@@ -301,6 +301,9 @@ def _manifest_seeds() -> list[bytes]:
         f"pair: front\nmask: a.png\ncamera: {FISHEYE}\nT_camera_lidar: {IDENTITY}\nframes:\n"
         "  - {image: a.ppm, cloud: a.bin, stamp_ns: 1, depth: depth.npy}\n"
         "  - {image: a.png, cloud: a.bin, stamp_ns: 100000000, cloud_stamp_ns: 90000000, depth: depth.png}\n",
+        f"pair: front\ncamera: {{image_width: 64, image_height: 48, distortion_model: plumb_bob, camera_matrix: "
+        f"{{data: [50, 0, 31, 0, 50, 23, 0, 0, 1]}}, distortion_coefficients: {{data: [0, 0, 0, 0, 0]}}}}\n"
+        f"T_camera_lidar: {IDENTITY}\nframes: [{{image: a.png, cloud: a.bin, stamp_ns: 1}}]\n",
     ]
     return [text.encode() for text in texts]
 

@@ -128,7 +128,7 @@ FRAME = {"image": "1.jpg", "cloud": "1.npy", "stamp_ns": 0}
         ({"frames": [{**FRAME, "stamp_ns": 2**63}]}, r"frames\.0\.stamp_ns"),
         ({"frames": [{**FRAME, "image": "absent.jpg"}]}, r"there is no file absent\.jpg"),
         ({"frames": [{**FRAME, "depth": "1.jpg"}]}, r"depth 1\.jpg is neither"),
-        ({"frames": [FRAME, FRAME]}, "same stamp"),
+        ({"frames": [FRAME, FRAME, {**FRAME, "stamp_ns": 9}]}, "same stamp"),
         ({"frames": [{**FRAME, "cloud_stamp_ns": 5}, {**FRAME, "stamp_ns": 1}]}, "order of their images"),
         ({"frames": [{**FRAME, "twist": {"linear_mps": [1, 2, 3]}}]}, "angular_radps: is missing"),
         ({"T_camera_lidar": [*IDENTITY[:3], [0, 0, 0, 2]]}, "T_camera_lidar is not a rigid"),
@@ -146,6 +146,93 @@ def test_what_the_contract_does_not_allow_is_refused_by_place(
     with pytest.raises(SourceError, match=complaint) as caught:
         open_source(str(tmp_path))
     assert "dataset.yaml" in str(caught.value)
+
+
+def numbered(*stamps_ns: float) -> dict[str, Any]:
+    return {"frames": [{**FRAME, "stamp_ns": stamp_ns} for stamp_ns in stamps_ns]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "way_out"),
+    [
+        ({"T_lidar_camera": IDENTITY}, "T_lidar_camera: there is no such key; .*write the inverse of this matrix"),
+        ({"camera_from_lidar": IDENTITY}, "the pose is called `T_camera_lidar`"),
+        (numbered(1600000000.5, 1600000000.6), r"frames\.0\.stamp_ns: .*multiply seconds by 1000000000"),
+        (numbered(1600000000, 1600000002), "looks like seconds: multiply every stamp by 1000000000"),
+        (numbered(1600000000000, 1600000000100), "looks like milliseconds: multiply every stamp by 1000000$"),
+        (numbered(0, 0, 0), "all 3 frames have the stamp_ns 0: .*number them: 0, 100000000"),
+        ({"camera": {"camera_matrix": {"data": [0.0] * 9}}}, "image_width is missing"),
+        ({"camera": "a\0b"}, "a name in a path has no zero byte"),
+        ({"camera": {"k": [10**400], "width": 64, "height": 48}}, "camera_matrix is no list of numbers"),
+        ({"camera": "absent.yaml"}, r"there is no file .*absent\.yaml"),
+    ],
+)
+def test_what_people_write_by_mistake_is_refused_with_the_way_out(
+    tmp_path: Path, changes: dict[str, Any], way_out: str
+) -> None:
+    a_dataset(tmp_path, **changes)
+    with pytest.raises(SourceError, match=way_out):
+        open_source(str(tmp_path))
+
+
+def test_stamps_that_can_be_nanoseconds_are_taken_as_they_are(tmp_path: Path) -> None:
+    a_dataset(tmp_path, **numbered(1600000000, 1700000000))
+    assert open_source(str(tmp_path)).camera_stamps_ns == (1600000000, 1700000000)
+
+
+NUMBERS = {"width": 64, "height": 48, "fx": 50, "fy": 51, "cx": 31.5, "cy": 23.5}
+POLYNOMIAL = {"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.002, "k3": 0.003}
+
+
+@pytest.mark.parametrize(
+    ("ros", "ours", "parameters"),
+    [
+        ("plumb_bob", "radtan", POLYNOMIAL),
+        ("rational_polynomial", "rational", {**POLYNOMIAL, "k4": 0.1, "k5": 0.01, "k6": 0.001}),
+        ("equidistant", "kannala_brandt", {"k1": 0.1, "k2": 0.01, "k3": 0.001, "k4": 0.0}),
+        ("fisheye", "kannala_brandt", {"k1": 0.1, "k2": 0.01, "k3": 0.001, "k4": 0.0}),
+    ],
+)
+def test_models_of_lenses_may_have_the_names_of_ros(
+    tmp_path: Path, ros: str, ours: str, parameters: dict[str, float]
+) -> None:
+    a_dataset(tmp_path, camera={"model": ros, **NUMBERS, **parameters})
+    camera = open_source(str(tmp_path)).rig.camera
+    assert cameras.name_of(camera) == ours
+    assert cameras.intrinsics_of(camera) == {**NUMBERS, **parameters}
+
+
+K = [50.0, 0.0, 31.5, 0.0, 51.0, 23.5, 0.0, 0.0, 1.0]
+CAMERA_INFO = {
+    "image_width": 64, "image_height": 48, "camera_name": "front", "distortion_model": "plumb_bob",
+    "camera_matrix": {"rows": 3, "cols": 3, "data": K},
+    "distortion_coefficients": {"rows": 1, "cols": 5, "data": list(POLYNOMIAL.values())},
+}  # fmt: skip
+ECHOED = {
+    "header": {"frame_id": "optical"}, "width": 64, "height": 48, "distortion_model": "plumb_bob", "k": K,
+    "d": list(POLYNOMIAL.values()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("info", [CAMERA_INFO, ECHOED], ids=["camera_calibration", "ros2 topic echo"])
+@pytest.mark.parametrize("beside", [True, False], ids=["named", "within"])
+def test_a_camera_info_is_taken_as_the_camera(tmp_path: Path, info: dict[str, Any], *, beside: bool) -> None:
+    with (tmp_path / "camera_info.yaml").open("w") as stream:
+        YAML().dump(info, stream)
+    a_dataset(tmp_path, camera="camera_info.yaml" if beside else info)
+    camera = open_source(str(tmp_path)).rig.camera
+    assert cameras.intrinsics_of(camera) == {**NUMBERS, **POLYNOMIAL}
+    with pytest.raises(SourceError, match=r"name it as `camera: camera_info\.yaml`"):
+        open_source(str(tmp_path / "camera_info.yaml"))
+
+
+def test_points_that_are_not_finite_are_counted(tmp_path: Path) -> None:
+    a_dataset(tmp_path)
+    points = np.ones((7, 3), np.float32)
+    points[3] = np.nan
+    np.save(tmp_path / "1.npy", points)
+    sweep = next(m for m in open_source(str(tmp_path)).messages() if isinstance(m, LidarFrame))
+    assert (len(sweep.xyz_m), sweep.not_finite) == (6, 1)
 
 
 def test_files_that_lie_are_named_when_it_is_their_turn(tmp_path: Path) -> None:

@@ -101,6 +101,7 @@ class LidarFrame:
         ring: (N,) uint16 or None.
         time_offset_s: (N,) float32 or None: when each point was measured, relative to `stamp_ns`.
         timed_by: a line for people: how point times were read if the message leaves that open; empty otherwise.
+        not_finite: number of points that were left out because their position or time is not finite.
     """
 
     stamp_ns: int
@@ -111,6 +112,7 @@ class LidarFrame:
     time_offset_s: NDArray[np.float32] | None = None
     sequence: int | None = None
     timed_by: str = ""
+    not_finite: int = 0
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)

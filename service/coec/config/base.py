@@ -63,6 +63,33 @@ class Stage(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+INVERSE = "the pose is `T_camera_lidar`, which maps LiDAR to camera coordinates: write the inverse of this matrix there"
+SAME = "the pose is called `T_camera_lidar`: its four rows, mapping LiDAR to camera coordinates"
+OTHER_NAMES = {
+    "T_lidar_camera": INVERSE,
+    "lidar_from_camera": INVERSE,
+    "T_cam_lidar": SAME,
+    "camera_from_lidar": SAME,
+    "extrinsic": SAME,
+    "extrinsics": SAME,
+}
+"""What to write in place of a key that other programs, or other files of coec, have."""
+
+
+def _advice(name: str, kind: str) -> str:
+    """What to do about a mistake at a key, beyond pydantic's own words; empty if they say it."""
+    if kind == "extra_forbidden" and name in OTHER_NAMES:
+        return f"; {OTHER_NAMES[name]}"
+    if kind.startswith("int") and name.endswith("_ns"):
+        return "; it counts nanoseconds, a whole number: multiply seconds by 1000000000"
+    if kind == "model_type" and name == "intrinsics":
+        return (
+            " (model, width, height, fx, ...); `coec convert BAG OUT.yaml` writes them from a bag's CameraInfo, or "
+            "from the camera_info.yaml in BAG?intrinsics=FILE"
+        )
+    return ""
+
+
 def describe(error: ValidationError, names: Mapping[str, Sequence[str]] | None = None) -> str:
     """Pydantic's complaints in one line: where and what, with `; ` between them. `names` holds the names of the entries
     of each list at the top of the file; they stand in place of the entries' indices."""
@@ -71,6 +98,6 @@ def describe(error: ValidationError, names: Mapping[str, Sequence[str]] | None =
         place = list(item["loc"])
         if len(place) > 1 and isinstance(place[1], int) and place[1] < len(known.get(str(place[0]), ())):
             place[1] = known[str(place[0])][place[1]]
-        what = OUR_WORDS.get(item["type"], item["msg"])
+        what = OUR_WORDS.get(item["type"], item["msg"]) + _advice(str(place[-1]) if place else "", item["type"])
         lines.append(f"{'.'.join(str(part) for part in place) or '(top)'}: {what}")
     return "; ".join(lines)

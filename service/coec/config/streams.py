@@ -4,9 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from coec.config.base import IDENTITY, FilePath, KeyExpression, Matrix4x4, Name, Stage
+
+ROS_NAMES = {
+    "plumb_bob": "radtan",
+    "rational_polynomial": "rational",
+    "equidistant": "kannala_brandt",
+    "fisheye": "kannala_brandt",
+    "ds": "double_sphere",
+    "cata": "mei",
+}
+"""Models of lenses by the names that ROS (sensor_msgs/distortion_models.hpp), OpenCV and Kalibr have for them."""
 
 
 class CameraIntrinsics(Stage):
@@ -35,6 +45,11 @@ class CameraIntrinsics(Stage):
     k6: float | None = Field(default=None, description="radial, below the fraction (rational)")
     p1: float | None = Field(default=None, description="tangential (radtan, rational, mei)")
     p2: float | None = Field(default=None, description="tangential (radtan, rational, mei)")
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _name_of_ros(cls, name: Any) -> Any:
+        return ROS_NAMES.get(name, name) if isinstance(name, str) else name
 
     def parameters(self) -> dict[str, float]:
         """The intrinsics that were given, by name, without `model`."""

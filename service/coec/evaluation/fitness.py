@@ -20,7 +20,7 @@ from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
 from coec.geometry.vectors import lengths
 from coec.sources.recording import Recording
-from coec.sources.windows import evenly
+from coec.sources.windows import clocks_text, evenly
 
 NS_PER_S = 1e9
 
@@ -29,6 +29,9 @@ LOOKED_AT = 12
 
 LITTLE_IN_VIEW = 0.03
 """Share of a sweep's points in view below which there is a remark. A 60° camera sees a tenth of a turning LiDAR's."""
+
+SOME_NOT_FINITE = 0.01
+"""Share of points without a finite position from which on there is a remark."""
 
 SMEARING_MPS = 1.0
 """Above this speed an uncompensated sweep of 0.1 s smears near objects by more than the spacing of its beams."""
@@ -79,6 +82,8 @@ class Fitness:
         paired: share of the frames looked at that found a sweep.
         sync_ms: (median, most) of camera stamp minus sweep stamp, milliseconds.
         in_view: share of a sweep's points that the nominal extrinsic puts into the image, median.
+        not_finite: share of a sweep's points that have no finite position or time, and are left out, median.
+        clocks: how far the stamps of the streams are apart, in a line; empty where frames find a sweep.
         remarks: the most important first.
     """
 
@@ -100,6 +105,8 @@ class Fitness:
     paired: float
     sync_ms: tuple[float, float] | None
     in_view: float
+    not_finite: float
+    clocks: str
     remarks: tuple[Remark, ...]
 
 
@@ -151,6 +158,8 @@ def fitness_of(recording: Recording) -> Fitness:
         paired=len(pairs) / len(chosen) if chosen else 0.0,
         sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
         in_view=float(np.median([in_view(sweep, rig) for sweep in sweeps])) if sweeps else 0.0,
+        not_finite=float(np.median([_not_finite(sweep) for sweep in sweeps])) if sweeps else 0.0,
+        clocks="" if pairs else clocks_text(stamps_ns, recording.sweep_stamps_ns),
         remarks=(),
     )
     return _with_remarks(seen)
@@ -197,6 +206,7 @@ def _remarks(seen: Fitness) -> list[Remark | None]:
         _too_short(seen),
         _unpaired(seen),
         _view(seen),
+        _finite(seen),
         _motion(seen),
         _standing(seen),
         _rings(seen),
@@ -214,9 +224,7 @@ def _too_short(seen: Fitness) -> Remark | None:
 def _unpaired(seen: Fitness) -> Remark | None:
     tolerance_ms = 1e3 * PairingConfig().tolerance_s
     if seen.paired == 0.0:
-        return Remark(
-            "fail", "no_pairs", f"No camera frame has a sweep within {tolerance_ms:.0f} ms: are the clocks in step?"
-        )
+        return Remark("fail", "no_pairs", f"No camera frame has a sweep within {tolerance_ms:.0f} ms: {seen.clocks}.")
     if seen.paired < 0.9:
         return Remark("warn", "few_pairs", f"{1 - seen.paired:.0%} of the camera frames have no sweep near them.")
     return None
@@ -227,6 +235,21 @@ def _view(seen: Fitness) -> Remark | None:
         return None
     text = f"{seen.in_view:.1%} of the points lie in the image at the nominal extrinsic: is it from LiDAR to camera?"
     return Remark("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
+
+
+def _not_finite(sweep: LidarFrame) -> float:
+    return sweep.not_finite / (sweep.not_finite + len(sweep.xyz_m))
+
+
+def _finite(seen: Fitness) -> Remark | None:
+    if seen.not_finite < SOME_NOT_FINITE:
+        return None
+    return Remark(
+        "ok",
+        "not_finite",
+        f"{seen.not_finite:.0%} of the points have no finite position or time and are left out. This is so in "
+        "organised clouds, where a beam without an echo gives NaN; if yours is none, see to its driver or filter.",
+    )
 
 
 def _motion(seen: Fitness) -> Remark | None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
+
 from coec.errors import SourceError, UsageError
 from coec.sources.recording import Recording
 from coec.sources.spec import FORMS, SourceSpec, is_bag, parse_spec
@@ -35,9 +38,29 @@ def open_source(spec: str) -> Recording:
     return _open_path(parsed)
 
 
+ROS_1 = ".bag"
+
+
+def _bags_of_ros_1(path: Path) -> list[Path]:
+    """The file, or the files in a folder that holds nothing which is read."""
+    if path.is_dir():
+        readable = (path / "metadata.yaml").exists() or (path / "dataset.yaml").exists()
+        return [] if readable else sorted(file for file in path.glob(f"*{ROS_1}") if file.is_file())
+    return [path] if path.suffix == ROS_1 else []
+
+
 def _open_path(spec: SourceSpec) -> Recording:
     if not spec.path.exists():
         raise SourceError(f"{spec.path} does not exist", FORMS)
+    ros_1 = _bags_of_ros_1(spec.path)
+    if ros_1:
+        given = " ".join(shlex.quote(str(path)) for path in ros_1)
+        folder = spec.path.with_suffix("") if spec.path.suffix == ROS_1 else spec.path / "ros2"
+        made = shlex.quote(str(folder))
+        raise SourceError(
+            f"{spec.path} is a bag of ROS 1, and bags of ROS 2 are read: `rosbags-convert --src {given} --dst {made}` "
+            f"(installed with coec) writes one; then give {made}"
+        )
     if is_bag(spec):
         from coec.sources.bag.recording import open_bag
 

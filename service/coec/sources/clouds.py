@@ -73,6 +73,7 @@ def _frame(stamp_ns: int, frame_id: str, path: Path, columns: Columns) -> LidarF
         intensity=None if intensity is None else intensity.astype(np.float32),
         ring=None if ring is None else ring.astype(np.uint16),
         time_offset_s=None if time_offset_s is None else time_offset_s.astype(np.float32),
+        not_finite=int((~keep).sum()),
     )
 
 

@@ -18,11 +18,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.images.codec import encode_depth_png, probe, raw_image
+from coec.adapters.ros.camera_info import info_of_yaml
 from coec.calibration.frames.concatenation import SeveralOrigins
 from coec.calibration.frames.origin import ApparentOrigin
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Name, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
+from coec.sources.bag.rig import with_camera_info
 from coec.sources.clouds import load_cloud, measured_from
 from coec.sources.kitti_files import load_image
 from coec.sources.reading import read_bytes, read_npy
@@ -91,8 +93,13 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         text = load_yaml(path)
     except ConfigError as error:
         raise SourceError(str(error)) from error
+    if info_of_yaml(text) is not None:
+        raise SourceError(
+            f"{path} is the calibration of a camera in ROS's form, no list of frames: name it as `camera: {path.name}` "
+            f"in a {FILE_NAME}, or behind a bag as BAG?intrinsics={path.name}"
+        )
     try:
-        document = ManifestDocument.model_validate(text)
+        document = ManifestDocument.model_validate(with_camera_info(text, path, rectified=False))
         camera = camera_of(document.camera)
         T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
         T_cloud_lidar = rigid_matrix(document.T_cloud_lidar, "T_cloud_lidar")
@@ -129,15 +136,40 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
 
 
 def _check_frames(path: Path, frames: Sequence[FrameDocument]) -> None:
-    for stream in ([f.stamp_ns for f in frames], [_cloud_stamp_ns(f) for f in frames]):
+    stamps_ns = [frame.stamp_ns for frame in frames]
+    if len(frames) > 1 and len(set(stamps_ns)) == 1:
+        raise SourceError(
+            f"{path}: all {len(frames)} frames have the stamp_ns {stamps_ns[0]}: write when each was taken, in "
+            "nanoseconds; if only the rate is known, number them: 0, 100000000, 200000000, ... at 10 Hz"
+        )
+    unit = _unit_of(stamps_ns)
+    if unit is not None:
+        name, factor = unit
+        raise SourceError(
+            f"{path}: stamp_ns counts nanoseconds, and {stamps_ns[0]} with the next after "
+            f"{stamps_ns[1] - stamps_ns[0]} looks like {name}: multiply every stamp by {factor}"
+        )
+    for stream in (stamps_ns, [_cloud_stamp_ns(f) for f in frames]):
         if any(later <= earlier for earlier, later in pairwise(stream)):
-            raise SourceError(f"{path}: two frames have the same stamp, or clouds are not in the order of their images")
+            raise SourceError(
+                f"{path}: two frames have the same stamp, or clouds are not in the order of their images: correct "
+                "stamp_ns and cloud_stamp_ns, or leave out the frame that stands there twice"
+            )
     for frame in frames:
         for file in (frame.image, frame.cloud, frame.depth):
             if file is not None and not (path.parent / file).is_file():
                 raise SourceError(f"{path}: there is no file {file}")
         if frame.depth is not None and frame.depth.suffix not in (".png", ".npy"):
             raise SourceError(f"{path}: depth {frame.depth} is neither .png nor .npy")
+
+
+def _unit_of(stamps_ns: Sequence[int]) -> tuple[str, int] | None:
+    """The unit in which stamps were written by mistake, and its factor; None if they can be nanoseconds. No camera
+    takes a thousand pictures a second, and stamps of an epoch tell their unit by their size."""
+    if len(stamps_ns) < 2 or float(np.median(np.diff(stamps_ns))) >= 1e6:
+        return None
+    units = ((10**9, 10**11, "seconds", 10**9), (10**12, 10**14, "milliseconds", 10**6), (10**15, 10**17, "µs", 10**3))
+    return next(((name, factor) for least, most, name, factor in units if least <= stamps_ns[0] < most), None)
 
 
 def _cloud_stamp_ns(frame: FrameDocument) -> int:

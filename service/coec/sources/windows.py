@@ -98,12 +98,28 @@ def chosen_from(
     if not pairs:
         raise NoPairsError(
             f"{recording.name}: none of {len(chosen)} camera frames has a sweep within "
-            f"{PairingConfig().tolerance_s} s: check the stamps of both"
+            f"{PairingConfig().tolerance_s} s: {clocks_text(recording.camera_stamps_ns, recording.sweep_stamps_ns)}"
         )
     window_id = f"{recording.rig.pair}-{pairs[0].stamp_ns}"
     window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
     losses = {cause: count for cause, count in pairer.losses.items() if count}
     return Loaded(window, recording.configuration, _default_vehicle(), losses)
+
+
+def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:
+    """How far the stamps of two streams are apart if no frame of one has a partner in the other, and what to do."""
+    if not camera_stamps_ns or not sweep_stamps_ns:
+        return "one of the two streams is empty"
+    cameras, sweeps = (np.array(stamps, dtype=np.float64) * 1e-9 for stamps in (camera_stamps_ns, sweep_stamps_ns))
+    apart_s = float(np.median([sweeps[np.abs(sweeps - stamp_s).argmin()] - stamp_s for stamp_s in cameras]))
+    overlap = sweeps[0] <= cameras[-1] and cameras[0] <= sweeps[-1]
+    if not overlap:
+        apart_s = float(sweeps[0] - cameras[0])
+    return (
+        f"the clouds are {abs(apart_s):.3f} s {'ahead of' if apart_s > 0 else 'behind'} the images. The stamps must be "
+        "of one clock: let both drivers take the computer's time, or synchronise the sensors (PTP), and record again; "
+        "where the difference is known, correct the stamps of one stream"
+    )
 
 
 def evenly(count: int, wanted: int) -> list[int]:

@@ -1,5 +1,6 @@
 """The recording of a pair in a ROS 2 bag, and recorded windows."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,10 @@ def numbered_cloud(stamp_ns: int) -> Any:
 
 
 def test_one_lidar_of_a_cloud_of_several_is_chosen(tmp_path: Path) -> None:
-    drive = [(topic, numbered_cloud(5) if topic == "/points" else message) for topic, message in a_drive()]
+    drive = [
+        (topic, numbered_cloud(5 + number) if topic == "/points" else message)
+        for number, (topic, message) in enumerate(a_drive())
+    ]
     path = Bag(drive).write(tmp_path / "b.mcap")
     with pytest.raises(SourceError, match=r"concatenated: its lidar_id has 0, 1; choose one"):
         open_source(str(path))
@@ -306,3 +310,28 @@ def test_a_recorded_window_is_a_recording_of_its_pairs(tmp_path: Path) -> None:
 
 def stamps(pair: FramePair) -> tuple[int, int, EgoMotion | None]:
     return pair.camera.stamp_ns, pair.lidar.stamp_ns, pair.motion
+
+
+@pytest.mark.parametrize("topic", ["/front/image", "/points"])
+def test_messages_without_stamps_are_refused_with_the_way_out(tmp_path: Path, topic: str) -> None:
+    drive = a_drive()
+    for name, message in drive:
+        if name == topic:
+            message.header.stamp.sec = message.header.stamp.nanosec = 0
+    bag = Bag(drive).write(tmp_path / "b.mcap")
+    with pytest.raises(
+        SourceError, match=f"messages on {topic} have the stamp 0 ns .* let the driver fill header.stamp"
+    ):
+        open_source(str(bag))
+
+
+def test_a_camera_info_in_a_file_gives_the_intrinsics(tmp_path: Path) -> None:
+    info = {
+        "image_width": WIDTH, "image_height": HEIGHT, "distortion_model": "plumb_bob",
+        "camera_matrix": {"data": [50.0, 0.0, 31.5, 0.0, 51.0, 23.5, 0.0, 0.0, 1.0]},
+        "distortion_coefficients": {"data": [0.0] * 5},
+    }  # fmt: skip
+    (tmp_path / "camera_info.yaml").write_text(json.dumps(info))  # which is YAML, too
+    bag = Bag(a_drive()).write(tmp_path / "b.mcap")
+    camera = open_source(f"{bag}?intrinsics={tmp_path / 'camera_info.yaml'}").rig.camera
+    assert (cameras.name_of(camera), cameras.intrinsics_of(camera)["fy"]) == ("pinhole", 51.0)

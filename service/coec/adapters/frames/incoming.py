@@ -104,7 +104,7 @@ def lidar_frame(
         ring = None if ring is None else ring[keep]
         time_offset_s = None if time_offset_s is None else time_offset_s[keep]
     if len(xyz_m) == 0:
-        raise DecodeError(Refusal.CLOUD_EMPTY, "the cloud has no finite point")
+        raise DecodeError(Refusal.CLOUD_EMPTY, "the cloud has no finite point: see to its driver or filter")
     if time_offset_s is not None and np.abs(time_offset_s).max() > MAX_TIME_OFFSET_S:
         raise DecodeError(
             Refusal.CLOUD_TIME,
@@ -119,4 +119,5 @@ def lidar_frame(
         time_offset_s=time_offset_s,
         sequence=sequence,
         timed_by=timed_by,
+        not_finite=0 if keep is None else int(len(keep) - len(xyz_m)),
     )

@@ -106,6 +106,50 @@ def info_of(message: Any) -> Info:
     )
 
 
+def info_of_yaml(document: object) -> Info | None:
+    """The content of a YAML file with a `CameraInfo`: as ROS's camera_calibration writes it (`camera_matrix`), or as
+    `ros2 topic echo` prints the message. None if it is neither.
+
+    Raises:
+        SourceError: it is one, and a number is absent or of the wrong form; says which.
+    """
+    if not isinstance(document, dict) or not ({"camera_matrix", "k", "K"} & document.keys()):
+        return None
+
+    def numbers(names: Sequence[str], count: int | None, default: Sequence[float] | None = None) -> tuple[float, ...]:
+        value = next((document[name] for name in names if name in document), default)
+        value = value.get("data") if isinstance(value, dict) else value
+        try:
+            found = tuple(float(number) for number in value or ())
+        except (TypeError, ValueError, OverflowError) as error:
+            raise SourceError(f"{names[0]} is no list of numbers") from error
+        if count is not None and len(found) != count:
+            raise SourceError(f"{names[0]} has {len(found)} numbers, not {count}")
+        return found
+
+    def whole(names: Sequence[str]) -> int:
+        value = next((document[name] for name in names if name in document), None)
+        if not isinstance(value, int) or value <= 0:
+            raise SourceError(f"{names[0]} is missing, or is no positive number of pixels")
+        return value
+
+    d = numbers(("distortion_coefficients", "d", "D"), None)
+    model = document.get("distortion_model", "plumb_bob")
+    if len(d) > MAX_COEFFICIENTS or not isinstance(model, str):
+        raise SourceError(f"a CameraInfo has the name of a model, and at most {MAX_COEFFICIENTS} coefficients")
+    return Info(
+        frame_id="",
+        size=(whole(("image_width", "width")), whole(("image_height", "height"))),
+        model=model,
+        d=d,
+        k=numbers(("camera_matrix", "k", "K"), 9),
+        r=numbers(("rectification_matrix", "r", "R"), 9, np.eye(3).ravel().tolist()),
+        p=numbers(("projection_matrix", "p", "P"), 12, np.zeros(12).tolist()),
+        binning=(1, 1),
+        roi=(0, 0, 0, 0),
+    )
+
+
 def info_topic(image_topic: str) -> str:
     """The topic of the `CameraInfo` for an image topic, by image_transport's rule: beside the image, for any
     transport."""

@@ -192,7 +192,21 @@ def _streams(
     found = motion_topic(index, reader, frames, asked)
     places = index.streams[found].ordered() if found in index.streams else []
     moved = moved_on(index, reader, found, frames) if found is not None and not places else ()
+    for topic in (camera, lidar):
+        _require_stamps(index, topic)
     return Streams(index.streams[camera].ordered(), index.streams[lidar].ordered(), places, moved)
+
+
+def _require_stamps(index: Index, topic: str) -> None:
+    """Raises SourceError if all messages of a topic have one stamp."""
+    stamps_ns = {place.stamp_ns for place in index.streams[topic].places}
+    count = len(index.streams[topic].places)
+    if count > 1 and len(stamps_ns) == 1:
+        raise SourceError(
+            f"{index.path}: all {count} messages on {topic} have the stamp {stamps_ns.pop()} ns in their header, so "
+            "nothing says when each was measured: let the driver fill header.stamp, and record again (the time at "
+            "which the recorder received a message is no replacement, it is milliseconds late)"
+        )
 
 
 def _frames(text: str | None) -> tuple[str, str]:

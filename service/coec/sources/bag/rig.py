@@ -3,18 +3,48 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from coec.adapters.files.home import from_home
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
-from coec.adapters.ros.camera_info import Info, Lens, info_topic, is_rectified, lens_of
+from coec.adapters.ros.camera_info import Info, Lens, info_of_yaml, info_topic, is_rectified, lens_of
 from coec.adapters.ros.transforms import bare
 from coec.calibration.types import CameraFrame, EgoMotion, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, SourceError
 from coec.sources.bag.index import Index
+
+_PATH: TypeAdapter[Path] = TypeAdapter(FilePath)
+
+
+def with_camera_info(document: Any, path: Path, rectified: bool) -> Any:
+    """The document of a file with a `camera:`, in which that may be a `camera_info.yaml` of ROS: its content, or its
+    path. The whole file may be one, too. Any other document is returned as it is.
+
+    Raises:
+        SourceError: it is a `CameraInfo` that describes no lens.
+        ConfigError: the named file cannot be read.
+        ValidationError: its name is no path.
+    """
+    whole = info_of_yaml(document) is not None
+    camera = document if whole else document.get("camera") if isinstance(document, dict) else None
+    if isinstance(camera, str):
+        path = path.parent / _PATH.validate_python(camera)
+        if not path.is_file():
+            raise SourceError(f"camera: there is no file {path}; give the lens here, or name a camera_info.yaml")
+        camera = load_yaml(path)
+    try:
+        info = info_of_yaml(camera)
+        if info is None:
+            return document
+        intrinsics = lens_of(info, rectified=rectified).intrinsics.model_dump(exclude_none=True)
+    except SourceError as error:
+        raise SourceError(f"{path}, a CameraInfo: {error}") from error
+    return {"camera": intrinsics} if whole else {**document, "camera": intrinsics}
 
 
 class RigFile(BaseModel):
@@ -51,7 +81,7 @@ def rig_of_bag(
             camera = camera_of(_lens(index, info, image_topic).intrinsics)
         else:
             path = from_home(intrinsics)
-            document = RigFile.model_validate(load_yaml(path))
+            document = RigFile.model_validate(with_camera_info(load_yaml(path), path, is_rectified(image_topic)))
             camera = camera_of(document.camera)
             if document.T_camera_lidar is not None:
                 T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
@@ -64,7 +94,8 @@ def rig_of_bag(
     if T_camera_lidar is None:
         raise SourceError(
             f"{index.path}: /tf_static does not connect {camera_frame!r} and {lidar_frame!r}; "
-            "give ?intrinsics=FILE with `camera:` and `T_camera_lidar:` as in a dataset.yaml"
+            "give ?intrinsics=FILE with `camera:` (which may name a camera_info.yaml) and `T_camera_lidar:` as in a "
+            "dataset.yaml"
         )
     if (image.image.width, image.image.height) != (camera.width, camera.height):
         raise SourceError(
