@@ -23,7 +23,7 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.endpoints import without_secrets
 from coec.adapters.zenoh.inputs import Input, Sample
-from coec.adapters.zenoh.settings import endpoints_of, settings_of, where
+from coec.adapters.zenoh.settings import check_certificates, endpoints_of, settings_of, where
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
 from coec.schemas.base import to_json, to_msgpack
@@ -94,11 +94,12 @@ def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
     """The session of a peer that connects and reconnects to the router, or of the router itself.
 
     Raises:
-        ConfigError: as `settings_of`.
+        ConfigError: as `settings_of`, or a certificate or key cannot be used.
         UnavailableError: a port is taken, or an address is not there.
     """
     zenoh.init_log_from_env_or("error")
     settings = settings_of(config, limits)
+    check_certificates(settings, where(config))
     try:
         return zenoh.open(settings)
     except zenoh.ZError as error:
