@@ -7,7 +7,7 @@ from pathlib import Path
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.tls.conversation import Listener, credentials_of
-from coec.adapters.zenoh.settings import settings_of
+from coec.adapters.zenoh.settings import check_certificates, settings_of, where
 from coec.config import (
     CameraConfig,
     CameraIntrinsics,
@@ -54,7 +54,7 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
         checks.append(f"no pairs of sensors that see nothing in common: {', '.join(config.left_out)}")
     if config.zenoh.file is not None:
         checks.append(_check_file(config.zenoh.file, "zenoh.file"))
-    settings_of(config.zenoh, config.limits)
+    check_certificates(settings_of(config.zenoh, config.limits), where(config.zenoh))
     credentials = credentials_of(config.authority)
     if credentials is not None:
         Listener(credentials)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.adapters.files.rig import check_given, rig_of
-from coec.adapters.zenoh.settings import settings_of
+from coec.adapters.zenoh.settings import check_certificates, settings_of, where
 from coec.config import Config, OpenPairConfig, PairConfig, config_hash
 from coec.errors import require_readable
 
@@ -62,7 +62,7 @@ def reload_of(running: Config, read: Config) -> Reload:
     Raises:
         ConfigError: a service could not start with `read`, so nothing of it may be taken over.
     """
-    settings_of(read.zenoh, read.limits)
+    check_certificates(settings_of(read.zenoh, read.limits), where(read.zenoh))
     for pair in read.pairs:
         rig_of(pair)
     for awaited in read.awaited:

@@ -24,7 +24,7 @@ from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.endpoints import without_secrets
 from coec.adapters.zenoh.inputs import Input, Sample
 from coec.adapters.zenoh.opening import open_waiting
-from coec.adapters.zenoh.settings import endpoints_of, mode_of, second, settings_of, where
+from coec.adapters.zenoh.settings import check_certificates, endpoints_of, mode_of, second, settings_of, where
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
 from coec.schemas.base import to_json, to_msgpack
@@ -96,13 +96,14 @@ def open_session(config: ZenohConfig, limits: LimitsConfig, *, again: bool = Fal
     router itself. `again`: one of the same kind that may run at the same time as the service's.
 
     Raises:
-        ConfigError: as `settings_of`.
+        ConfigError: as `settings_of`, or a certificate or key cannot be used.
         UnavailableError: a port is taken, or an address is not there.
     """
     zenoh.init_log_from_env_or("error")
     settings = settings_of(config, limits)
     if again:
         settings = second(settings)
+    check_certificates(settings, where(config))
     try:
         return open_waiting(settings) if mode_of(settings) == "client" else zenoh.open(settings)
     except zenoh.ZError as error:

@@ -39,8 +39,8 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
     that names no mode, but where to listen, or gossip, makes it a peer: clients do neither.
 
     Raises:
-        ConfigError: the file, an endpoint or a certificate cannot be used, or an endpoint lets anybody in and
-            `config.insecure` is not set.
+        ConfigError: the file or an endpoint cannot be used, or an endpoint lets anybody in and `config.insecure` is not
+            set.
     """
     listen = config.listen if config.embedded_router else ()
     connect = tuple(endpoint for endpoint in config.connect if endpoint not in listen)
@@ -75,7 +75,6 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
         settings.insert_json5("transport/shared_memory/enabled", "false")
     except (zenoh.ZError, ValueError) as error:
         raise ConfigError(f"{where(config)}: {without_secrets(str(error), endpoints_of(config))}") from None
-    check_certificates(settings, where(config))
     doors = unguarded(settings)
     if doors and not config.insecure:
         raise ConfigError(
