@@ -98,12 +98,12 @@ class Compilation:
         self._resume()
         if self._reached is None:
             return
-        done, total = self._reached
+        _, total = self._reached
         self._reached = None
         elapsed_s = self._clock() - self._begun_s
         if elapsed_s >= SHORT_S:
             fields = {"seconds": round(elapsed_s, 1), "kernels": total}
-            _log.info(f"no more kernels to compile for now: {max(done, 0)} of {total}", extra={"fields": fields})
+            _log.info(f"kernels compiled in {elapsed_s:.0f} s: those that are needed now", extra={"fields": fields})
 
     def _go_on(self, done: int, total: int) -> None:
         now_s = self._told_s = self._clock()
