@@ -54,6 +54,34 @@ def test_without_the_extra_nothing_is_written(
     assert not folder.exists()
 
 
+@pytest.mark.fault(
+    "a batch fails before its first window, or all windows for a common cause",
+    "one message with the way out; the next try is not refused",
+)
+def test_a_failed_try_leaves_no_folder_that_refuses_the_next(
+    coec: Coec, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "results"
+    monkeypatch.setitem(sys.modules, "ray", None)  # as if not installed
+    no_ray = coec("batch", recorded, "--output", folder, "--engine", "ray")
+    assert no_ray.status == 1
+    assert "coec[ray]" in no_ray.err
+    assert not folder.exists()
+    assert coec("batch", recorded, "--output", folder, "--ray-address", "auto").status == 2
+
+    absent = tmp_path / "absent.onnx"
+    stopped = coec("batch", recorded, "--output", folder, "--jobs", 1, "--depth", absent)
+    assert stopped.status == 1
+    assert "absent.onnx" in stopped.err
+    assert "--keep-going" in stopped.err
+    kept = coec("batch", recorded, "--output", folder, "--jobs", 1, "--depth", absent, "--keep-going", "--json")
+    assert kept.document["errors"] == {"bad_model": 2}
+
+    other = tmp_path / "other"
+    assert coec("batch", recorded, "--output", other, "--jobs", 1, "--depth", absent).status == 1
+    assert coec("batch", recorded, "--output", other, "--jobs", 1).status == 0
+
+
 def test_what_is_not_the_word_of_a_fleet_is_told(coec: Coec, tmp_path: Path) -> None:
     said = tmp_path / "now.json"
     said.write_text("{}")

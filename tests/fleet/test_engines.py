@@ -100,5 +100,8 @@ def test_a_cluster_of_ray_decides_the_same(recorded: Path, poisoned: str) -> Non
 
     want = expected(recorded)
     one, two = want
-    engine = RayEngine(2, BOUNDS)
-    assert decided(engine, [Job(one), Job(poisoned), Job(two)]) == {**want, poisoned: PROCESS_DIED}
+    engine = RayEngine(2, BOUNDS, "local")
+    try:
+        assert decided(engine, [Job(one), Job(poisoned), Job(two)]) == {**want, poisoned: PROCESS_DIED}
+    finally:
+        engine.close()

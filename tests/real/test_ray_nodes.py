@@ -20,7 +20,7 @@ from ray_cluster import MISSING, Nodes, batch_command, two_nodes
 pytestmark = pytest.mark.slow
 
 MAX_LOST_S = 60.0
-"""A lost node costs at most so much, s: from its loss until all windows are judged, less what judging takes."""
+"""A lost node costs at most so much, s: until all windows are judged, less the time that judging takes."""
 
 COPIES = 8
 

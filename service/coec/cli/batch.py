@@ -62,7 +62,7 @@ def _engine(options: Options) -> Engine:
     if options.engine == "ray":
         from coec.fleet.engines.ray import RayEngine
 
-        return RayEngine(options.jobs, bounds, options.ray_address, send_credentials=options.send_credentials)
+        return RayEngine(options.jobs, bounds, options.ray_address, send_credentials=not options.no_credentials)
     if options.ray_address is not None:
         raise UsageError("--ray-address is for --engine ray")
     from coec.fleet.engines.local import LocalEngine

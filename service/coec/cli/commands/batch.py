@@ -33,13 +33,12 @@ class Options:
             show_default="$RAY_ADDRESS, else auto",
         ),
     ] = None
-    send_credentials: Annotated[
+    no_credentials: Annotated[
         bool,
         typer.Option(
-            "--send-credentials/--no-send-credentials",
-            help="Send the credentials for stores in this environment to the Ray nodes.",
+            "--no-send-credentials", help="Do not send this environment's credentials for stores to the Ray nodes."
         ),
-    ] = True
+    ] = False
     with_config: Annotated[
         Path | None,
         typer.Option("--with-config", help="Judge by this configuration instead of each window's own.", metavar="FILE"),
