@@ -147,6 +147,9 @@ class FailingEngine:
         yield from rows(self._count)
         raise FleetError("the cluster cannot be reached")
 
+    def close(self) -> None:
+        """It holds nothing."""
+
 
 def run(folder: Path, terms: Terms, engine: FailingEngine) -> None:
     batch.run([Job("0.mcap")], terms, engine, folder, lambda _: None, resume=False)
