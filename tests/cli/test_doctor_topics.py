@@ -36,7 +36,7 @@ def configured(middleware: str = "rmw_zenoh", **ros: Any) -> Config:
 
 
 def test_topics_that_may_be_streams_are_named_with_types_and_nodes() -> None:
-    (found,) = topic_findings(THERE, configured(domain=7))
+    (found,) = topic_findings(THERE, THERE, configured(domain=7))
     assert (found.level, found.where) == ("ok", "domain 7")
     assert found.text == (
         "/front/image (sensor_msgs/msg/Image, by /left, /right); /top/points (sensor_msgs/msg/PointCloud2); "
@@ -46,21 +46,22 @@ def test_topics_that_may_be_streams_are_named_with_types_and_nodes() -> None:
 
 def test_a_vehicle_with_very_many_names_some() -> None:
     many = Topics(tuple(Publisher(f"/image{number:03}", IMAGE, "/node", None) for number in range(NAMED + 5)))
-    (found,) = topic_findings(many, configured())
+    (found,) = topic_findings(many, many, configured())
     assert found.text.count("/image") == NAMED
     assert "; 5 more such; 0 of other types" in found.text
 
 
 @pytest.mark.parametrize(("middleware", "where"), [("rmw_zenoh", "domain 0"), ("ros2dds", "bridge")])
 def test_nobody_there_is_told_with_what_may_be_wrong(middleware: str, where: str) -> None:
-    (found,) = topic_findings(Topics(), configured(middleware))
+    (found,) = topic_findings(Topics(), Topics(), configured(middleware))
     assert (found.level, found.where) == ("warn", where)
     assert found.advice is not None
     assert "@ros2_lv/**" in found.advice
 
 
 def test_tokens_that_were_not_read_are_told() -> None:
-    *_, found = topic_findings(Topics(THERE.publishers, Counter(too_many=7, malformed=2)), configured())
+    there = Topics(THERE.publishers, Counter(too_many=7, malformed=2))
+    *_, found = topic_findings(there, there, configured())
     assert (found.level, "2 malformed, 7 too_many" in found.text) == ("warn", True)
 
 

@@ -128,7 +128,9 @@ class WorkerConfig(Stage):
 class ZenohConfig(Stage):
     """The Zenoh session. `file` is a Zenoh configuration (JSON5) for TLS, access control and the like."""
 
-    connect: tuple[str, ...] = Field(default=("tcp/127.0.0.1:7447",), description="endpoints of the router; the first that answers is used")
+    connect: tuple[str, ...] = Field(
+        default=("tcp/127.0.0.1:7447",), description="endpoints of the router; the first that answers is used"
+    )
     embedded_router: bool = Field(default=False, description="the service is the router itself and listens on `listen`")
     listen: tuple[str, ...] = Field(
         default=("tcp/127.0.0.1:7447",),
