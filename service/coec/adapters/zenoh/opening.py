@@ -69,7 +69,7 @@ def open_waiting(settings: zenoh.Config) -> zenoh.Session:
         place = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
         endpoint = f"{_UNIX}//proc/self/fd/{place}/router"
         with zenoh.open(_router_for(settings, endpoint, Path(folder))) as router:
-            _insert(settings, "connect/endpoints", [*connected_of(settings), endpoint])
+            _insert(settings, "connect/endpoints", [endpoint, *connected_of(settings)])
             allowed = json.loads(settings.get_json(_PROTOCOLS))
             if allowed:
                 _insert(settings, _PROTOCOLS, [*allowed, _UNIX])
