@@ -96,6 +96,7 @@ def environment(folder: Path, python: str, checkout: Path, *resolution: str) -> 
 
 def run_tests(interpreter: Path, checkout: Path, tests: Sequence[str]) -> str:
     """The last line of pytest. Fails the test if any of those tests fails."""
+    completed(interpreter, "tests/warm.py", cwd=checkout)  # or the first test compiles the kernels
     left_out = [word for test in OF_THE_LOCK_FILES for word in ("--deselect", test)]
     done = completed(
         interpreter, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", *OTHER_VERSIONS, *left_out, *tests,

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.adapters.files.conversions import estimate_of, matrix_of, result_of, transform_of
+from coec.adapters.files.conversions import comparable, estimate_of, matrix_of, result_of, transform_of
 from coec.calibration.types import (
     Decision,
     Estimate,
@@ -89,6 +89,18 @@ def test_a_move_within_the_window_travels_with_the_result() -> None:
     read = from_json(CalibrationResult, to_json(result_of(sent, RIG, "truck-7")))
     assert same(estimate_of(read).moved, moved)
     assert estimate_of(result_of(estimate(), RIG, "truck-7")).moved is None
+
+
+def test_a_result_of_an_earlier_version_is_the_same_decision_without_intrinsics() -> None:
+    """What it lacks is no difference; other intrinsics in it are one."""
+    reached = result_of(estimate(), RIG, "truck-7")
+    assert reached.intrinsics is not None
+    recorded = from_json(
+        CalibrationResult, to_json(reached.model_copy(update={"schema_version": 6, "intrinsics": None}))
+    )
+    assert to_json(comparable(reached, recorded)) == to_json(recorded)
+    other = reached.model_copy(update={"intrinsics": reached.intrinsics.model_copy(update={"model": "mei"})})
+    assert to_json(comparable(reached, other)) != to_json(other)
 
 
 def same(one: Any, other: Any) -> bool:

@@ -15,12 +15,16 @@ NAMES = "Neither the name of the copyright holder nor"
 
 
 def package(folder: Path, name: str, *headers: str, files: str = "", texts: dict[str, str] | None = None) -> None:
-    """An installed package, as far as its metadata go."""
+    """An installed package, as far as its metadata go. The files of its record are there, but empty: importlib of
+    Python 3.12 and later leaves out those that are not."""
     metadata = folder / f"{name}-1.0.dist-info"
     metadata.mkdir()
     lines = ("Metadata-Version: 2.4", f"Name: {name}", "Version: 1.0", *headers)
     (metadata / "METADATA").write_text("\n".join(lines) + "\n")
     (metadata / "RECORD").write_text(files)
+    for line in files.splitlines():
+        (folder / line.partition(",")[0]).parent.mkdir(parents=True, exist_ok=True)
+        (folder / line.partition(",")[0]).touch()
     for file, text in (texts or {}).items():
         (metadata / "licenses").mkdir(exist_ok=True)
         (metadata / "licenses" / file).write_text(text)
