@@ -148,7 +148,7 @@ def test_methods_side_by_side_in_words(coec: Coec, monkeypatch: pytest.MonkeyPat
     header = next(line for line in outcome.out.splitlines() if "fused" in line)
     assert header.split() == ["fused", "mi", "unit"]
     assert "intensity was not evaluated: " in outcome.out
-    assert "1 splits into halves of 1 frames" in outcome.out
+    assert "1 split into halves of 1 frame:" in outcome.out
     assert not outcome.err
 
 

@@ -127,7 +127,7 @@ def test_topics_are_chosen_by_name(coec: Coec, listener: Listener, tmp_path: Pat
     assert set(document["frames"]) == {"/points", "/odom"}
     said = coec("play", bag, "--middleware", "ros2dds", "--topics", "/lidar", "--connect", listener.endpoint)
     assert said.status == 2
-    assert "no topic /lidar; there: /front/camera_info (sensor_msgs/msg/CameraInfo, 1 messages)" in said.err
+    assert "no topic /lidar; there: /front/camera_info (sensor_msgs/msg/CameraInfo, 1 message)" in said.err
 
 
 def test_stamps_begin_now_where_asked_and_all_else_is_as_recorded(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import tomllib
 from itertools import combinations
@@ -80,3 +81,19 @@ def test_an_argument_that_is_not_known_is_refused_before_anything_is_made() -> N
     done = subprocess.run([REPOSITORY / "deploy" / "setup", "--cheks"], capture_output=True, text=True)
     assert done.returncode == 1
     assert "--cheks" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("argument", "stamps"),
+    [("--docs", {"requirements", "docs"}), ("--checks", {"requirements", "docs", "checks"})],
+)
+def test_what_was_installed_is_noted_for_each_lock(tmp_path: Path, argument: str, stamps: set[str]) -> None:
+    """With locks that pin nothing, and a project that cannot be installed, so that nothing is fetched."""
+    (tmp_path / "deploy").mkdir()
+    shutil.copy2(REPOSITORY / "deploy" / "setup", tmp_path / "deploy")
+    for lock in LOCKS:
+        (tmp_path / lock.name).write_text("# nothing\n")
+    (tmp_path / "pyproject.toml").write_text("no project")
+    done = subprocess.run([tmp_path / "deploy" / "setup", argument], capture_output=True, text=True)
+    assert "could not install coec" in done.stderr
+    assert {path.name for path in (tmp_path / ".venv").glob("coec-*")} == {f"coec-{name}" for name in stamps}

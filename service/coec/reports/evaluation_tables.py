@@ -279,8 +279,8 @@ def show_detection(detection: DetectionReport) -> None:
         table.add_row(row.name, str(row.checks), f"{100 * row.flagged:.1f} %", between, undecided, by_paper)
     console.out.print(table)
     console.show(
-        f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other; "
-        "no pair is in both"
+        f"{count(detection.splits, 'split')} of {count(detection.pairs, 'pair')}: limits learned on one half, tried on "
+        "the other; no pair is in both"
     )
     right = next((row for row in detection.moves if row.name == RIGHT), None)
     if right is not None:
@@ -306,8 +306,8 @@ def _show_steps(steps: Sequence[StepRow]) -> None:
 
 def _show_halves(halves: HalvesReport, dof: int) -> None:
     console.show(
-        f"{halves.splits} splits into halves of {halves.pairs} frames: {halves.solved} solved, {halves.accepted} "
-        f"accepted on both sides, {halves.hits} hit on both"
+        f"{count(halves.splits, 'split')} into halves of {count(halves.pairs, 'frame')}: {halves.solved} solved, "
+        f"{halves.accepted} accepted on both sides, {halves.hits} hit on both"
     )
     table = console.table("difference", "rms", "largest", "σ claimed", "within 3 σ", "unit", right=range(1, 5))
     for axis in range(dof):
