@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import socket
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -180,6 +181,7 @@ Cluster = Callable[..., FakeRay]
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
     """Puts a cluster of these nodes in the place of Ray."""
+    monkeypatch.setattr(engine_module, "CURRENT", Path("/nonexistent"))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
 
@@ -216,17 +218,38 @@ def test_a_window_that_every_node_is_lost_with_is_a_row(cluster: Cluster) -> Non
 
 
 @pytest.mark.fault("no Ray cluster", "none is started; the message says how to name or start one")
-def test_without_a_cluster_none_is_started(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_cluster_none_is_started(cluster: Cluster) -> None:
     fake = cluster()
     with pytest.raises(FleetError) as raised:
         RayEngine(None, BOUNDS)
     for way_out in ("RAY_ADDRESS=HOST:6379", "--ray-address local", "--engine local"):
         assert way_out in str(raised.value)
-    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
-    for address in (None, "other:6379"):
-        with pytest.raises(FleetError):
-            RayEngine(None, BOUNDS, address)
-    assert fake.addresses == ["auto", "head:6379", "other:6379"]
+    assert fake.addresses == ["auto"]
+
+
+@pytest.mark.fault("nobody listens at the address of the Ray cluster", "an error at once, where Ray waits for ever")
+def test_an_address_at_which_nobody_listens_is_an_error(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    fake = cluster(Node())
+    with socket.socket() as bound:  # and not listening
+        bound.bind(("127.0.0.1", 0))
+        closed = f"127.0.0.1:{bound.getsockname()[1]}"
+        for address in (closed, f"ray://{closed}"):
+            with pytest.raises(FleetError, match=f"{closed}.*refused"):
+                RayEngine(None, BOUNDS, address)
+        current = tmp_path / "ray_current_cluster"
+        current.write_text(f"{closed}\n")
+        monkeypatch.setattr(engine_module, "CURRENT", current)
+        with pytest.raises(FleetError, match="refused"):
+            RayEngine(None, BOUNDS)
+        monkeypatch.setenv("RAY_ADDRESS", closed)
+        with pytest.raises(FleetError, match=closed):
+            RayEngine(None, BOUNDS)
+        assert fake.addresses == []
+        bound.listen()
+        RayEngine(None, BOUNDS)
+        assert fake.addresses == [closed]
 
 
 def test_a_cluster_whose_nodes_are_too_small_is_refused_at_once(cluster: Cluster) -> None:

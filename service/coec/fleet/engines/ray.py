@@ -12,6 +12,7 @@ import re
 import socket
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,6 +30,15 @@ from coec.schemas.fleet import WindowRow
 
 ADDRESS = "RAY_ADDRESS"
 """Environment variable of Ray with the address of the cluster."""
+
+AUTO = "auto"
+"""Address of the cluster that runs on this machine."""
+
+CURRENT = Path(os.environ.get("RAY_TMPDIR", "/tmp")) / "ray" / "ray_current_cluster"
+"""File in which Ray keeps the address of the cluster that `ray start` started last on this machine."""
+
+CONNECT_S = 10.0
+"""Longest wait for a connection to the cluster, s."""
 
 PING_S, SILENCE_S = 5.0, 45.0
 """Time between two pings of an actor, and longest time without an answer to one, s. Ray itself finds a lost node after
@@ -179,6 +189,20 @@ def _explained(row: WindowRow) -> WindowRow:
     return failed(row, NOT_ON_NODE, f"a node of the cluster cannot read {row.url}, which exists on this machine")
 
 
+def _probe(address: str) -> None:
+    """Connects to the address of a cluster once, because Ray itself waits for one that does not answer for ever.
+
+    Raises:
+        OSError: nobody listens there.
+    """
+    if address == AUTO:  # Ray takes the latest cluster that was started here, even if it has ended
+        with suppress(OSError):
+            address = CURRENT.read_text(encoding="utf-8").strip()
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
+
+
 class RayEngine:
     """Judges windows on a Ray cluster."""
 
@@ -206,9 +230,10 @@ class RayEngine:
         self._ray = ray
         self._bounds = bounds
         self._send_credentials = send_credentials
-        address = address or os.environ.get(ADDRESS) or "auto"
+        address = address or os.environ.get(ADDRESS) or AUTO
         ours = {"include_dashboard": False} if address == "local" else {}
         try:
+            _probe(address)
             ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR, **ours)
             nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         except Exception as error:  # of Ray, of the system, or of a library in between
