@@ -48,7 +48,7 @@ ALWAYS = (
 )
 """Keys that a person has to see before the configuration is used elsewhere, whatever their defaults are."""
 
-REMARKS = {
+COMMENTS = {
     "vehicle": "unique in the fleet; a part of every key",
     "zenoh": "the router; where an embedded one listens",
     "state": "windows, and what survives a restart",
@@ -154,7 +154,7 @@ def _configuration(recording: Recording, out: Path, *, full: bool, force: bool) 
         text = head + commented_yaml(config)
     else:
         text = f"{head}# Keys that are not here have their defaults: `coec check-config {out.name}` prints them all.\n"
-        text += short_yaml(config, ALWAYS, REMARKS)
+        text += short_yaml(config, ALWAYS, COMMENTS)
     if mask is None:
         return [output.replace(out, text.encode())]
     had_mask = mask_path.exists()

@@ -126,7 +126,8 @@ class StoreCredentials:
                 os.environ[name] = value
         if self.google is not None:
             descriptor = os.memfd_create("credentials")
-            os.write(descriptor, self.google)
+            with open(descriptor, "wb", closefd=False) as file:
+                file.write(self.google)
             os.environ[GOOGLE] = f"/proc/self/fd/{descriptor}"
 
 

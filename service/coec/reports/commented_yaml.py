@@ -29,7 +29,7 @@ def commented_yaml(model: BaseModel) -> str:
     return "\n".join(_mapping(model, "")) + "\n"
 
 
-def short_yaml(model: BaseModel, always: Collection[str], remarks: Mapping[str, str]) -> str:
+def short_yaml(model: BaseModel, always: Collection[str], comments: Mapping[str, str]) -> str:
     """The fields of the model that differ from their defaults. `load_config` reads the text back to an equal model.
 
     A block is written on one line. One that does not fit has its nested blocks and matrices on lines of their own.
@@ -37,18 +37,18 @@ def short_yaml(model: BaseModel, always: Collection[str], remarks: Mapping[str, 
     Args:
         always: dotted names of fields that are written with their default, too; the entries of a list have no place in
             such a name.
-        remarks: comments by dotted name, on fields of the top level and of the entries of its lists.
+        comments: comments by dotted name, on fields of the top level and of the entries of its lists.
     """
     lines: list[str] = []
     for name, value in _differing(model, "", always).items():
         if isinstance(value, list):
             lines.append(f"{name}:")
             for item in value:
-                written = (_short_lines(key, below, name, remarks) for key, below in item.items())
+                written = (_short_lines(key, below, name, comments) for key, below in item.items())
                 first, *rest = chain.from_iterable(written)
                 lines += [f"{INDENT}- {first}", *(f"{INDENT * 2}{line}" for line in rest)]
         else:
-            lines += _short_lines(name, value, "", remarks)
+            lines += _short_lines(name, value, "", comments)
     return "\n".join(lines) + "\n"
 
 
@@ -71,9 +71,9 @@ def _differing(model: BaseModel, place: str, always: Collection[str]) -> dict[st
     return found
 
 
-def _short_lines(name: str, value: Any, place: str, remarks: Mapping[str, str]) -> Iterator[str]:
-    remark = remarks.get(f"{place}.{name}" if place else name, "")
-    behind = f"  # {remark}" if remark else ""
+def _short_lines(name: str, value: Any, place: str, comments: Mapping[str, str]) -> Iterator[str]:
+    comment = comments.get(f"{place}.{name}" if place else name, "")
+    behind = f"  # {comment}" if comment else ""
     line = f"{name}: {_scalar(value)}"
     if len(line) <= WIDTH - 2 * len(INDENT) or not isinstance(value, dict | tuple):
         yield f"{line}{behind}"
@@ -93,45 +93,45 @@ def _short_lines(name: str, value: Any, place: str, remarks: Mapping[str, str]) 
 def _mapping(model: BaseModel, indent: str) -> Iterator[str]:
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
-        remark = " ".join((field.description or "").split())
+        comment = " ".join((field.description or "").split())
         if value is None:
-            if remark:
-                yield _line(f"{indent}# {name}:", remark)
+            if comment:
+                yield _line(f"{indent}# {name}:", comment)
         elif isinstance(value, BaseModel):
-            yield from _heading(value, remark, indent)
+            yield from _heading(value, comment, indent)
             yield f"{indent}{name}:"
             yield from _mapping(value, indent + INDENT)
         elif _holds_models(value):
             if not indent:
                 yield ""
-            yield from _remark(remark, indent)
+            yield from _comment(comment, indent)
             yield f"{indent}{name}:"
             for item in value:
                 first, *rest = _mapping(item, indent + INDENT * 2)
                 yield f"{indent}{INDENT}- {first.lstrip()}"
                 yield from rest
         elif _is_matrix(value):
-            yield from _remark(remark, indent)
+            yield from _comment(comment, indent)
             yield f"{indent}{name}:"
             yield from (f"{indent}{INDENT}- {_scalar(row)}" for row in value)
         else:
-            yield _line(f"{indent}{name}: {_scalar(value)}", remark)
+            yield _line(f"{indent}{name}: {_scalar(value)}", comment)
 
 
-def _heading(value: BaseModel, remark: str, indent: str) -> Iterator[str]:
+def _heading(value: BaseModel, comment: str, indent: str) -> Iterator[str]:
     """A comment on what the block is for, with an empty line before it at the top level."""
     if not indent:
         yield ""
-    text = remark or " ".join((type(value).__doc__ or "").split())
-    yield from _remark(text, indent)
+    text = comment or " ".join((type(value).__doc__ or "").split())
+    yield from _comment(text, indent)
 
 
-def _remark(text: str, indent: str) -> Iterator[str]:
+def _comment(text: str, indent: str) -> Iterator[str]:
     yield from textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
 
 
-def _line(text: str, remark: str) -> str:
-    return f"{text:<{COMMENT_COLUMN}}  # {remark}" if remark else text
+def _line(text: str, comment: str) -> str:
+    return f"{text:<{COMMENT_COLUMN}}  # {comment}" if comment else text
 
 
 def _holds_models(value: object) -> bool:

@@ -111,14 +111,14 @@ def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int])
     if not camera_stamps_ns or not sweep_stamps_ns:
         return "one of the two streams is empty"
     cameras, sweeps = (np.array(stamps, dtype=np.float64) * 1e-9 for stamps in (camera_stamps_ns, sweep_stamps_ns))
-    apart_s = float(np.median([sweeps[np.abs(sweeps - stamp_s).argmin()] - stamp_s for stamp_s in cameras]))
+    offset_s = float(np.median([sweeps[np.abs(sweeps - stamp_s).argmin()] - stamp_s for stamp_s in cameras]))
     overlap = sweeps[0] <= cameras[-1] and cameras[0] <= sweeps[-1]
     if not overlap:
-        apart_s = float(sweeps[0] - cameras[0])
+        offset_s = float(sweeps[0] - cameras[0])
     return (
-        f"the clouds are {abs(apart_s):.3f} s {'ahead of' if apart_s > 0 else 'behind'} the images. The stamps must be "
-        "of one clock: let both drivers take the computer's time, or synchronise the sensors (PTP), and record again; "
-        "where the difference is known, correct the stamps of one stream"
+        f"the clouds are {abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} the images. The stamps must "
+        "be of one clock: let both drivers take the computer's time, or synchronise the sensors (PTP), and record "
+        "again; where the difference is known, correct the stamps of one stream"
     )
 
 

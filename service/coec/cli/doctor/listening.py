@@ -78,7 +78,7 @@ class Heard:
 
 
 @dataclass(frozen=True, slots=True)
-class AllHeard:
+class Reception:
     """What came in the time.
 
     Attributes:
@@ -97,7 +97,7 @@ def listen(
     config: Config,
     seconds: float,
     heard: Callable[[float], None],
-) -> AllHeard:
+) -> Reception:
     """What comes through a session as the service has it, and how much of it comes to the client `beside` it. `heard`
     is called now and then with the seconds that have passed."""
     ears = [_Ear(session, ros, pair, config) for pair in config.pairs]
@@ -116,7 +116,7 @@ def listen(
         bus.undeclare_inputs()
         for counter in counters:
             counter.undeclare()
-    return AllHeard([ear.heard for ear in ears], awaited)
+    return Reception([ear.heard for ear in ears], awaited)
 
 
 def _awaited(session: zenoh.Session, ros: RosSide, config: Config) -> tuple[dict[str, Heard], Bus]:

@@ -45,12 +45,12 @@ def pages(
 def accepted_format(accept: str) -> TextFormat:
     """The format of the metrics for a header `Accept` (RFC 9110, 12.5.1): OpenMetrics if the reader names it and does
     not prefer plain text, else the text format, which every reader knows."""
-    wanted = {ENCODING: 0.0, TEXT: 0.0}
+    qualities = {ENCODING: 0.0, TEXT: 0.0}
     for item in accept.split(","):
         media_type, *parameters = (part.strip().lower() for part in item.split(";"))
-        if media_type in wanted:
-            wanted[media_type] = max(wanted[media_type], _quality(parameters))
-    preferred = 0.0 < wanted[ENCODING] >= wanted[TEXT]
+        if media_type in qualities:
+            qualities[media_type] = max(qualities[media_type], _quality(parameters))
+    preferred = 0.0 < qualities[ENCODING] >= qualities[TEXT]
     return TextFormat.OPEN_METRICS if preferred else TextFormat.PROMETHEUS
 
 

@@ -57,7 +57,7 @@ class Compilation:
         """`clock`: a steady clock, s."""
         self._clock = clock
         self._reached: tuple[int, int] | None = None
-        self._begun_s = self._told_s = self._logged_s = 0.0
+        self._started_s = self._reported_s = self._logged_s = 0.0
         # Time that the clock has stood still up to now, and since when it does; written together.
         self._pause: tuple[float, float | None] = 0.0, None
 
@@ -75,12 +75,12 @@ class Compilation:
     def status(self) -> Compiling | None:
         """The compilation in progress; None if there is none."""
         reached = self._reached
-        return None if reached is None else Compiling(*reached, self._clock() - self._begun_s)
+        return None if reached is None else Compiling(*reached, self._clock() - self._started_s)
 
     @property
     def has_stalled(self) -> bool:
         """Whether a kernel is being compiled, and nothing was reported for `STALLED_S`."""
-        return self._pause[1] is not None and self._clock() - self._told_s > STALLED_S
+        return self._pause[1] is not None and self._clock() - self._reported_s > STALLED_S
 
     def take(self, message: Mapping[str, Any]) -> bool:
         """Takes a message of the worker if it is about the compilation; returns whether it is."""
@@ -100,19 +100,19 @@ class Compilation:
             return
         _, total = self._reached
         self._reached = None
-        elapsed_s = self._clock() - self._begun_s
+        elapsed_s = self._clock() - self._started_s
         if elapsed_s >= SHORT_S:
             fields = {"seconds": round(elapsed_s, 1), "kernels": total}
             _log.info(f"kernels compiled in {elapsed_s:.0f} s: those that are needed now", extra={"fields": fields})
 
     def _go_on(self, done: int, total: int) -> None:
-        now_s = self._told_s = self._clock()
+        now_s = self._reported_s = self._clock()
         if self._reached is None:
-            self._begun_s, self._logged_s = now_s, now_s
+            self._started_s, self._logged_s = now_s, now_s
             _log.info(f"compiling kernels, once on this machine: {done} of {total} are there")
         elif now_s - self._logged_s >= LINE_S:
             self._logged_s = now_s
-            _log.info(f"compiling kernels: {done} of {total}, after {now_s - self._begun_s:.0f} s")
+            _log.info(f"compiling kernels: {done} of {total}, after {now_s - self._started_s:.0f} s")
         self._reached = done, total
         before_s, since_s = self._pause
         self._pause = before_s, now_s if since_s is None else since_s
