@@ -129,7 +129,7 @@ FORMS = {
         "until [[ $line == *ready* ]]; do read -r line <&${SERVICE[0]} || break; done; kill $PID; wait $PID",
         always=True,
     ),
-    "coec query windows": Form(until="sim-1600000015010000000 .* accepted"),
+    "coec query windows": Form(until="sim-1600000020010000000 .* accepted"),
     "coec models show network.onnx": Form(f"coec models show {NETWORK}", always=True),
     ASSESS: Form(f'coec models assess {NETWORK} "kitti360:{SAMPLES}/kitti360?camera=image_00" --frames 2', always=True),
 }

@@ -165,7 +165,9 @@ def _bring_into_a_solve(running: Service, frames: list[Frame]) -> int:
     The worker is held while the job comes to it, so that there is time to see it, and let go until it has computed for
     a while: a solve with `SLOW` takes much longer.
     """
-    worker = psutil.Process(running.worker()["pid"])
+    # A new worker prepares kernels while nothing waits; held in that, it would not take the job.
+    idle = running.until(running.worker, lambda told: told["state"] == "idle", "the worker has nothing to do")
+    worker = psutil.Process(idle["pid"])
     worker.suspend()
     running.send(frames)
     running.until(running.worker, lambda told: told["state"] == "busy", "the worker has the window")

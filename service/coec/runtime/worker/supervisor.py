@@ -372,7 +372,8 @@ class Worker:
         """The next job; None if there is none, after waiting for `POLL_S` at most."""
         with self._held() as queue:
             ticket = queue.take(self._now_s())
-            self._state = WorkerState.READY if ticket is None else WorkerState.BUSY
+            # A worker that compiles kernels while nothing waits is at work, too.
+            self._state = WorkerState.READY if ticket is None and self._is_warm else WorkerState.BUSY
             if ticket is None and self._is_warm:
                 self._condition.wait(POLL_S)
         return ticket
