@@ -129,7 +129,7 @@ FORMS = {
         "until [[ $line == *ready* ]]; do read -r line <&${SERVICE[0]} || break; done; kill $PID; wait $PID",
         always=True,
     ),
-    "coec query windows": Form(until="sim-1600000020010000000 .* accepted"),
+    "coec query windows": Form(until="sim-16000000[1-3][0-9]* .* accepted"),
     "coec models show network.onnx": Form(f"coec models show {NETWORK}", always=True),
     ASSESS: Form(f'coec models assess {NETWORK} "kitti360:{SAMPLES}/kitti360?camera=image_00" --frames 2', always=True),
 }
@@ -323,7 +323,7 @@ def shim(folder: Path, coec: Sequence[str]) -> Path:
     path.parent.mkdir()
     path.write_text(
         "#!/bin/bash\n"
-        f"case $1 in run | play) sed -i s/127.0.0.1:7447/{endpoint}/ ./*.yaml ;; esac\n"
+        f"case $1 in run | play) sed -i s/127.0.0.1:7447/{endpoint}/g ./*.yaml ;; esac\n"
         f'case $1 in query | watch) set -- "$@" --connect tcp/{endpoint} ;; esac\n'
         f'exec {shlex.join(coec)} "$@"\n'
     )
