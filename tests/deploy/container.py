@@ -41,7 +41,7 @@ def enter_copy_of_root() -> None:
     for place in others:
         _run("mount", "--rbind", place, f"{PLACE}/root{place}")
     # Every container has memory of its own there.
-    _run("mount", "-t", "tmpfs", "-o", "mode=1777", "tmpfs", f"{PLACE}/root/dev/shm")
+    _run("mount", "-t", "tmpfs", "-o", "mode=1777", "tmpfs", str(PLACE / "root" / "dev" / "shm"))
     os.chroot(PLACE / "root")
     os.chdir("/")
 

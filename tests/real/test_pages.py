@@ -4,15 +4,13 @@ block typed there. In the gate the same blocks run in the environment of the che
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from conftest import REPOSITORY
+from real.packages import copied_checkout, require_index
 from test_readme import BLOCKS, LONG_S, Block, name_of, play_through
 
 pytestmark = pytest.mark.slow
@@ -21,7 +19,6 @@ PAGES = ("README", "tutorial")
 OF_PAGES = [block for block in BLOCKS if block.page.stem in PAGES and block.language == "console"]
 PYTHON = [block for block in BLOCKS if block.page.stem in PAGES and block.language == "python"]
 
-NOT_THE_CHECKOUTS = (".venv", ".venv.lock")
 FOREIGN = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
 """Variables that would let another environment shine through."""
 
@@ -40,25 +37,8 @@ def done(words: Sequence[object], cwd: Path) -> subprocess.CompletedProcess[str]
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a clone of the working tree would hold, set up by the first command of the tutorial."""
-    if shutil.which("git") is None or not (REPOSITORY / ".git").exists():
-        pytest.skip(
-            "needs a checkout and git (Debian: apt-get install git): what belongs to the project is what git lists"
-        )
-    probe = tmp_path_factory.mktemp("probe")
-    fetched = done(
-        [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", probe, "hatchling"], probe
-    )
-    if fetched.returncode != 0:
-        pytest.skip(
-            f"needs a package index: connect, or name a mirror in pip's configuration ({fetched.stderr[-300:]})"
-        )
-    folder = tmp_path_factory.mktemp("fresh") / "coec"
-    listed = done(["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], REPOSITORY)
-    for name in listed.stdout.split("\0"):
-        path = REPOSITORY / name
-        if name and name not in NOT_THE_CHECKOUTS and path.is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(path, folder / name)
+    require_index(tmp_path_factory.mktemp("probe"))
+    folder = copied_checkout(tmp_path_factory.mktemp("fresh") / "coec")
     shown = done(["deploy/demo", "--output", folder.parent / "demo"], folder)
     assert shown.returncode == 0, shown.stderr
     return folder

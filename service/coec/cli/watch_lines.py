@@ -18,14 +18,12 @@ from coec.cli.stopping import until_signal
 from coec.reports import console
 from coec.reports.instants import second
 from coec.reports.page.words import count
+from coec.runtime.worker import compilation
 from coec.schemas.keys import Keys
 from coec.schemas.replies import HealthReply
 
 WAITING = 1024
 """Changes that may wait to be written, some 10 MB; further ones are counted and left out."""
-
-COMPILING = "compiling_kernels"
-"""Code of the reason whose text is shown, because it says how far the compilation is."""
 
 POLL_S = 0.2
 """Time between two checks whether to stop."""
@@ -85,7 +83,8 @@ def _write(change: Change, vehicle: str, *, as_json: bool) -> None:
     if isinstance(value, bool):
         text = "is served" if value else "is no longer served"
     elif isinstance(value, HealthReply):
-        why = ", ".join(reason.text if reason.code == COMPILING else reason.code for reason in value.reasons)
+        # Compilation's text says how far it is.
+        why = ", ".join(reason.text if reason.code == compilation.CODE else reason.code for reason in value.reasons)
         text = f"{value.state}{f': {why}' if why else ''}"
     else:
         text = f"extrinsic {value.provenance}, {console.attempt(value.status)}"
