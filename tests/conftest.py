@@ -32,8 +32,10 @@ hypothesis.settings.load_profile("coec")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--faults FILE``: write the table of faults and promises at the end of the run (``tests/faults.py``)."""
+    """``--faults FILE``: write the table of faults and promises at the end of the run (``tests/faults.py``).
+    ``--write-golden``: replace the golden decisions (``tests/golden``)."""
     parser.addoption("--faults", type=Path, metavar="FILE", help="write the table of faults and promises")
+    parser.addoption("--write-golden", action="store_true", help="replace the golden decisions by today's")
 
 
 def pytest_configure(config: pytest.Config) -> None:
