@@ -73,6 +73,8 @@ def plain(value: Any) -> Any:
             return value.model_dump(mode="json")
         case Enum():
             return plain(value.value)
+        case bytes():
+            return sha256(value)
         case np.ndarray() | np.generic():
             return plain(value.tolist())
         case dict():
@@ -151,7 +153,7 @@ def write_lines(path: Path, lines: Sequence[Any]) -> None:
 def check_lines(path: Path, lines: Sequence[Any], tolerance: Tolerance) -> None:
     """Compares a stream with the golden one."""
     head, *golden = (json.loads(line) for line in path.read_text(encoding="utf-8").splitlines())
-    now = [rounded(plain(line)) for line in lines]
+    now = json.loads(json.dumps([rounded(plain(line)) for line in lines]))
     found = [f"{len(golden)} lines were written, now {len(now)}"] if len(golden) != len(now) else []
     for number, (before, after) in enumerate(zip(golden, now, strict=False), start=2):
         found += differences(before, after, tolerance, f"{path.name}:{number} ")

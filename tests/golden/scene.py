@@ -62,7 +62,8 @@ class Drive:
     Attributes:
         turned_deg: by how much the camera turns about its vertical axis, in the middle of the drive.
         brightness: of the pictures.
-        beams, columns: of the LiDAR, in front of the vehicle.
+        beams, columns: of the LiDAR, in front of the vehicle, as far as `half_view_deg` to either side.
+        depth_step: how many pixels of the picture lie between two of its depth map.
     """
 
     lens: str = "pinhole"
@@ -72,6 +73,8 @@ class Drive:
     brightness: float = 1.0
     beams: int = 64
     columns: int = 600
+    half_view_deg: float = 75.0
+    depth_step: int = 1
     speed_mps: float = SPEED_MPS
 
 
@@ -201,7 +204,7 @@ def _turn(yaw_rad: float) -> Array:
 
 def sweep(drive: Drive, place: Street, x_m: float) -> dict[str, NDArray[np.generic]]:
     """A sweep while the vehicle drives: its points are where they were when each was measured."""
-    azimuth = np.radians(np.linspace(75.0, -75.0, drive.columns, endpoint=False))
+    azimuth = np.radians(np.linspace(drive.half_view_deg, -drive.half_view_deg, drive.columns, endpoint=False))
     elevation = np.radians(np.linspace(14.0, -25.0, drive.beams))
     a, e = (grid.ravel() for grid in np.meshgrid(azimuth, elevation, indexing="ij"))
     ring = np.tile(np.arange(drive.beams, dtype=np.uint16), drive.columns)
@@ -230,7 +233,8 @@ def write(drive: Drive, folder: Path) -> Path:
         grey = np.rint(np.clip(bright * drive.brightness, 0.0, 1.0) * 255.0).astype(np.uint8)
         names = {"image": f"{index}.png", "depth": f"{index}.npy", "cloud": f"{index}.npz"}
         assert cv2.imwrite(str(folder / names["image"]), grey)
-        np.save(folder / names["depth"], metres)
+        first, step = drive.depth_step // 2, drive.depth_step
+        np.save(folder / names["depth"], metres[first::step, first::step])
         np.savez(folder / names["cloud"], **sweep(drive, place, x_m))  # type: ignore[arg-type]
         twist = {"linear_mps": [drive.speed_mps, 0.0, 0.0], "angular_radps": [0.0, 0.0, 0.0]}
         frames.append({**names, "stamp_ns": START_NS + round(index * SPACING_S * NS_PER_S), "twist": twist})

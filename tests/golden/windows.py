@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import coec
+from coec.schemas.replies import CalibrationResult
 from golden.reference import DATA, plain, rounded, sha256
 from golden.scene import LENSES, Drive, write
 
@@ -113,6 +114,15 @@ class Windows:
         return stored(result.to_json()) | ({"beside": rounded(plain(beside))} if beside else {})
 
 
+def fields_that_differ(golden: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """Names of the fields of a result whose digits differ."""
+    before, after = golden["fields"].split(), now["fields"].split()
+    names = sorted(CalibrationResult.model_fields)
+    if not len(names) == len(before) == len(after):
+        return ["there are other fields"]
+    return [name for name, a, b in zip(names, before, after, strict=True) if a != b]
+
+
 def stored(text: str) -> dict[str, Any]:
     """Of the canonical JSON of a result."""
     document = json.loads(text)
@@ -120,7 +130,7 @@ def stored(text: str) -> dict[str, Any]:
     verdict = document["verdict"]
     return {
         "sha256": sha256(text.encode()),
-        "fields": {name: sha256(json.dumps(document[name]).encode())[:6] for name in sorted(document)},
+        "fields": " ".join(sha256(json.dumps(document[name]).encode())[:4] for name in sorted(document)),
         "values": rounded(
             {
                 **{name: document[name] for name in VALUES},

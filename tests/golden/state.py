@@ -1,0 +1,96 @@
+"""What stands on a vehicle's disk: written by today's code into `data/state`, read and written again by any other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from calibration.rig.test_objections import EDGE, RIG
+from coec.adapters.files.baseline_file import BASELINES, baseline_hash, load_baselines, save_baseline
+from coec.adapters.files.rig import rig_from_json
+from coec.config import Config
+from coec.runtime.decisions.history import History
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.nominal.kept import KeptNominals
+from coec.runtime.rig.rig_file import RigFile
+from driven_rig import Drive
+from golden.reference import DATA, plain, read
+from rigs import POSES, with_moved
+from upgrade import read_state, write_state
+
+STATE, EXPECTED, VALUES = DATA / "state", DATA / "state_expected.json", DATA / "state_values.json"
+RIG_FOLDER, RIG_AGAIN = "moved", "moved_again"
+"""Of a rig while a sensor has moved; and of the same rig after a restart, which rounds its poses once more."""
+
+
+def write_all(folder: Path) -> dict[str, Any]:
+    """Every file of a vehicle. Returns what stands in them, as `read_state` wants to know it."""
+    expected = write_state.write(folder)
+    drive = Drive(RIG)
+    drive.looks(POSES, 6)
+    drive.lidars(EDGE, POSES)
+    drive.looks(with_moved("roof"), 6)
+    assert drive.state.event is not None
+    (folder / RIG_FOLDER).mkdir()
+    book = RigFile(folder / RIG_FOLDER)
+    book.remember(drive.state)
+    book.flush()
+    _write_rig_again(folder, folder)
+    return expected
+
+
+def _write_rig_again(folder: Path, to: Path) -> None:
+    (to / RIG_AGAIN).mkdir()
+    book = RigFile(to / RIG_AGAIN)
+    book.remember(RigFile(folder / RIG_FOLDER).recalled(Drive(RIG).state))
+    book.flush()
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Bytes by path."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def values(folder: Path) -> dict[str, Any]:
+    """What is read of a state directory, in readable form."""
+    expected = read(EXPECTED)
+    config = Config.model_validate(expected["nominal"])
+    found = KeptNominals(folder).found(config)
+    baselines = load_baselines(folder / BASELINES)
+    rig = RigFile(folder / RIG_FOLDER)
+    recalled = rig.recalled(Drive(RIG).state)
+    return {
+        "state": read_state.read(folder, expected),
+        "history": {pair: _history(folder, pair) for pair in expected["pairs"]},
+        "nominal": {name: one.pair.model_dump(mode="json") for name, one in found.items()},
+        "origins": {name: dict(one.origins) for name, one in found.items()},
+        "baselines": {name: baseline_hash(one) for name, one in baselines.items()},
+        "rig": {"damage": plain(rig.damage), "event": plain(recalled.event), "before": plain(recalled.before)},
+        "poses": {name: plain(one.pose) for name, one in sorted(recalled.believed.histories.items())},
+    }
+
+
+def _history(folder: Path, pair: str) -> list[Any]:
+    books = History(folder, pair, 1000, {})
+    return [one.entry.model_dump(mode="json") for one in books.entries()]
+
+
+def write_again(folder: Path, to: Path) -> None:
+    """Reads the files of a folder and writes what was read into another one."""
+    expected = read(EXPECTED)
+    to.mkdir()
+    read_store, store = StateStore(folder, write_state.VEHICLE), StateStore(to, write_state.VEHICLE)
+    for document in expected["pairs"].values():
+        rig = rig_from_json(document["rig"], None)
+        remembered = read_store.recall(rig)
+        assert remembered is not None
+        heads: Callable[[], dict[str, str]] = partial(dict, remembered.history_heads)
+        store.remember(rig, remembered.state, remembered.clocks, heads, remembered.commissioned_from)
+    store.flush()
+    for baseline in load_baselines(folder / BASELINES).values():
+        save_baseline(to / BASELINES, baseline)
+    (to / "nominal.json").write_bytes((folder / "nominal.json").read_bytes())
+    KeptNominals(to).flush()
+    _write_rig_again(folder, to)
