@@ -3,7 +3,7 @@ two LiDARs. No window is solved here: the worker knows the truth, so that a driv
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from calibration.rig.test_objections import EDGE, RIG
 from coec.calibration.frames.window import SliceEnded
 from coec.calibration.rig.objections import objections
+from coec.calibration.types import Matrix4
 from driven_rig import Drive
 from golden.reference import plain
 from lidar_bench import LidarBench
@@ -113,9 +114,8 @@ def _by_name(parts: list[dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
     return [(part["name"], part) for part in parts]
 
 
-def rig_of_two_lidars() -> list[dict[str, Any]]:
-    """Three cameras and two LiDARs; the one on the roof is knocked, named, and put right in all of its pairs at once,
-    then the bumper's."""
+def rig_of_two_lidars(knocked_lidar: str) -> list[dict[str, Any]]:
+    """Three cameras and two LiDARs, one of which is knocked, named, and put right in all of its pairs at once."""
     drive = Drive(RIG)
     lines: list[dict[str, Any]] = []
     corrections: list[object] = [None]
@@ -129,24 +129,21 @@ def rig_of_two_lidars() -> list[dict[str, Any]]:
             corrections.append(state.correction)
             lines.append({"correction": plain(state.correction)})
 
-    def turn(poses: Any, rounds: int) -> None:
+    def turn(poses: Mapping[str, Matrix4], rounds: int) -> None:
         for _ in range(rounds):
             drive.looks(poses, 1)
             note()
         drive.lidars(EDGE, poses)
         note()
 
-    poses: Any = POSES
-    for knocked_lidar in LIDARS:
-        turn(poses, 3)
-        turn(poses, 3)
-        poses = {**poses, knocked_lidar: with_moved(knocked_lidar)[knocked_lidar]}
-        knocked_s = drive.at_s
-        turn(poses, 3)
-        turn(poses, 3)
-        for edge in RIG.edges:
-            if knocked_lidar in (edge.a, edge.b) and edge.name != EDGE:
-                drive.window(edge.name, poses, knocked_s + 1.0)
-                note()
-        turn(poses, 3)
+    turn(POSES, 3)
+    turn(POSES, 3)
+    poses, knocked_s = with_moved(knocked_lidar), drive.at_s
+    turn(poses, 3)
+    turn(poses, 3)
+    for edge in RIG.edges:
+        if knocked_lidar in (edge.a, edge.b) and edge.name != EDGE:
+            drive.window(edge.name, poses, knocked_s + 1.0)
+            note()
+    turn(poses, 3)
     return lines

@@ -62,5 +62,6 @@ def test_of_two_lidars_without_cameras(tmp_path: Path, seed: int | None, writes:
     compare("two_lidars", streams.two_lidars(tmp_path / "rig", seed), writes=writes and seed is None)
 
 
-def test_of_a_rig_with_three_cameras_and_two_lidars(writes: bool) -> None:
-    compare("rig", streams.rig_of_two_lidars(), writes=writes)
+@pytest.mark.parametrize("lidar", ["roof", pytest.param("bumper", marks=pytest.mark.slow)])
+def test_of_a_rig_with_three_cameras_and_two_lidars(lidar: str, writes: bool) -> None:
+    compare(f"rig_{lidar}", streams.rig_of_two_lidars(lidar), writes=writes)

@@ -77,7 +77,7 @@ def _cases() -> dict[str, Case]:
         "dark": Case(Drive(brightness=0.03), three),
         "standing": Case(Drive(speed_mps=0.0), three),
         "two pairs": Case(Drive(pairs=2), three),
-        "sparse": Case(Drive(beams=16, columns=200), three, fast=True),
+        "sparse": Case(Drive(beams=16, columns=200), three),
         "not compensated": Case(Drive(), {**three, "motion_compensation": False}),
         "no start": Case(Drive(), {"objective": "fused"}),
         "time offset": Case(Drive(), {**three, "time_offset": True}),
