@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calibration.rig.test_objections import EDGE, RIG
 from coec.adapters.files.baseline_file import BASELINES, baseline_hash, load_baselines, save_baseline
 from coec.adapters.files.rig import rig_from_json
+from coec.calibration.rig.types import RigGraph
 from coec.config import Config
 from coec.runtime.decisions.history import History
 from coec.runtime.decisions.state_store import StateStore
@@ -41,10 +45,17 @@ def write_all(folder: Path) -> dict[str, Any]:
     return expected
 
 
+def _rig_of(folder: Path) -> RigGraph:
+    """The rig, built as it was when the file was written: with other last digits it would be another one."""
+    stored = read(folder / RIG_FOLDER / "sensors.json")["body"]["edges"]
+    edges = [replace(edge, T_a_b=np.array(stored[edge.name]["nominal"])) for edge in RIG.edges]
+    return RigGraph.of(RIG.sensors, edges, RIG.links)
+
+
 def _write_rig_again(folder: Path, to: Path) -> None:
     (to / RIG_AGAIN).mkdir()
     book = RigFile(to / RIG_AGAIN)
-    book.remember(RigFile(folder / RIG_FOLDER).recalled(Drive(RIG).state))
+    book.remember(RigFile(folder / RIG_FOLDER).recalled(Drive(_rig_of(folder)).state))
     book.flush()
 
 
@@ -60,7 +71,7 @@ def values(folder: Path) -> dict[str, Any]:
     found = KeptNominals(folder).found(config)
     baselines = load_baselines(folder / BASELINES)
     rig = RigFile(folder / RIG_FOLDER)
-    recalled = rig.recalled(Drive(RIG).state)
+    recalled = rig.recalled(Drive(_rig_of(folder)).state)
     return {
         "state": read_state.read(folder, expected),
         "history": {pair: _history(folder, pair) for pair in expected["pairs"]},

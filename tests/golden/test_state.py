@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -33,7 +34,9 @@ def folder(tmp_path: Path) -> Path:
 
 def test_files_are_read_to_the_same_values(folder: Path) -> None:
     now = json.loads(json.dumps(plain(values(folder))))
-    assert not differences(read(VALUES), now, Tolerance(0.0, 0.0))
+    assert not differences(
+        read(VALUES), now, Tolerance(0.0 if is_identical() else 1e-9, 0.0 if is_identical() else 1e-12)
+    )
     assert files(folder) == files(STATE), "to read changes nothing, and nothing is kept aside"
 
 
@@ -60,5 +63,15 @@ def same(name: str, before: bytes, after: bytes, *, exact: bool) -> None:
         assert after == before, name
         return
     for old, new in zip(before.splitlines(), after.splitlines(), strict=True):
-        found = differences(json.loads(old), json.loads(new), Tolerance(1e-6, 1e-9))
+        found = differences(documents(old.decode()), documents(new.decode()), Tolerance(1e-6, 1e-9))
         assert all("sha256" in line or "checksum" in line or "hash" in line for line in found), (name, found)
+
+
+def documents(line: str) -> list[Any]:
+    """The JSON objects in a line; books have a checksum before them."""
+    decoder, found, at = json.JSONDecoder(), [], line.find("{")
+    while at >= 0:
+        one, end = decoder.raw_decode(line, at)
+        found.append(one)
+        at = line.find("{", end)
+    return found
