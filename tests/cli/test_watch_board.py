@@ -20,7 +20,7 @@ from coec.adapters.system import keyboard
 from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.words import Words
-from coec.cli.watch_board import Asking, Board
+from coec.cli.fleet_screen import Asking, Board
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import DecodeError
 from coec.fleet.roster import Filter, Roster

@@ -6,7 +6,7 @@ import pytest
 
 from coec.config import CalibrationConfig, DepthConfig, SearchConfig
 from coec.errors import UsageError
-from coec.library.choices import Choices, configuration_of
+from coec.calibration_options import Choices, configuration_of
 
 
 def test_choices_override_the_recorded_configuration_and_nothing_else() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
-from coec.library.choices import Choices
+from coec.calibration_options import Choices
 from coec.library.evaluating import MARGIN_DEG, MARGIN_M, Plan, configuration_of
 
 

@@ -1,4 +1,6 @@
-"""The computer: its disk, its clock, and whether kernels are compiled."""
+"""Findings of `coec doctor` on this computer: its disk, its clock, and whether kernels are compiled; and what makes a
+finding.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +14,37 @@ from pathlib import Path
 
 from coec.adapters.system.clock import clock_state
 from coec.adapters.system.locks import holder_of
-from coec.cli.doctor.found import fail, ok, warn
 from coec.config import StateConfig
 from coec.schemas.doctor import Finding
 
 MIB = 2**20
 
+
 PROBE_BYTES = 16 * MIB
 """Written to measure the disk, and removed: four camera-LiDAR pairs of full size."""
+
 
 SLOW_MIB_PER_S = 10.0
 """Three times what an urgent window takes: a pair of 4 MB every 1.2 s."""
 
+
 CLOCK_LIMIT_S = 1.0
 """Largest error of the clock that the kernel may estimate."""
+
+
+def ok(check: str, where: str, text: str) -> Finding:
+    """A finding that needs no action."""
+    return Finding(check=check, level="ok", where=where, text=text)
+
+
+def warn(check: str, where: str, text: str, advice: str) -> Finding:
+    """A finding that should be seen to, although the service can work."""
+    return Finding(check=check, level="warn", where=where, text=text, advice=advice)
+
+
+def fail(check: str, where: str, text: str, advice: str) -> Finding:
+    """A finding with which the service cannot do its work."""
+    return Finding(check=check, level="fail", where=where, text=text, advice=advice)
 
 
 def state_findings(state: StateConfig) -> Iterator[Finding]:
@@ -130,7 +149,7 @@ def _disk(folder: Path, min_free_bytes: int) -> Iterator[Finding]:
 def _speed(folder: Path) -> Finding:
     where = str(folder)
     data = os.urandom(MIB)
-    begun_s = time.monotonic()
+    started_s = time.monotonic()
     try:
         descriptor, name = tempfile.mkstemp(prefix=".doctor-", dir=folder)
         try:
@@ -144,7 +163,7 @@ def _speed(folder: Path) -> Finding:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         advice = "make room: windows and history cannot be written" if full else "see to the disk, and who may write"
         return fail("writing", where, f"cannot be written: {error.strerror}", advice)
-    speed = PROBE_BYTES / MIB / max(time.monotonic() - begun_s, 1e-6)
+    speed = PROBE_BYTES / MIB / max(time.monotonic() - started_s, 1e-6)
     text = f"{speed:.0f} MiB/s, safely on the disk"
     if speed < SLOW_MIB_PER_S:
         advice = "a faster disk, or smaller frames: pairs are lost when they come faster than they are written"

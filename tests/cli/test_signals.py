@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from coec.cli import stopping
-from coec.cli.stopping import no_interrupt_lost
+from coec.cli.signals import no_interrupt_lost
 
 DEADLINE_S = 60.0
 

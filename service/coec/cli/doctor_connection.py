@@ -1,4 +1,6 @@
-"""The way to the router, step by step: whether anything listens, certificates, Zenoh, access rules."""
+"""Findings of `coec doctor` on the way to the router and the service: whether the router answers, certificates, Zenoh,
+access rules, and what a running service reports about itself.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,13 @@ from typing import Literal
 
 import zenoh
 
+from coec import __version__
 from coec.adapters.zenoh.bus import closed, is_connected, open_session
+from coec.adapters.zenoh.client import ask, ask_one
 from coec.adapters.zenoh.endpoints import CERTIFIED, WITH_PORT, Endpoint, redacted
 from coec.adapters.zenoh.opening import open_client
-from coec.adapters.zenoh.settings import beside, connected_of, finds_peers, listened_of, mode_of, settings_of
+from coec.adapters.zenoh.settings import beside as as_separate_client
+from coec.adapters.zenoh.settings import connected_of, finds_peers, listened_of, mode_of, settings_of
 from coec.adapters.zenoh.tls import (
     Certificate,
     CertificateError,
@@ -24,22 +29,31 @@ from coec.adapters.zenoh.tls import (
     read_certificate,
     shake_hands,
 )
-from coec.cli.doctor.found import fail, ok, warn
+from coec.cli.doctor_computer import fail, ok, warn
 from coec.config import Config
-from coec.errors import UnavailableError
-from coec.schemas.doctor import Finding
+from coec.errors import CoecError, NotFoundError, UnavailableError
+from coec.runtime.api.configuration import shown
+from coec.runtime.api.troubles import TROUBLES
+from coec.runtime.reload import differing
+from coec.schemas.base import from_json, json_value
+from coec.schemas.doctor import Finding, Level
 from coec.schemas.keys import Keys
+from coec.schemas.replies import HealthReply, StatusReply
 
 CONNECT_S = 3.0
 """Timeout of each step; a router on the same network answers in milliseconds."""
 
+
 CLOSE_S = 3.0
 
-ASK_AGAIN_S = 0.05
+
+QUERY_PERIOD_S = 0.05
 """Time between two queries for a token that the router may not have forwarded yet; nothing announces a refusal."""
+
 
 SEEN_S = 3.0
 """Timeout for our own liveliness token to come back from the router."""
+
 
 EXPIRES_SOON_DAYS = 30.0
 
@@ -48,15 +62,29 @@ OVER_TCP = frozenset({"tcp", "tls", "ws"})
 DAY_S = 86_400.0
 
 
+TIMEOUT_S = 3.0
+
+
+OF_THE_COMMAND_LINE = frozenset({"zenoh.embedded_router", "state.directory"})
+"""Configuration values that options of `coec run` override."""
+
+
+PLACES_NAMED = 5
+
+
+LEVELS: dict[int, Level] = {0: "ok", 1: "warn", 2: "fail", 3: "warn"}
+"""Level of a finding by ROS level; STALE, when nothing was checked yet, is no failure."""
+
+
 def certificate_findings(config: Config) -> Iterator[Finding]:
     """Findings on the certificates that the service shows, read from the disk."""
     settings = settings_of(config.zenoh, config.limits)
     seen: set[str] = set()
-    ways: tuple[tuple[Literal["connect", "listen"], tuple[str, ...]], ...] = (
+    roles: tuple[tuple[Literal["connect", "listen"], tuple[str, ...]], ...] = (
         ("connect", connected_of(settings)),
         ("listen", listened_of(settings)),
     )
-    for role, endpoints in ways:
+    for role, endpoints in roles:
         for endpoint in (Endpoint.parse(text) for text in endpoints):
             material = material_of(settings, endpoint, role)
             where = str(material.certificate)
@@ -81,12 +109,12 @@ def router_findings(config: Config) -> Iterator[Finding]:
             yield ok("router", redacted(text), "only Zenoh itself can tell whether somebody is there")
 
 
-def session_beside(config: Config) -> zenoh.Session | None:
+def session_of_client(config: Config) -> zenoh.Session | None:
     """A client session with the router that uses the certificate of the service; None when none comes about."""
     zenoh.init_log_from_env_or("off")
     settings = settings_of(config.zenoh, config.limits)
     endpoints = _endpoints(settings, config)
-    settings = beside(settings)
+    settings = as_separate_client(settings)
     settings.insert_json5("connect/endpoints", json.dumps(endpoints))
     try:
         return open_client(settings, CONNECT_S)
@@ -98,7 +126,7 @@ def session_as_of_service(config: Config) -> zenoh.Session | None:
     """A session as the service opens it, which therefore receives what the service receives; None when none comes
     about. Where the service is the router itself: a client of it."""
     if mode_of(settings_of(config.zenoh, config.limits)) == "router":
-        return session_beside(config)
+        return session_of_client(config)
     zenoh.init_log_from_env_or("off")
     try:
         session = open_session(config.zenoh, config.limits, again=True)
@@ -109,7 +137,7 @@ def session_as_of_service(config: Config) -> zenoh.Session | None:
         if time.monotonic() > deadline_s:
             closed(session, CLOSE_S)
             return None
-        time.sleep(ASK_AGAIN_S)
+        time.sleep(QUERY_PERIOD_S)
     return session
 
 
@@ -174,7 +202,7 @@ def rules_finding(config: Config, session: zenoh.Session, other: zenoh.Session) 
         while time.monotonic() < deadline_s:
             if any(reply.ok is not None for reply in other.liveliness().get(token_key, timeout=1.0)):
                 return ok("rules", keys.root, "the router hands on what is said there")
-            time.sleep(ASK_AGAIN_S)
+            time.sleep(QUERY_PERIOD_S)
     finally:
         token.undeclare()
     return fail(
@@ -252,3 +280,78 @@ def _dated(check: str, where: str, seen: Certificate) -> Finding:
 
 def _day(seconds: float) -> str:
     return "for ever" if seconds == float("inf") else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")
+
+
+def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding]:
+    """Findings from the answers of the vehicle's service; a single one if no service answers."""
+    keys = Keys(config.prefix, config.vehicle)
+    try:
+        status = from_json(StatusReply, ask_one(session, f"{keys.status}?format=json", TIMEOUT_S).payload)
+    except NotFoundError:
+        yield ok("service", keys.root, "no service of the vehicle answers here; what it would say is not known")
+        return
+    except CoecError as error:
+        yield fail("service", keys.root, f"answers wrongly: {error}", "see to its log")
+        return
+    yield from _status(status, keys)
+    yield _compared(session, config, keys)
+    try:
+        replies = ask(session, f"{keys.health('*')}?format=json", TIMEOUT_S)
+        healths = [from_json(HealthReply, reply.payload) for reply in replies]
+    except CoecError as error:
+        yield fail("health", keys.health("*"), f"answers wrongly: {error}", "see to its log")
+        return
+    for health in healths:
+        yield from _health(health, keys)
+
+
+def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:
+    """Whether the service runs with this file."""
+    try:
+        served = json_value(ask_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
+        places = [place for place in differing(served, shown(config)) if place not in OF_THE_COMMAND_LINE]
+    except (CoecError, ValueError, KeyError, TypeError) as error:
+        text = f"the service does not tell with which configuration it runs: {error}"
+        return warn("file", keys.config, text, "see to its version, and to the rules of the router")
+    if not places:
+        return ok("file", keys.config, "the service runs with this file")
+    more = f" and {len(places) - PLACES_NAMED} more" if len(places) > PLACES_NAMED else ""
+    text = f"this file is another than the service runs with, in {', '.join(places[:PLACES_NAMED])}{more}"
+    return warn(
+        "file", keys.config, text, "reload or restart the service, or name the file that it runs with (--config)"
+    )
+
+
+def _status(status: StatusReply, keys: Keys) -> Iterator[Finding]:
+    runs = f"version {status.version}, {status.state} for {status.uptime_s:.0f} s"
+    if status.state in ("failing", "stopping"):
+        yield fail("service", keys.root, runs, "see to its log, and whether the service manager starts it again")
+    elif status.version != __version__:
+        advice = "restart the service with the version that is installed, or ask with its own"
+        yield warn("service", keys.root, f"{runs}; this is version {__version__}", advice)
+    else:
+        yield ok("service", keys.root, runs)
+    loaded = status.configuration
+    if loaded is not None and loaded.refused is not None:
+        advice = "correct the file (`coec check-config`) and reload"
+        yield fail("reload", keys.root, f"the file on the disk was refused: {loaded.refused}", advice)
+    elif loaded is not None and loaded.waiting:
+        waits = ", ".join(loaded.waiting)
+        yield warn("reload", keys.root, f"waits for a restart: {waits}", "restart the service when it suits")
+    for reason in status.reasons:
+        problem = TROUBLES.get(reason.code)
+        advice = f"reason {reason.code}: see to its log" if problem is None else problem.advice
+        yield warn("service", keys.root, reason.text, advice)
+
+
+def _health(health: HealthReply, keys: Keys) -> Iterator[Finding]:
+    where = keys.health(health.pair)
+    why = " ".join(reason.text for reason in health.reasons)
+    level = LEVELS[health.level]
+    text = f"{health.state}{f': {why}' if why else ''}"
+    advice = None if level == "ok" else "see `coec query health`, and docs/health.md for what it means"
+    yield Finding(check="health", level=level, where=where, text=text, advice=advice)
+    if health.needs:
+        yield ok("next_window", where, f"still needed for the next window: {'; '.join(health.needs)}")
+    else:
+        yield ok("next_window", where, "nothing is missing")
