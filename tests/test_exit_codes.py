@@ -371,4 +371,4 @@ def test_a_signal_before_the_service_handles_it_is_a_stop() -> None:
 
 def test_check_config_of_the_template_of_these_tests_succeeds(tmp_path: Path) -> None:
     """Without a fault, none is found."""
-    assert check_config.run(written(tmp_path), defaults=False, as_json=True) == ExitCode.SUCCESS
+    assert check_config.check_config(written(tmp_path), defaults=False, as_json=True) == ExitCode.SUCCESS

@@ -222,12 +222,12 @@ def test_recordings_beyond_the_limit_are_left_out(
     "a vehicle that lists thousands of snippets of one event", "the nearest are fetched, the rest is counted"
 )
 def test_snippets_of_an_event_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = cli_fetch._Fetch(cast(Any, None), KEYS, PAIR, tmp_path, cast(Any, None))
+    bench = cli_fetch.Download(cast(Any, None), KEYS, PAIR, tmp_path, 1.0, 1.0, with_windows=True)
     file: dict[str, Any] = {"size_bytes": 1, "sha256": SHA256, "event": "suspect", "recorded_ns": 8}
     snippets = tuple(SnippetInfo(snippet_id=f"front-{n}.snippet", stamp_ns=n, **file) for n in range(1000))
     listed = WindowsReply(vehicle=VEHICLE, pair=PAIR, windows=(), snippets=snippets)
-    monkeypatch.setattr(cli_fetch._Fetch, "_document", lambda *_: listed)
-    monkeypatch.setattr(cli_fetch._Fetch, "_recording", lambda *_: snippets[0])
+    monkeypatch.setattr(cli_fetch.Download, "_document", lambda *_: listed)
+    monkeypatch.setattr(cli_fetch.Download, "_recording", lambda *_: snippets[0])
     found = sorted(bench._snippets(cast(Any, SimpleNamespace(stamp_ns=100))))
     nearest = sorted(f"front-{n}.snippet" for n in range(92, 108))
     assert (found, len(found)) == (nearest, cli_fetch.MAX_SNIPPETS)
