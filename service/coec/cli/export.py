@@ -25,49 +25,55 @@ def _formats() -> Iterable[str]:
     return tuple(FORMATS)
 
 
+CalibrationSource = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SOURCE",
+        help="A state directory, a recorded window (.mcap), the JSON of `calibrate` or of `query extrinsic`.",
+        show_default=False,
+    ),
+]
+Format = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        help="tf, urdf, autoware, kalibr, kitti, kitti360, nuscenes, openlabel, colmap, opencv or json.",
+        metavar="NAME",
+        autocompletion=suggesting(_formats),
+        show_default=False,
+    ),
+]
+ParentPose = Annotated[
+    str | None,
+    typer.Option(
+        help="Pose of the LiDAR in the parent: metres and a quaternion.",
+        metavar="X,Y,Z,QX,QY,QZ,QW",
+        show_default="the LiDAR is the parent",
+    ),
+]
+OutputFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="File to write, completely or not at all; in a file with several entries only this one changes. "
+        "Default: print it.",
+        metavar="FILE",
+    ),
+]
+
+
 def export(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SOURCE",
-            help="A state directory, a recorded window (.mcap), the JSON of `calibrate` or of `query extrinsic`.",
-            show_default=False,
-        ),
-    ],
-    format: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            help="tf, urdf, autoware, kalibr, kitti, kitti360, nuscenes, openlabel, colmap, opencv or json.",
-            metavar="NAME",
-            autocompletion=suggesting(_formats),
-            show_default=False,
-        ),
-    ],
+    source: CalibrationSource,
+    format: Format,
     parent: Annotated[str | None, typer.Option(help="Parent frame in the file.", show_default="the LiDAR's")] = None,
     child: Annotated[
         str | None, typer.Option(help="Name of the camera's frame in the file.", show_default="the camera's")
     ] = None,
-    parent_pose: Annotated[
-        str | None,
-        typer.Option(
-            help="Pose of the LiDAR in the parent: metres and a quaternion.",
-            metavar="X,Y,Z,QX,QY,QZ,QW",
-            show_default="the LiDAR is the parent",
-        ),
-    ] = None,
+    parent_pose: ParentPose = None,
     pair: Annotated[str | None, typer.Option(help="Pair, if there are several.")] = None,
     config: Annotated[
         Path | None, typer.Option(help="Configuration of the daemon, for intrinsics and frames.", metavar="FILE")
     ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            help="File to write, completely or not at all; in a file with several entries only this one changes. "
-            "Default: print it.",
-            metavar="FILE",
-        ),
-    ] = None,
+    output: OutputFile = None,
     force: Annotated[
         bool, typer.Option("--force", help="Write a calibration that is not accepted, too; the file says so.")
     ] = False,

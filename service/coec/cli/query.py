@@ -90,78 +90,96 @@ class Request:
         return f"/{VERSION_CHUNK}/" in self.key
 
 
+def _typable() -> Iterable[str]:
+    """Keys that a shell suggests; commands each by name."""
+    from coec.schemas.commands import NAMES
+
+    plain = (each.key for each in KEYS if "/" not in each.key)
+    return (*plain, "windows/", "evidence/", *(f"command/{name}" for name in NAMES))
+
+
+KeyArgument = Annotated[
+    str,
+    typer.Argument(
+        help="One of the keys above, or a whole key expression with @v1 in it.",
+        metavar="KEY",
+        autocompletion=suggesting(_typable),
+        show_default=False,
+    ),
+]
+Pair = Annotated[
+    str | None, typer.Option(help="Pair to ask; default: all. A command needs it if there are several pairs.")
+]
+SessionCredentials = Annotated[
+    Path | None,
+    typer.Option(
+        help="Zenoh configuration (JSON5) to connect with; its certificate authenticates commands.",
+        metavar="FILE",
+    ),
+]
+Anonymous = Annotated[bool, typer.Option("--anonymous", help="Send a command without authentication.")]
+Params = Annotated[
+    list[str] | None,
+    typer.Option("--param", help="Parameter of the query, for example limit=5; repeatable.", metavar="K=V"),
+]
+RollbackTo = Annotated[
+    str | None,
+    typer.Option(help="For command/rollback: window or sha256 from `query history` to serve again.", metavar="HASH"),
+]
+Candidate = Annotated[
+    str | None,
+    typer.Option(
+        help="For command/apply: window or sha256 of the candidate from `query extrinsic`; another one is refused.",
+        metavar="HASH",
+    ),
+]
+Release = Annotated[bool, typer.Option("--release", help="For command/hold: end the hold.")]
+Reason = Annotated[
+    str | None,
+    typer.Option(
+        help="For any command: the reason. It appears in `query history`, and for a hold also in extrinsic and health.",
+        metavar="TEXT",
+    ),
+]
+Sensor = Annotated[
+    str | None,
+    typer.Option(help="For any command: apply it to all pairs of this sensor of the rig.", metavar="NAME"),
+]
+Payload = Annotated[
+    str | None, typer.Option(help="Payload of a command as JSON, instead of these options.", metavar="JSON")
+]
+OutputFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="File to write, byte for byte as it was sent: windows/ID with its sha256 verified, overlay, or a "
+        "picture of evidence/ID.",
+        metavar="FILE",
+    ),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace a FILE that holds something else than the window.")]
+
+
 def query(
-    key: Annotated[
-        str,
-        typer.Argument(
-            help="One of the keys above, or a whole key expression with @v1 in it.",
-            metavar="KEY",
-            autocompletion=suggesting(_typable),
-            show_default=False,
-        ),
-    ],
-    pair: Annotated[
-        str | None, typer.Option(help="Pair to ask; default: all. A command needs it if there are several pairs.")
-    ] = None,
+    key: KeyArgument,
+    pair: Pair = None,
     config: ServiceConfig = None,
     vehicle: Vehicle = None,
     prefix: Prefix = None,
     connect: Connect = None,
-    zenoh: Annotated[
-        Path | None,
-        typer.Option(
-            help="Zenoh configuration (JSON5) to connect with; its certificate authenticates commands.",
-            metavar="FILE",
-        ),
-    ] = None,
-    anonymous: Annotated[bool, typer.Option("--anonymous", help="Send a command without authentication.")] = (False),
-    params: Annotated[
-        list[str] | None,
-        typer.Option("--param", help="Parameter of the query, for example limit=5; repeatable.", metavar="K=V"),
-    ] = None,
-    to: Annotated[
-        str | None,
-        typer.Option(
-            help="For command/rollback: window or sha256 from `query history` to serve again.", metavar="HASH"
-        ),
-    ] = None,
-    candidate: Annotated[
-        str | None,
-        typer.Option(
-            help="For command/apply: window or sha256 of the candidate from `query extrinsic`; another one is refused.",
-            metavar="HASH",
-        ),
-    ] = None,
-    release: Annotated[bool, typer.Option("--release", help="For command/hold: end the hold.")] = False,
-    reason: Annotated[
-        str | None,
-        typer.Option(
-            help="For any command: the reason. It appears in `query history`, and for a hold also in extrinsic and "
-            "health.",
-            metavar="TEXT",
-        ),
-    ] = None,
-    sensor: Annotated[
-        str | None,
-        typer.Option(help="For any command: apply it to all pairs of this sensor of the rig.", metavar="NAME"),
-    ] = None,
-    payload: Annotated[
-        str | None, typer.Option(help="Payload of a command as JSON, instead of these options.", metavar="JSON")
-    ] = None,
+    zenoh: SessionCredentials = None,
+    anonymous: Anonymous = (False),
+    params: Params = None,
+    to: RollbackTo = None,
+    candidate: Candidate = None,
+    release: Release = False,
+    reason: Reason = None,
+    sensor: Sensor = None,
+    payload: Payload = None,
     timeout_s: Annotated[
         float, typer.Option("--timeout", help="Seconds to wait for the router and for the answer.", min=0.01)
     ] = 5.0,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            help="File to write, byte for byte as it was sent: windows/ID with its sha256 verified, overlay, or a "
-            "picture of evidence/ID.",
-            metavar="FILE",
-        ),
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace a FILE that holds something else than the window.")
-    ] = False,
+    output: OutputFile = None,
+    force: ForceOption = False,
     as_json: Json = False,
 ) -> int:
     from coec.adapters.zenoh.client import connected_by, is_alive, nobody
@@ -185,14 +203,6 @@ def query(
             raise nobody(selected, service_is_there=is_alive(session, keys, timeout_s))
     _show(answers, kind, request, selected, as_json=as_json)
     return 0 if all(_succeeded(answer, kind) for answer in answers) else 1
-
-
-def _typable() -> Iterable[str]:
-    """Keys that a shell suggests; commands each by name."""
-    from coec.schemas.commands import NAMES
-
-    plain = (each.key for each in KEYS if "/" not in each.key)
-    return (*plain, "windows/", "evidence/", *(f"command/{name}" for name in NAMES))
 
 
 def _answers(
