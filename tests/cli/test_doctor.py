@@ -255,7 +255,7 @@ def test_no_router_is_told_and_fails(coec: Coec, tmp_path: Path) -> None:
     assert report["healthy"] is False
     (found,) = [one for one in report["findings"] if one["check"] == "router"]
     assert (found["level"], found["where"]) == ("fail", endpoint)
-    assert "nobody listens at this port" in found["text"]
+    assert "nothing listens at this port" in found["text"]
     assert "session" not in [one["check"] for one in report["findings"]], "there is nobody to talk to"
 
 
@@ -269,7 +269,7 @@ def test_a_port_at_which_something_else_answers_is_told_from_none(
         found = list(examine(written(tmp_path, ZenohConfig(connect=(endpoint,)), "front"), 0.5))
     assert of(found, "router", endpoint)[0] == "ok"
     level, text = of(found, "session", endpoint)
-    assert (level, text) == ("fail", "no Zenoh session comes about")
+    assert (level, text) == ("fail", "no Zenoh session can be opened")
 
 
 def test_a_broken_configuration_is_a_finding(coec: Coec, tmp_path: Path) -> None:

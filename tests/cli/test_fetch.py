@@ -173,7 +173,7 @@ def test_whatever_is_fetched_is_metered_and_waited_for(
     [
         (("../x",), UsageError.exit_code, "is no name of a vehicle"),
         ((VEHICLE, "../../etc/passwd"), UsageError.exit_code, "is no red event"),
-        ((VEHICLE, "front-1"), NotFoundError.exit_code, "keeps no such red event"),
+        ((VEHICLE, "front-1"), NotFoundError.exit_code, "has no such red event"),
         (("nobody", "latest"), NotFoundError.exit_code, "nobody answered"),
     ],
 )
@@ -200,7 +200,7 @@ def test_of_a_vehicle_that_is_parked_its_last_word_is_told(coec: Coec, router: R
         wait_until(lambda: bool(storage.kept), "it is kept")
         outcome = coec("fetch", "truck-3", "latest", "--connect", router.endpoint)
     assert outcome.status == NotFoundError.exit_code
-    assert re.search(r"truck-3 does not answer; it took its leave \d+ d ago \(front: miscalibrated\)", outcome.err)
+    assert re.search(r"truck-3 does not answer; it logged off \d+ d ago \(front: miscalibrated\)", outcome.err)
 
 
 @pytest.mark.fault(

@@ -179,7 +179,7 @@ def test_a_link_that_breaks_is_said_and_words_come_again_with_it(
             wait_until(lambda: board.heartbeats.told.is_set(), "nobody has said anything")
             say(session, "truck-1")
             wait_until(lambda: "1 vehicle, 1 pair: 1 healthy" in text(board), "it is told")
-        wait_until(lambda: "no router: nothing new comes" in text(board), "the link is gone")
+        wait_until(lambda: "no router: nothing new arrives" in text(board), "the link is gone")
         board.clock = lambda: time.monotonic() + 200.0
         assert "silent (healthy)" in text(board), "its last state is not taken for the present one"
         board.clock = time.monotonic

@@ -19,13 +19,10 @@ if TYPE_CHECKING:
     from coec.fleet.engines.engine import Bounds, Engine
     from coec.schemas.fleet import BatchReport, WindowRow
 
-
 MIB = 2**20
-
 
 LINE_S = 30.0
 """Time between two lines of progress where standard error is no terminal."""
-
 
 Windows = Annotated[
     list[str],
@@ -74,9 +71,11 @@ def batch(
     no_credentials: NoCredentials = False,
     with_config: Annotated[
         Path | None,
-        typer.Option("--with-config", help="Judge by this configuration instead of each window's own.", metavar="FILE"),
+        typer.Option(
+            "--with-config", help="Evaluate with this configuration instead of each window's own.", metavar="FILE"
+        ),
     ] = None,
-    rig: Annotated[Path | None, typer.Option(help="Judge with this rig (JSON).", metavar="FILE")] = None,
+    rig: Annotated[Path | None, typer.Option(help="Evaluate with this rig (JSON).", metavar="FILE")] = None,
     depth: DepthModel = None,
     jobs: Annotated[int | None, typer.Option(help="Number of windows at a time.", min=1, show_default="the cores")] = (
         None
@@ -87,7 +86,7 @@ def batch(
     memory_mib: Annotated[int, typer.Option("--memory", help="Memory limit for one process, MiB.", min=256)] = 2048,
     as_json: Json = False,
 ) -> int:
-    """Judge many windows again: exit 0 if every one has a result, 1 if not."""
+    """Evaluate many windows again: exit 0 if every one has a result, 1 if not."""
     from coec.fleet import batch as fleet_batch
     from coec.fleet.engines.engine import Bounds
     from coec.fleet.places import jobs_of
@@ -158,7 +157,7 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
         bars.update(task, advance=1, note=note)
         if bars.disable and now_s - printed_s > LINE_S:
             printed_s = now_s
-            console.say(f"{done} of {count(total, 'window')} judged, {note}")
+            console.say(f"{done} of {count(total, 'window')} evaluated, {note}")
 
     with bars:
         yield on_row
@@ -171,7 +170,7 @@ def _show(report: BatchReport, cores: int) -> None:
     rows = console.table("windows", "", right=(1,))
     rows.add_row("in all", str(report.windows))
     if report.kept:
-        rows.add_row("judged before", str(report.kept))
+        rows.add_row("evaluated before", str(report.kept))
     rows.add_row("accepted", str(report.accepted))
     rows.add_row("refused", str(report.refused))
     for code, number in report.errors.items():
@@ -181,5 +180,5 @@ def _show(report: BatchReport, cores: int) -> None:
     console.out.print(rows)
     if report.share_of_ideal is not None:
         share = f"{100.0 * report.share_of_ideal:.0f} % of what {count(cores, 'core')} can do"
-        console.show(f"{report.elapsed_s:.1f} s, {report.cpu_s:.1f} s of processor, {share}")
+        console.show(f"{report.elapsed_s:.1f} s, {report.cpu_s:.1f} s of processor time, {share}")
     console.show(f"tables in {report.output}")

@@ -16,10 +16,8 @@ if TYPE_CHECKING:
     from coec.reports.stage_times import StageTimes
     from coec.sources import Recording
 
-
 PAIRS = 6
 """Pairs of the trial, evenly chosen: as many as in a check of the monitor."""
-
 
 LEVEL_STYLES = {"fail": "bold red", "warn": "bold yellow", "ok": ""}
 
@@ -29,7 +27,7 @@ def check(
     depth: Depth = None,
     as_json: Json = False,
 ) -> int:
-    """Show what a recording holds and what it is good for: exit 1 if it allows no calibration."""
+    """Show the content of a recording and whether it is suitable: exit 1 if it allows no calibration."""
     from coec.evaluation.fitness import fitness_of
     from coec.reports import console
     from coec.reports.stage_times import StageTimes

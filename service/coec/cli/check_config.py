@@ -13,7 +13,6 @@ from coec.errors import ConfigError, ModelError, UsageError, require_readable
 if TYPE_CHECKING:
     from coec.config import Config, OpenPairConfig, PairConfig
 
-
 TEMPLATE_HEAD = """\
 # Configuration of coec. Every key stands here with its default, except for what only you can know: the names, keys,
 # intrinsics and extrinsic below `pairs` are an example. Unknown keys are refused. Relative paths are relative to this

@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from coec.config import CalibrationConfig, PairConfig, SweepConfig, WindowConfig
     from coec.sources import Recording
 
-
 NS_PER_S = 1_000_000_000
-
 
 ALWAYS = (
     "vehicle",
@@ -32,7 +30,6 @@ ALWAYS = (
     "pairs.lidar.frame_id",
 )
 """Keys that a person has to see before the configuration is used elsewhere, whatever their defaults are."""
-
 
 COMMENTS = {
     "vehicle": "unique in the fleet; a part of every key",

@@ -21,11 +21,9 @@ if TYPE_CHECKING:
     from coec.reports.stage_times import StageTimes
     from coec.schemas.evaluation import DetectionReport
 
-
 REACH_DEG = 8.0
 """How far around the given pose the pose is searched: as far as a knock moves a mount. Beyond that, use
 `coec calibrate`."""
-
 
 MAX_SIGMA_DEG = 1.0
 """Above this standard deviation of a rotation, a result is not reported. The limit is looser than for serving, because

@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     from coec.config import Config, OpenPairConfig
     from coec.schemas.doctor import Finding
 
-
 USUAL_FILE = Path("/etc/coec/coec.yaml")
 """Configuration that the systemd unit names."""
-
 
 STYLES = {"ok": "green", "warn": "bold yellow", "fail": "bold red"}
 
@@ -39,7 +37,7 @@ def doctor(
     seconds: Annotated[float, typer.Option(help="How long to listen to the streams.", min=0.5, max=600)] = 5.0,
     as_json: Json = False,
 ) -> int:
-    """Find what keeps this computer from a calibration: exit 1 if something must be done first.
+    """Find what prevents a calibration on this computer: exit 1 if something must be corrected first.
 
     Checks the configuration, disk, clock, certificates, router and its rules, streams, and the running service if
     there is one; changes and disturbs nothing.
@@ -93,7 +91,7 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
         yield connection.mode_finding(config)
         session = connection.session_as_of_service(config)
         if session is None:
-            yield warn("rules", config.vehicle, "the router takes one session, not two", "raise its `max_sessions`")
+            yield warn("rules", config.vehicle, "the router accepts one session, not two", "raise its `max_sessions`")
             return
         sessions.callback(closed, session, connection.CLOSE_S)
         yield connection.rules_finding(config, session, client)

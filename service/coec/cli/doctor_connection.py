@@ -43,17 +43,13 @@ from coec.schemas.replies import HealthReply, StatusReply
 CONNECT_S = 3.0
 """Timeout of each step; a router on the same network answers in milliseconds."""
 
-
 CLOSE_S = 3.0
-
 
 QUERY_PERIOD_S = 0.05
 """Time between two queries for a token that the router may not have forwarded yet; nothing announces a refusal."""
 
-
 SEEN_S = 3.0
 """Timeout for our own liveliness token to come back from the router."""
-
 
 EXPIRES_SOON_DAYS = 30.0
 
@@ -61,16 +57,12 @@ OVER_TCP = frozenset({"tcp", "tls", "ws"})
 
 DAY_S = 86_400.0
 
-
 TIMEOUT_S = 3.0
-
 
 OF_THE_COMMAND_LINE = frozenset({"zenoh.embedded_router", "state.directory"})
 """Configuration values that options of `coec run` override."""
 
-
 PLACES_NAMED = 5
-
 
 LEVELS: dict[int, Level] = {0: "ok", 1: "warn", 2: "fail", 3: "warn"}
 """Level of a finding by ROS level; STALE, when nothing was checked yet, is no failure."""
@@ -94,7 +86,7 @@ def certificate_findings(config: Config) -> Iterator[Finding]:
             try:
                 yield _dated("certificate", where, read_certificate(material, role))
             except CertificateError as error:
-                advice = "have it made anew by the authority that the router trusts; `deploy/` shows how"
+                advice = "have the authority that the router trusts issue a new one; see `deploy/`"
                 yield fail("certificate", where, str(error), advice)
 
 
@@ -106,7 +98,7 @@ def router_findings(config: Config) -> Iterator[Finding]:
         if endpoint.protocol in WITH_PORT and endpoint.protocol in OVER_TCP:
             yield from _reached(settings, endpoint, redacted(text))
         else:
-            yield ok("router", redacted(text), "only Zenoh itself can tell whether somebody is there")
+            yield ok("router", redacted(text), "only Zenoh can check whether this endpoint answers")
 
 
 def session_of_client(config: Config) -> zenoh.Session | None:
@@ -148,9 +140,9 @@ def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
         return fail(
             "session",
             where,
-            "no Zenoh session comes about",
-            "start the router; where somebody answers all the same, it is another program (a wrong port?), or the "
-            "router takes no more sessions (`max_sessions`)",
+            "no Zenoh session can be opened",
+            "start the router; if something answers, it is another program (a wrong port?), or the "
+            "router accepts no more sessions (`max_sessions`)",
         )
     routers = [str(one) for one in session.info.routers_zid()]
     return ok("session", where, f"a session with router {', '.join(routers) or 'none, but a peer'}")
@@ -176,16 +168,15 @@ def cause_of_silence(config: Config) -> tuple[str, str]:
     """Why the service does not receive what a client of the same router receives, and what to do about it."""
     settings = settings_of(config.zenoh, config.limits)
     if mode_of(settings) != "peer":
-        return "the router hands it on to others", "see to the router's rules for this certificate (docs/security.md)"
+        advice = "check the router's rules for this certificate (docs/security.md)"
+        return "the router forwards it to others", advice
     client = "leave `mode`, `listen` and `scouting` out of zenoh.file, so that the service is a client"
     if finds_peers(settings):
-        cause = (
-            "the service is a peer, to which a router hands nothing from other peers, and it has no connection to them"
-        )
+        cause = "the service is a peer, to which a router forwards nothing from other peers, and it has no connection to them"
         advice = f"{client}; or enable gossip at the router, and have peers listen where others can reach them"
         return cause, advice
     cause = (
-        "the service is a peer without gossip: a router hands nothing on between two peers, so that it exchanges "
+        "the service is a peer without gossip: a router forwards nothing between two peers, so that it exchanges "
         "nothing with nodes of rmw_zenoh, which are peers"
     )
     return cause, f'{client}; or enable gossip there, and listen at "tcp/localhost:0"'
@@ -201,14 +192,14 @@ def rules_finding(config: Config, session: zenoh.Session, other: zenoh.Session) 
     try:
         while time.monotonic() < deadline_s:
             if any(reply.ok is not None for reply in other.liveliness().get(token_key, timeout=1.0)):
-                return ok("rules", keys.root, "the router hands on what is said there")
+                return ok("rules", keys.root, "the router forwards what is published there")
             time.sleep(QUERY_PERIOD_S)
     finally:
         token.undeclare()
     return fail(
         "rules",
         keys.root,
-        "the router takes the session, but hands nothing on: its access control refuses",
+        "the router accepts the session, but forwards nothing: its access control refuses",
         "compare prefix and vehicle with its rules, and the certificate's name with its subjects: the service needs "
         "`liveliness_token`, `liveliness_query` and `declare_queryable` below its keys, `declare_subscriber` on frames",
     )
@@ -227,20 +218,20 @@ def _reached(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Iterator
         with closing(socket.create_connection((host, port), CONNECT_S)):
             pass
     except socket.gaierror as error:
-        yield fail("router", where, f"nobody knows the host {host}: {error.strerror}", "see to its name, or to DNS")
+        yield fail("router", where, f"unknown host {host}: {error.strerror}", "check its name, and DNS")
         return
     except TimeoutError:
-        text = f"no answer within {CONNECT_S:g} s: the computer is off, or a firewall is silent"
-        yield fail("router", where, text, "see to the network between here and there")
+        text = f"no answer within {CONNECT_S:g} s: the computer is off, or a firewall drops the connection"
+        yield fail("router", where, text, "check the network in between")
         return
     except ConnectionRefusedError:
         advice = "start the router (or `coec run --embedded-router`), or correct the port in zenoh.connect"
-        yield fail("router", where, "nobody listens at this port; the computer is there", advice)
+        yield fail("router", where, "connection refused: nothing listens at this port", advice)
         return
     except OSError as error:
-        yield fail("router", where, f"cannot be reached: {error.strerror or error}", "see to the network")
+        yield fail("router", where, f"cannot be reached: {error.strerror or error}", "check the network")
         return
-    yield ok("router", where, "somebody listens")
+    yield ok("router", where, "accepts connections")
     if endpoint.protocol in CERTIFIED:
         yield _handshake(settings, endpoint, where)
 
@@ -255,24 +246,22 @@ def _handshake(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Findin
         )
         return fail("tls", where, str(error), advice)
     except OSError as error:
-        return fail(
-            "tls", where, f"the link broke: {error.strerror or error}", "see to the files of transport/link/tls"
-        )
+        return fail("tls", where, f"the link broke: {error.strerror or error}", "check the files of transport/link/tls")
     return _dated("tls", where, seen)
 
 
 def _dated(check: str, where: str, seen: Certificate) -> Finding:
     """Whether a certificate is valid today, and for how long."""
     now_s = time.time()
-    text = f"{seen.name!r}, good until {_day(seen.not_after_s)}"
+    text = f"{seen.name!r}, valid until {_day(seen.not_after_s)}"
     if seen.names:
         text += f", for {', '.join(seen.names)}"
     renew = "have the authority make a new one"
     if seen.not_after_s < now_s:
         return fail(check, where, f"{seen.name!r} has expired on {_day(seen.not_after_s)}", renew)
     if seen.not_before_s > now_s:
-        advice = "see to the clock of this computer"
-        return fail(check, where, f"{seen.name!r} is not good before {_day(seen.not_before_s)}", advice)
+        advice = "check the clock of this computer"
+        return fail(check, where, f"{seen.name!r} is not valid before {_day(seen.not_before_s)}", advice)
     if seen.not_after_s < now_s + EXPIRES_SOON_DAYS * DAY_S:
         return warn(check, where, text, f"{renew}, soon")
     return ok(check, where, text)
@@ -288,10 +277,10 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
     try:
         status = from_json(StatusReply, ask_one(session, f"{keys.status}?format=json", TIMEOUT_S).payload)
     except NotFoundError:
-        yield ok("service", keys.root, "no service of the vehicle answers here; what it would say is not known")
+        yield ok("service", keys.root, "no service of the vehicle answers here; its status is not known")
         return
     except CoecError as error:
-        yield fail("service", keys.root, f"answers wrongly: {error}", "see to its log")
+        yield fail("service", keys.root, f"invalid reply: {error}", "check its log")
         return
     yield from _status(status, keys)
     yield _compared(session, config, keys)
@@ -299,7 +288,7 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
         replies = ask(session, f"{keys.health('*')}?format=json", TIMEOUT_S)
         healths = [from_json(HealthReply, reply.payload) for reply in replies]
     except CoecError as error:
-        yield fail("health", keys.health("*"), f"answers wrongly: {error}", "see to its log")
+        yield fail("health", keys.health("*"), f"invalid reply: {error}", "check its log")
         return
     for health in healths:
         yield from _health(health, keys)
@@ -311,12 +300,12 @@ def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:
         served = json_value(ask_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
         places = [place for place in differing(served, shown(config)) if place not in OF_THE_COMMAND_LINE]
     except (CoecError, ValueError, KeyError, TypeError) as error:
-        text = f"the service does not tell with which configuration it runs: {error}"
-        return warn("file", keys.config, text, "see to its version, and to the rules of the router")
+        text = f"the service does not report its configuration: {error}"
+        return warn("file", keys.config, text, "check its version and the rules of the router")
     if not places:
         return ok("file", keys.config, "the service runs with this file")
     more = f" and {len(places) - PLACES_NAMED} more" if len(places) > PLACES_NAMED else ""
-    text = f"this file is another than the service runs with, in {', '.join(places[:PLACES_NAMED])}{more}"
+    text = f"this file differs from the configuration of the service in {', '.join(places[:PLACES_NAMED])}{more}"
     return warn(
         "file", keys.config, text, "reload or restart the service, or name the file that it runs with (--config)"
     )
@@ -325,9 +314,9 @@ def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:
 def _status(status: StatusReply, keys: Keys) -> Iterator[Finding]:
     runs = f"version {status.version}, {status.state} for {status.uptime_s:.0f} s"
     if status.state in ("failing", "stopping"):
-        yield fail("service", keys.root, runs, "see to its log, and whether the service manager starts it again")
+        yield fail("service", keys.root, runs, "check its log, and whether the service manager starts it again")
     elif status.version != __version__:
-        advice = "restart the service with the version that is installed, or ask with its own"
+        advice = "restart the service with the version that is installed, or query it with its own version"
         yield warn("service", keys.root, f"{runs}; this is version {__version__}", advice)
     else:
         yield ok("service", keys.root, runs)
@@ -337,10 +326,10 @@ def _status(status: StatusReply, keys: Keys) -> Iterator[Finding]:
         yield fail("reload", keys.root, f"the file on the disk was refused: {loaded.refused}", advice)
     elif loaded is not None and loaded.waiting:
         waits = ", ".join(loaded.waiting)
-        yield warn("reload", keys.root, f"waits for a restart: {waits}", "restart the service when it suits")
+        yield warn("reload", keys.root, f"waits for a restart: {waits}", "restart the service at a suitable time")
     for reason in status.reasons:
         problem = TROUBLES.get(reason.code)
-        advice = f"reason {reason.code}: see to its log" if problem is None else problem.advice
+        advice = f"reason {reason.code}: check its log" if problem is None else problem.advice
         yield warn("service", keys.root, reason.text, advice)
 
 

@@ -39,47 +39,35 @@ from coec.schemas.ros_names import TF_STATIC
 SAMPLES_WAITING = 8
 """Most samples of a stream that wait to be decoded; further ones are only counted."""
 
-
 MOTIONS_WAITING = 512
-
 
 SAMPLES_COUNTED = 200_000
 """Most samples of a stream whose arrival and size are noted: a minute at 3 kHz. A flood beyond that is not counted."""
 
-
 POLL_S = 0.01
 
-
 NS_PER_S = 1_000_000_000
-
 
 OFF_S = 1.0
 """Most time between the stamp of a frame and its arrival: a sweep takes 0.1 s, and its way here as much again."""
 
-
 PACE = 0.1
 """Share by which sensor time may run faster or slower than this computer's clock, as in a replay."""
-
 
 PARTNERS = 0.9
 """Least share of the camera frames that should have a sweep near in time."""
 
-
 PERIOD = 0.1
 """Share by which the rate of sweeps may differ from `sweep.period_s`."""
-
 
 LARGE = 0.8
 """Share of the largest accepted message from which on there is a warning."""
 
-
 STREAM_TYPES = frozenset((*get_args(CameraMessage), *get_args(LidarMessage), *get_args(EgoMessage)))
 """Message types that a stream may have."""
 
-
 NAMED = 40
 """Most topics that are named; a vehicle with more sensors is better examined with ROS's own tools."""
-
 
 _SILENT = logging.Logger("doctor")
 _SILENT.addHandler(logging.NullHandler())
@@ -298,15 +286,15 @@ def _stream(
     yield _rate(pair, name, samples, seconds)
     largest, limit = max(samples.sizes), config.limits.max_message_bytes
     if largest > LARGE * limit:
-        text = f"{name}: {largest / 1e6:.1f} MB in the largest sample, of {limit / 1e6:.1f} that are taken"
+        text = f"{name}: {largest / 1e6:.1f} MB in the largest sample, of {limit / 1e6:.1f} that are accepted"
         yield warn("size", samples.place, text, "raise limits.max_message_bytes, here and at the router, or send less")
     if samples.refused:
         causes = ", ".join(f"{count} {reason}" for reason, count in samples.refused.most_common())
-        advice = "see that encoding, type, frame id and image size are those of the configuration, and its limits"
+        advice = "check that encoding, type, frame id and image size are those of the configuration, and its limits"
         if samples.latest is None:
-            yield fail("decoding", samples.place, f"{name}: no sample makes a frame: {causes}", advice)
+            yield fail("decoding", samples.place, f"{name}: no sample can be decoded: {causes}", advice)
         else:
-            yield warn("decoding", samples.place, f"{name}: some samples make no frame: {causes}", advice)
+            yield warn("decoding", samples.place, f"{name}: some samples cannot be decoded: {causes}", advice)
     if samples.stamps:
         yield _clock(name, samples)
 
@@ -327,7 +315,7 @@ def undiscovered_findings(
 
 def _silent(name: str, samples: StreamSamples, config: Config, seconds: float, absent: str | None) -> Finding:
     """The finding on a stream without samples; `absent` says that nobody publishes its topic."""
-    text = f"{name}: nothing came in {seconds:g} s"
+    text = f"{name}: no sample in {seconds:g} s"
     if samples.elsewhere:
         cause, advice = cause_of_silence(config)
         got = f"a client of the same router got {samples.elsewhere} samples"
@@ -335,7 +323,7 @@ def _silent(name: str, samples: StreamSamples, config: Config, seconds: float, a
     if absent is not None:
         return fail("stream", samples.place, f"{text}: {absent}", "start its node, or name the topic that is meant")
     advice = (
-        "see that its publisher runs, on this router, with this key or topic; and that the router's rules let this "
+        "check that its publisher runs, on this router, with this key or topic; and that the router's rules allow this "
         "certificate subscribe to it"
     )
     return fail("stream", samples.place, text, advice)
@@ -353,7 +341,7 @@ def _rate(pair: PairConfig, name: str, samples: StreamSamples, seconds: float) -
         why = f"pairs need one within {pair.pairing.motion_tolerance_s:g} s"
     else:
         full_hz, least_hz = monitor.pairs / monitor.period_s, monitor.min_pairs / monitor.period_s
-        why = f"a check wants {monitor.pairs} pairs in {monitor.period_s:g} s, and needs {monitor.min_pairs}"
+        why = f"a check uses {monitor.pairs} pairs in {monitor.period_s:g} s, and needs {monitor.min_pairs}"
     advice = "a faster stream, or a longer monitor.period_s"
     if rate_hz < least_hz:
         return fail("stream", samples.place, f"{text}: {why}", advice)
@@ -371,7 +359,7 @@ def _clock(name: str, samples: StreamSamples) -> Finding:
     sensor_s = (samples.stamps[-1][0] - samples.stamps[0][0]) / NS_PER_S
     here_s = (samples.stamps[-1][1] - samples.stamps[0][1]) / NS_PER_S
     if back:
-        advice = "see to the clock of the sensor: it is set back, or two of them send under one key"
+        advice = "check the clock of the sensor: it steps back, or two sensors publish on one key"
         return warn("stamps", samples.place, f"{name}: {back} stamps step back", advice)
     if abs(late_s) > OFF_S:
         side = "behind" if late_s > 0 else "ahead of"
@@ -380,7 +368,7 @@ def _clock(name: str, samples: StreamSamples) -> Finding:
         return warn("stamps", samples.place, text, advice)
     if here_s > 1.0 and abs(sensor_s / here_s - 1.0) > PACE:
         text = f"{name}: its time runs {sensor_s / here_s:.2f} times as fast as this computer's"
-        return warn("stamps", samples.place, text, "nothing, if this is a replay; else see to the sensor's clock")
+        return warn("stamps", samples.place, text, "nothing, if this is a replay; else check the sensor's clock")
     return ok("stamps", samples.place, f"{name}: {1e3 * late_s:.0f} ms from stamp to arrival")
 
 
@@ -430,7 +418,7 @@ def _point_times(pair: PairConfig, cloud: LidarFrame, rate_hz: float | None) -> 
     key, times_s = pair.lidar.place, cloud.time_offset_s
     count = len(cloud.xyz_m)
     if count == 0:
-        return fail("point_times", key, "the last sweep has no point", "see to the LiDAR")
+        return fail("point_times", key, "the last sweep has no point", "check the LiDAR")
     if times_s is None:
         return _by_azimuth(pair, rate_hz)
     first_s, last_s = float(np.min(times_s)), float(np.max(times_s))
@@ -442,7 +430,7 @@ def _point_times(pair: PairConfig, cloud: LidarFrame, rate_hz: float | None) -> 
         return fail("point_times", key, f"{text}: further than two sweeps", advice)
     if last_s == first_s:
         advice = "have the driver fill in the field, or leave it out and set lidar.sweep"
-        return warn("point_times", key, f"{text}: all the same, nothing is compensated by them", advice)
+        return warn("point_times", key, f"{text}: all equal, so sweeps cannot be compensated", advice)
     return ok("point_times", key, text)
 
 
@@ -455,7 +443,7 @@ def _by_azimuth(pair: PairConfig, rate_hz: float | None) -> Finding:
         return warn("point_times", key, "points have no time: sweeps cannot be compensated", advice)
     if rate_hz is not None and abs(rate_hz * sweep.period_s - 1.0) > PERIOD:
         text = f"lidar.sweep.period_s is {sweep.period_s:g} s, but sweeps come every {1.0 / rate_hz:.3f} s"
-        return warn("point_times", key, text, "correct lidar.sweep, or see why sweeps are lost")
+        return warn("point_times", key, text, "correct lidar.sweep, or find out why sweeps are lost")
     return ok("point_times", key, "of the azimuth, by lidar.sweep")
 
 
@@ -465,7 +453,7 @@ def _image(pair: PairConfig, frame: CameraFrame, config: Config) -> Iterator[Fin
     try:
         quality = Inspector(config.limits).inspect(frame)
     except DecodeError as error:
-        yield fail("image", key, f"the picture cannot be decoded: {error}", "see to the camera's encoder")
+        yield fail("image", key, f"the image cannot be decoded: {error}", "check the camera's encoder")
         return
     levels = f"level {quality.mean_level:.0f} of 255, {100 * quality.clipped:.0f} % clipped"
     levels += f", sharpness {quality.sharpness:.3f}"
@@ -479,13 +467,13 @@ def _image(pair: PairConfig, frame: CameraFrame, config: Config) -> Iterator[Fin
         if wrong
     ]
     if defects:
-        advice = "clean the lens, see to exposure and focus; windows are not cut from such pictures (pair window.*)"
+        advice = "clean the lens, check exposure and focus; windows are not cut from such pictures (pair window.*)"
         yield warn("image", key, f"{levels}: {', '.join(defects)}", advice)
     else:
         yield ok("image", key, levels)
     if pair.calibration.depth.model == STEREO and frame.depth is None:
         advice = "send depth maps with the frames, or name a network in calibration.depth.model"
-        yield fail("depth", key, "frames carry no depth map, and the configuration counts on them", advice)
+        yield fail("depth", key, "frames carry no depth map, and the configuration requires them", advice)
 
 
 def topic_findings(here: Topics, topics: Topics, config: Config) -> Iterator[Finding]:
@@ -500,10 +488,10 @@ def topic_findings(here: Topics, topics: Topics, config: Config) -> Iterator[Fin
     where = f"domain {config.ros.domain}" if is_rmw else f"bridge {config.ros.namespace}".strip()
     if not topics.publishers:
         advice = (
-            "see that nodes and bridge use this router, that ros.domain or ros.namespace is theirs, and that the "
+            "check that nodes and bridge use this router, that ros.domain or ros.namespace is theirs, and that the "
             "router's rules let this certificate see @ros2_lv/** (docs/security.md)"
         )
-        yield warn("topics", where, "nobody on this router says that it publishes a topic of ROS", advice)
+        yield warn("topics", where, "no node on this router announces a topic of ROS", advice)
     else:
         types = topics.types()
         lines = [
@@ -521,7 +509,7 @@ def topic_findings(here: Topics, topics: Topics, config: Config) -> Iterator[Fin
             yield fail("topics", where, f"the service does not see {listed(unseen)}: {cause}", advice)
     if topics.left_out:
         counted = ", ".join(f"{count} {cause}" for cause, count in sorted(topics.left_out.items()))
-        advice = "see who declares them: no node of ROS does"
+        advice = "check which program declares them: no node of ROS does"
         yield warn("topics", where, f"liveliness tokens that were not read: {counted}", advice)
 
 

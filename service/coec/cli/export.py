@@ -163,7 +163,7 @@ def _of_state(folder: Path, name: str | None, config: Config | None, frames: Fra
         own = (pair.lidar.frame_id, pair.camera.frame_id)
         return exported(state, config.vehicle, served, own, pair.camera.intrinsics, frames)
     if stored.accepted is None:
-        raise UsageError(f"{folder}: nothing was accepted yet; --config says which frames the nominal calibration has")
+        raise UsageError(f"{folder}: nothing was accepted yet; --config gives the frames of the nominal calibration")
     own = (stored.accepted.lidar_frame, stored.accepted.camera_frame)
     camera = intrinsics_config_of(stored.accepted.intrinsics)
     return exported(state, stored.accepted.vehicle, served, own, camera, frames)

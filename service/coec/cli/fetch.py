@@ -30,39 +30,34 @@ if TYPE_CHECKING:
     from coec.schemas.keys import Keys
     from coec.schemas.replies import ChainedEntry, EvidenceEvent, HistoryReply, WindowsReply
 
-
 LATEST: Final = "latest"
 VEHICLE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-
 
 AROUND_NS: Final = 600 * 1_000_000_000
 """History that is fetched before the first and after the last figure of the event: 10 minutes."""
 
-
 SNIPPET_NS: Final = 60 * 1_000_000_000
 """Most sensor time between an event and its snippet: a suspicion comes up to a minute before the event."""
-
 
 MAX_SNIPPETS: Final = 16
 """Most snippets of one event. A suspicion, the event, and its end within a minute make three."""
 
+MAX_RECORDED_BYTES: Final = 2**32
+"""Most bytes of the recordings of one event together, two windows and its snippets, as the vehicle claims them: as much
+as is fetched of one window. Two windows and three snippets have some 500 MB."""
 
 MAX_PICTURE_BYTES: Final = 16 * 2**20
 
 ENTRIES: Final = 300
 """Most entries of the history, some 6 kB each."""
 
-
 WAIT_S: Final = 0.5
 """Time before a vehicle with a busy uplink is asked again."""
 
-
 WAITS: Final = frozenset({"uplink_busy", "busy", "not_drawn"})
-
 
 PAGE = "index.html"
 REPORT = "incident.json"
-
 
 M = TypeVar("M", bound="Message")
 
@@ -94,9 +89,9 @@ def fetch(
     ] = 120.0,
     as_json: Json = False,
 ) -> int:
-    """Fetch a red event as one folder with pictures, recordings, history, and a page that tells its story.
+    """Fetch a red event into one folder: pictures, recordings, history, and a report page.
 
-    What has arrived is kept: the same command resumes where the link broke.
+    The same command resumes an interrupted download.
     """
     from coec.adapters.zenoh.client import connected_by
     from coec.reports import console, incident_page
@@ -156,10 +151,10 @@ def _nobody(session: zenoh.Session, keys: Keys, timeout_s: float, selector: str)
         except DecodeError:
             continue
         ago = duration(max((time.time_ns() - word.said_ns) * 1e-9, 0.0))
-        left = "took its leave" if word.service == "stopping" else "was heard last"
+        left = "logged off" if word.service == "stopping" else "was last received"
         return NotFoundError(
-            f"{word.vehicle} does not answer; it {left} {ago} ago ({word.pair}: {word.state}). What it keeps is on "
-            "board: fetch it when it is back"
+            f"{word.vehicle} does not answer; it {left} {ago} ago ({word.pair}: {word.state}). Its data are on "
+            "board: fetch them when it is back"
         )
     return nobody(selector)
 
@@ -181,7 +176,7 @@ def _list(events: Sequence[EvidenceEvent], vehicle: str, *, as_json: bool) -> in
         ours = tuple(event for event in events if event.pair == pair)
         replies.evidence(to_json(EvidenceReply(vehicle=vehicle, pair=pair, events=ours)))
     if not events:
-        console.show(f"{vehicle} keeps no red event")
+        console.show(f"{vehicle} has no red event")
     return 0
 
 
@@ -190,7 +185,7 @@ def _select(events: Sequence[EvidenceEvent], event_id: str, vehicle: str) -> Evi
         return events[-1]
     match = next((event for event in events if event.event_id == event_id), None)
     if match is None:
-        raise NotFoundError(f"{vehicle} keeps no such red event: `coec fetch {vehicle}` lists them")
+        raise NotFoundError(f"{vehicle} has no such red event: `coec fetch {vehicle}` lists them")
     return match
 
 
@@ -330,17 +325,16 @@ class Download:
             self.absent.append(Absent(what=f"{len(near) - MAX_SNIPPETS} snippets", why=f"{why}; {how}"))
 
     def _recording(self, recording_id: str) -> Recording | None:
-        from coec.adapters.zenoh.window_fetch import MAX_WINDOW_BYTES, fetch_window
+        from coec.adapters.zenoh.window_fetch import fetch_window
         from coec.reports import console
         from coec.schemas.incident import Absent, FetchedFile
 
         if (named := OF_PAIR.fullmatch(recording_id)) is None or named["pair"] != self.pair:
-            self.absent.append(Absent(what="a recording", why="what the vehicle calls it is no name of one"))
+            self.absent.append(Absent(what="a recording", why="the vehicle reports an invalid name for it"))
             return None
         name = _recorded(recording_id)
         recordings: list[Recording] = []
-        # As much of all recordings together as of one window: two windows and three snippets have some 500 MB.
-        left = MAX_WINDOW_BYTES - self.recorded_bytes
+        left = MAX_RECORDED_BYTES - self.recorded_bytes
         if left <= 0:
             how = f"`coec query windows/{recording_id} --output FILE` fetches it"
             why = f"the other recordings of the event have {self.recorded_bytes} bytes, as much as is fetched; {how}"

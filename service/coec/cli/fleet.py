@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     from coec.schemas.fleet import FleetReport
     from coec.schemas.fleet_now import FleetNow
 
-
 app = typer.Typer(no_args_is_help=True, help="Combine results of many vehicles.")
-
 
 SHOWN = 15
 """Most pairs in the table on the screen; the page has all."""
@@ -145,7 +143,7 @@ def commission(
     vehicles = [load_baselines(path) for path in _each_once(baselines)]
     for path, pairs in zip(baselines, vehicles, strict=True):
         if not pairs:
-            raise UsageError(f"{path} holds no baseline: coec commission, or the command of that name, makes them")
+            raise UsageError(f"{path} holds no baseline: `coec commission`, or the command `commission`, makes them")
     shared = sorted(set.intersection(*(set(pairs) for pairs in vehicles)))
     if not shared:
         raise UsageError("there is no pair that all of the vehicles have")

@@ -54,7 +54,7 @@ def add(
     force: Force = False,
     as_json: Json = False,
 ) -> int:
-    """Copy the file of a known depth network to where this user's services look for it, after checking it."""
+    """Copy the file of a known depth network to where this user's services load it, after checking it."""
     from coec.adapters.depth import network_files
     from coec.reports import console
 
@@ -64,7 +64,7 @@ def add(
     elif copied:
         console.show(f"{card.name}: checked, copied to {place}; `--depth {card.name}` uses it. Licence: {card.licence}")
     else:
-        console.show(f"{card.name}: the same file is there already, {place}")
+        console.show(f"{card.name}: the same file exists already, {place}")
     return 0
 
 
@@ -101,7 +101,7 @@ def _list(*, as_json: bool) -> int:
         if path is not None:
             console.show(f"{name}: {path}")
     console.show(
-        f"an absent network is looked for as NAME.onnx in {folder}; `coec models add FILE` checks it and puts it there"
+        f"an absent network is expected as NAME.onnx in {folder}; `coec models add FILE` checks it and copies it there"
     )
     console.show("any other ONNX file is used by its path (docs/own-network.md)")
     return 0

@@ -24,22 +24,17 @@ if TYPE_CHECKING:
     from coec.sources import Recording
     from coec.sources.spec import SourceSpec
 
-
 RosMiddleware = Literal["rmw_zenoh", "ros2dds"]
 Middleware = Literal["native", "rmw_zenoh", "ros2dds"]
 """How a recording speaks on the bus."""
 
-
 Encoding = Literal["msgpack", "cdr"]
 """Of frames."""
 
-
 CONNECT_S = 10.0
-
 
 LISTENER_S = 5.0
 """How long to wait for a router, and for a listener."""
-
 
 DEFAULT_PERIOD_NS = 100_000_000
 """Time between two passes of a recording with a single frame: 10 Hz."""

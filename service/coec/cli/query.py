@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from coec.adapters.zenoh.client import Reply, Way
     from coec.schemas.keys import Keys
 
-
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
 
 PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
@@ -36,10 +35,8 @@ JPEG = "image/jpeg"
 PATIENCE_S = 60.0
 """How long to wait for a window of which no piece arrives; what has arrived is kept for the next attempt."""
 
-
 OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d{1,19}(\.snippet)?", re.ASCII)
 """Names of windows, snippets and red events: their pair, and a time in nanoseconds."""
-
 
 PICTURE_KEYS = ("overlay", "evidence")
 """Keys whose answer may be a picture, for `--output`."""
@@ -64,7 +61,7 @@ KEYS = (
     Key("evidence", "stored red events"),
     Key("evidence/ID", "one of them; a picture of it with --output FILE.jpg", "overlay=before, overlay=after"),
     Key("rig", "all sensors of the vehicle together"),
-    Key("status", "the service itself: streams, worker, budget, troubles"),
+    Key("status", "the service itself: streams, worker, budget, problems"),
     Key("config", "its effective configuration, without secrets"),
     Key("metrics", "OpenMetrics text"),
     Key("command/NAME", "calibrate, apply, rollback, reset, commission, hold", "timeout_ms=COUNT"),
@@ -108,7 +105,7 @@ KeyArgument = Annotated[
     ),
 ]
 Pair = Annotated[
-    str | None, typer.Option(help="Pair to ask; default: all. A command needs it if there are several pairs.")
+    str | None, typer.Option(help="Pair to query; default: all. A command needs it if there are several pairs.")
 ]
 SessionCredentials = Annotated[
     Path | None,
@@ -286,7 +283,7 @@ def _resolve(session: zenoh.Session, request: Request, keys: Keys) -> tuple[str,
         return single_key(keys.command(of, argument)), "command"
     if head == "evidence" and argument:
         return keys.evidence_of(_pair_of(session, request, keys, argument), argument), "event"
-    raise UsageError("say where to with --output FILE.jpg")
+    raise UsageError("give the file with --output FILE.jpg")
 
 
 def _only_pair(session: zenoh.Session, request: Request, keys: Keys) -> str:
@@ -339,7 +336,7 @@ def _payload(request: Request, arguments: Mapping[str, str | bool | None], paylo
         return None
     if payload is not None:
         if given:
-            raise UsageError(f"--payload says it all: leave --{', --'.join(given)} out, or --payload")
+            raise UsageError(f"--payload is the whole payload: leave --{', --'.join(given)} out, or --payload")
         try:
             return json.dumps(json.loads(payload), separators=(",", ":")).encode()
         except ValueError as error:
@@ -463,7 +460,7 @@ def _download(
     from coec.reports import console
 
     if output is None:
-        raise UsageError("say where to with --output FILE")
+        raise UsageError("give the file with --output FILE")
     with connected_by(way, request.timeout_s) as session, console.progress(counted=False) as bars:
         pair = _pair_of(session, request, keys, window_id)
         single_key(keys.window(pair, window_id))

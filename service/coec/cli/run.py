@@ -14,7 +14,6 @@ from coec.cli.signals import success_on_sigterm
 if TYPE_CHECKING:
     from coec.config import Config
 
-
 MATRIX_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Set to 1, because the service multiplies (N, 3) by (3, 3), where more threads only spin for longer than the work
 takes. Read when NumPy is imported; the worker process gets its own."""

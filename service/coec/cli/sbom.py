@@ -18,9 +18,7 @@ from coec.errors import UsageError
 if TYPE_CHECKING:
     from coec.reports.bill_of_materials import Inventory, Network
 
-
 APPLICATION = "coec"
-
 
 DOCUMENT, TABLE = "coec.cdx.json", "licences.md"
 

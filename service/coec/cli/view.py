@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from coec.adapters.foxglove.server import Screen
     from coec.calibration.types import Rig
 
-
 LAYOUT = "deploy/foxglove-layout.json"
 ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]+):(\d{1,5})")
 
@@ -53,7 +52,7 @@ def view(
     zenoh: SessionFile = None,
     timeout_s: RouterTimeout = 5.0,
     result: Annotated[
-        Path | None, typer.Option(help="Output of `calibrate --json`, drawn as the candidate.", metavar="FILE")
+        Path | None, typer.Option(help="Output of `calibrate --json`, shown as the candidate.", metavar="FILE")
     ] = None,
     rate: Annotated[float, typer.Option(help="Factor on the recorded speed.", min=0.01, max=100)] = 1.0,
     repeat: Annotated[bool, typer.Option("--repeat", help="Repeat for ever; sensor time goes on.")] = False,
@@ -63,7 +62,8 @@ def view(
     insecure: Annotated[
         bool,
         typer.Option(
-            "--insecure", help="Also listen where other computers get in; they need no certificate and see everything."
+            "--insecure",
+            help="Also listen on addresses that other computers reach; they need no certificate and see everything.",
         ),
     ] = False,
     as_json: Annotated[

@@ -34,26 +34,20 @@ from coec.sources.windows import RECORDED_GAP_S
 
 NS_PER_S = 1_000_000_000
 
-
 AGAIN_S = 1.0
 """Time between two lines of the timeline, and between two redraws of the pair for viewers who connected since."""
-
 
 POLL_S = 0.05
 """Time between two checks whether there is a viewer."""
 
-
 DEFAULT_PERIOD_NS = 100_000_000
 """Time between two passes of a recording with a single frame: 10 Hz."""
-
 
 MAX_BYTES = 2**20
 """Most bytes of a result, which has some 5 kB."""
 
-
 STALE: Final = 3
 """ROS level of an unknown state."""
-
 
 EXPLANATIONS = {
     NOT_SERVED: "Nobody serves the pair: its service is down, or its router is.",

@@ -36,53 +36,40 @@ from coec.schemas.replies import AxisReply, ExtrinsicReply, HealthReply, Transfo
 REPEAT_S = 1.0
 """Time between two lines of the timeline while nothing changes."""
 
-
 WAIT_S = 0.05
 """How long to wait for frames before everything else is updated."""
-
 
 MUTE = (
     "Nothing comes on {}: see that somebody publishes it, and that the router's rules let this session subscribe to it."
 )
 
-
 SERVICE = "service"
 """Name under which refused documents of the service are counted."""
-
 
 SILENT_S = 10.0
 """A service without an answer for so long, five queries, counts as silent."""
 
-
 QUERY_S = 2.0
 """Time between two queries, and the timeout of an answer."""
-
 
 MAX_BYTES = 2**20
 """Most bytes of a document of the service; they have some 10 kB."""
 
-
 WAITING = 64
 """Documents that may wait to be read, of at most `MAX_BYTES` each; the oldest are dropped."""
 
-
 HEALTH, EXTRINSIC = "health", "extrinsic"
-
 
 DEPTHS = {CAMERA: 4, LIDAR: 4, EGO: 512}
 """Samples that may wait; the oldest are dropped. A pair needs its neighbours in time, and two seconds of ego-motion."""
 
-
 PATIENCE_S = 5.0
 """Time after which a stream without samples is reported."""
-
 
 BUSY_S = 0.2
 """Time after which the newest pair so far is shown, even if more samples wait."""
 
-
 T = TypeVar("T")
-
 
 _SILENT = logging.Logger("view")
 _SILENT.addHandler(logging.NullHandler())

@@ -15,7 +15,6 @@ from coec.errors import OutputError, UsageError
 if TYPE_CHECKING:
     from coec.config import OpenPairConfig, PairConfig
 
-
 SIZE = {"width": 160, "height": 120, "fx": 60.0, "fy": 60.0, "cx": 79.5, "cy": 59.5}
 """Kernels are compiled for types, not for sizes."""
 
@@ -44,8 +43,8 @@ def warmup(
 ) -> int:
     """Compile the kernels that the service and the calibration use, so that no first start has to.
 
-    They are kept in the cache of the user who runs the command, for processors like this one. What is there already is
-    not compiled again.
+    They are cached for the user who runs the command and for processors like this one. Cached kernels are not compiled
+    again.
     """
     from coec.geometry.compiler import kernel_cache
     from coec.reports import console
@@ -64,7 +63,7 @@ def warmup(
     else:
         done = "nothing had to be compiled" if not fresh else f"compiled in {took_s:.0f} s"
         console.show(f"{total} kernels for {', '.join(models)}: {done}")
-        console.show(f"kept in {folder}")
+        console.show(f"cached in {folder}")
     return 0
 
 

@@ -21,13 +21,10 @@ if TYPE_CHECKING:
 
     from coec.adapters.zenoh.changes import Change
 
-
 EVERY_VEHICLE = "*"
-
 
 WAITING = 1024
 """Changes that may wait to be written, some 10 MB; further ones are counted and left out."""
-
 
 POLL_S = 0.2
 """Time between two checks whether to stop."""
@@ -136,7 +133,7 @@ def _changes(session: zenoh.Session, address: ServiceAddress, timeout_s: float) 
         yield waiting
     if lost:
         dropped = count(lost.total(), "message was", "messages were")
-        console.say(f"coec: {dropped} not shown: no document of ours, or more than could be written")
+        console.say(f"coec: {dropped} not shown: invalid, or more than could be written")
 
 
 def _write(change: Change, vehicle: str, *, as_json: bool) -> None:
