@@ -32,7 +32,7 @@ def test_people_are_told_where_they_are(capsys: pytest.CaptureFixture[str]) -> N
     assert warmup.warmup(lenses=["pinhole"]) == 0
     out = capsys.readouterr().out
     assert f"{compiled(1).total} kernels for pinhole" in out
-    assert f"kept in {compiler.kernel_cache()[0]}" in out
+    assert f"cached in {compiler.kernel_cache()[0]}" in out
 
 
 @pytest.fixture

@@ -172,7 +172,9 @@ def cause_of_silence(config: Config) -> tuple[str, str]:
         return "the router forwards it to others", advice
     client = "leave `mode`, `listen` and `scouting` out of zenoh.file, so that the service is a client"
     if finds_peers(settings):
-        cause = "the service is a peer, to which a router forwards nothing from other peers, and it has no connection to them"
+        cause = (
+            "the service is a peer: a router forwards nothing to it from other peers, and it is not connected to them"
+        )
         advice = f"{client}; or enable gossip at the router, and have peers listen where others can reach them"
         return cause, advice
     cause = (
