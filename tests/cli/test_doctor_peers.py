@@ -134,7 +134,7 @@ def test_what_the_service_receives_is_in_order(
     [
         (rmw_zenoh_defaults.router, DEAF, "a peer without gossip", "`mode`, `listen` and `scouting` out of zenoh.file"),
         (shipped, DEAF, "a peer without gossip", "so that the service is a client"),
-        (silent_router, GOSSIPS, "it has no connection to them", "enable gossip at the router"),
+        (silent_router, GOSSIPS, "it is not connected to them", "enable gossip at the router"),
     ],
     ids=["rmw_zenoh's", "shipped", "no gossip at the router"],
 )

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from cli.conftest import Coec
-from coec import __version__
+from coec import __version__, api
 from coec.cli.main import BUILT_IN, LABORATORY, application
+from coec.errors import UsageError
 
 COMMANDS = ("calibrate", "run", "check-config", "play", "query", "replay", "convert", "models", "demo")
 HELP = "import sys; sys.argv = ['coec', '--help']; from coec.cli.main import main; sys.exit(main())"
@@ -190,3 +191,56 @@ def test_who_reads_no_further_leaves_141() -> None:
     )  # fmt: skip
     assert done.stdout.strip() == "141"
     assert "Traceback" not in done.stderr
+
+
+ADDED = """\
+import typer
+
+group = typer.Typer(no_args_is_help=True)
+
+
+def five(times: int = 1) -> int:
+    '''Returns five.'''
+    return 5 * times
+
+
+@group.command()
+def inner() -> int:
+    '''Returns six.'''
+    return 6
+
+
+@group.command()
+def other() -> int:
+    return 0
+"""
+
+
+@pytest.fixture
+def _added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another package with commands is installed."""
+    (tmp_path / "added_commands.py").write_text(ADDED)
+    info = tmp_path / "added-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: added\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[coec.commands]\nfive = added_commands:five\ngroup = added_commands:group\n"
+        "fleet.five = added_commands:five\n[coec.api]\nfive = added_commands:five\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+
+@pytest.mark.usefixtures("_added")
+def test_another_package_adds_commands_groups_and_subcommands(coec: Coec) -> None:
+    assert coec("five", "--times", 2).status == 10
+    assert coec("group", "inner").status == 6
+    assert coec("fleet", "five").status == 5
+    assert "Returns five" in coec("--help").out
+    assert coec("five", "--nonsense").status == 2
+
+
+@pytest.mark.usefixtures("_added")
+def test_another_package_adds_a_function_to_the_package() -> None:
+    assert api.added("five")() == 5
+    with pytest.raises(UsageError, match=r"coec\.six is not installed"):
+        api.added("six")()

@@ -16,6 +16,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -99,15 +100,15 @@ def application(arguments: Sequence[str]) -> typer.Typer:
     if is_built_in or first in others:
         built_in = built_in if is_built_in else {}
         others = {name: load for name, load in others.items() if first in (name, name.partition(".")[0])}
-    commands = {name: _load(target) for name, target in built_in.items()}
-    for name, command in commands.items():
-        _add(app, name, command, None)
-    for name, load in others.items():
+    commands: dict[str, Any] = {}
+    for name, target in built_in.items():
+        commands[name] = _add(app, name, _load(target), None)
+    for name in sorted(others, key=lambda name: "." in name):  # groups before what is added to them
         group, _, subcommand = name.rpartition(".")
-        if group:
-            _add(commands[group], subcommand, load(), None)
-        else:
-            _add(app, name, load(), "Laboratory")
+        if not group:
+            commands[name] = _add(app, name, others[name](), "Laboratory")
+        elif group in commands:
+            _add(commands[group], subcommand, others[name](), None)
     return app
 
 
@@ -133,11 +134,15 @@ def _added_commands() -> dict[str, Callable[[], Any]]:
     return laboratory | {point.name: point.load for point in entry_points(group=GROUP)}
 
 
-def _add(app: typer.Typer, name: str, command: Any, panel: str | None) -> None:
-    if isinstance(command, typer.Typer):
-        app.add_typer(command, name=name, rich_help_panel=panel)
-    elif all(each.name != name for each in app.registered_commands):
+def _add(app: typer.Typer, name: str, command: Any, panel: str | None) -> typer.Typer | None:
+    """Adds a command or group. Returns a group as it was added: a copy, to which subcommands may be added."""
+    if not isinstance(command, typer.Typer):
         app.command(name, rich_help_panel=panel)(_evaluated(command))
+        return None
+    group = copy(command)
+    group.registered_commands = [*command.registered_commands]
+    app.add_typer(group, name=name, rich_help_panel=panel)
+    return group
 
 
 def _evaluated(command: Callable[..., int]) -> Callable[..., int]:
