@@ -10,10 +10,8 @@ from typing import Any
 
 import pytest
 
-from coec.cli import (
-    main,
-    sim,  # noqa: F401  it draws for itself, whichever test loads it first; so do these
-)
+from coec.cli import sim  # noqa: F401  it draws for itself, whichever test loads it first; so do these
+from coec.cli.main import main
 from coec.evaluation import check_run, matrix_run  # noqa: F401
 from drives import drawn
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from cli.conftest import Coec
-from coec import __version__
-from coec.cli import COMMANDS as COMMANDS_WITHOUT_COMMANDS
-from coec.cli import application
+from coec import __version__, api
+from coec.cli.main import BUILT_IN, LABORATORY, application
+from coec.errors import UsageError
 
 COMMANDS = ("calibrate", "run", "check-config", "play", "query", "replay", "convert", "models", "demo")
-HELP = "import sys; sys.argv = ['coec', '--help']; from coec.cli import main; sys.exit(main())"
+HELP = "import sys; sys.argv = ['coec', '--help']; from coec.cli.main import main; sys.exit(main())"
 HEAVY = ("cv2", "mcap", "numba", "numpy", "onnxruntime", "pydantic", "rosbags", "zenoh")
 
 
@@ -34,7 +34,7 @@ def test_every_command_has_help(coec: Coec, command: str) -> None:
 def test_help_of_all_commands_imports_nothing_heavy() -> None:
     code = (
         "import sys; sys.argv = ['coec', '--help']\n"
-        "from coec.cli import main; main()\n"
+        "from coec.cli.main import main; main()\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
     path = ":".join(sys.path)
@@ -46,7 +46,7 @@ def test_help_of_all_commands_imports_nothing_heavy() -> None:
 def test_a_source_that_is_refused_is_refused_before_what_draws_is_imported(tmp_path: Path) -> None:
     code = (
         f"import sys; sys.argv = ['coec', 'calibrate', {str(tmp_path / 'absent')!r}]\n"
-        "from coec.cli import main; status = main()\n"
+        "from coec.cli.main import main; status = main()\n"
         "print(status, 'matplotlib' in sys.modules)"
     )
     done = subprocess.run(
@@ -57,7 +57,9 @@ def test_a_source_that_is_refused_is_refused_before_what_draws_is_imported(tmp_p
 
 
 def test_a_user_without_a_home_gets_pictures_without_words_of_the_library_that_draws(tmp_path: Path) -> None:
-    code = "import sys; sys.argv = ['coec', '--version']\nfrom coec.cli import main; main()\nimport matplotlib.figure"
+    code = (
+        "import sys; sys.argv = ['coec', '--version']\nfrom coec.cli.main import main; main()\nimport matplotlib.figure"
+    )
     (tmp_path / "file").touch()
     env = {"PYTHONPATH": ":".join(sys.path), "HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
@@ -67,7 +69,10 @@ def test_a_user_without_a_home_gets_pictures_without_words_of_the_library_that_d
 def test_a_command_is_declared_without_the_others() -> None:
     (alone,) = application(["check-config", "--defaults"]).registered_commands
     assert alone.name == "check-config"
-    assert len(application(["--help", "check-config"]).registered_commands) == len(COMMANDS_WITHOUT_COMMANDS)
+    everything = application(["--help", "check-config"])
+    names = {each.name for each in everything.registered_commands}
+    names |= {each.name for each in everything.registered_groups}
+    assert names == {*BUILT_IN, *(name for name in LABORATORY if "." not in name)}
 
 
 def test_a_mistyped_command_is_told_which_is_meant(coec: Coec) -> None:
@@ -108,7 +113,7 @@ def test_fault_of_our_own_is_70_with_traceback(coec: Coec, monkeypatch: pytest.M
     def fail(*_: object, **__: object) -> int:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("coec.cli.models.run", fail)
+    monkeypatch.setattr("coec.cli.models._list", fail)
     outcome = coec("models", "--json")
     assert outcome.status == 70
     assert "Traceback" in outcome.err
@@ -186,3 +191,56 @@ def test_who_reads_no_further_leaves_141() -> None:
     )  # fmt: skip
     assert done.stdout.strip() == "141"
     assert "Traceback" not in done.stderr
+
+
+ADDED = """\
+import typer
+
+group = typer.Typer(no_args_is_help=True)
+
+
+def five(times: int = 1) -> int:
+    '''Returns five.'''
+    return 5 * times
+
+
+@group.command()
+def inner() -> int:
+    '''Returns six.'''
+    return 6
+
+
+@group.command()
+def other() -> int:
+    return 0
+"""
+
+
+@pytest.fixture
+def _added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another package with commands is installed."""
+    (tmp_path / "added_commands.py").write_text(ADDED)
+    info = tmp_path / "added-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: added\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[coec.commands]\nfive = added_commands:five\ngroup = added_commands:group\n"
+        "fleet.five = added_commands:five\n[coec.api]\nfive = added_commands:five\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+
+@pytest.mark.usefixtures("_added")
+def test_another_package_adds_commands_groups_and_subcommands(coec: Coec) -> None:
+    assert coec("five", "--times", 2).status == 10
+    assert coec("group", "inner").status == 6
+    assert coec("fleet", "five").status == 5
+    assert "Returns five" in coec("--help").out
+    assert coec("five", "--nonsense").status == 2
+
+
+@pytest.mark.usefixtures("_added")
+def test_another_package_adds_a_function_to_the_package() -> None:
+    assert api.added("five")() == 5
+    with pytest.raises(UsageError, match=r"coec\.six is not installed"):
+        api.added("six")()

@@ -15,13 +15,14 @@ from coec.adapters.images.codec import GreyImages, decode_bgr
 from coec.calibration.estimators import Sight, sight_of
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.types import Window
+from coec.calibration_options import SolverOptions as Choices
+from coec.calibration_options import configuration_of
 from coec.cli.commands.models_assess import Options
 from coec.config import LimitsConfig, WindowConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.evaluation import depth_quality
 from coec.evaluation.depth_quality import DepthQuality
 from coec.evaluation.experiments import Stages
-from coec.library.choices import Choices, configuration_of
 from coec.reports import console
 from coec.reports.evaluation_documents import number
 from coec.reports.page.words import count

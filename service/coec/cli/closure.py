@@ -11,8 +11,8 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.types import Matrix4
 from coec.cli import evaluate
-from coec.cli.chosen import choices_of
 from coec.cli.commands.evaluate import Options
+from coec.cli.options import choices_of
 from coec.config import LimitsConfig, WindowConfig
 from coec.evaluation import experiments
 from coec.evaluation.closure import Between, Closure, Solve, between, close

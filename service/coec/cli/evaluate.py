@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from rich.progress import Progress
 
 from coec.adapters.files import output
-from coec.cli.chosen import choices_of
+from coec.cli.calibrate import picture_of_lens_error as drawn_if_refused
 from coec.cli.commands.evaluate import Options
-from coec.cli.lens_refusal import drawn_if_refused
+from coec.cli.options import choices_of
 from coec.config import WindowConfig
 from coec.errors import CalibrationError
 from coec.evaluation.experiments import Stages

@@ -14,6 +14,8 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.estimators import depth_features, sight_of
 from coec.calibration.ports import Silence
+from coec.calibration_options import SolverOptions as Choices
+from coec.calibration_options import configuration_of
 from coec.cli.commands.paper import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import SourceError
@@ -21,7 +23,6 @@ from coec.evaluation import paper, paper_published, starts, statistics
 from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
 from coec.evaluation.paper_speed import run_times
 from coec.evaluation.statistics import Outcome
-from coec.library.choices import Choices, configuration_of
 from coec.reports import console, page, paper_charts, paper_plots, plots, provenance
 from coec.reports.bullseye import bullseye
 from coec.reports.page import Block

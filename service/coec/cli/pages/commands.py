@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 import typer
 
-from coec.cli import application
+from coec.cli.main import application
 from coec.cli.pages.markdown import WRITTEN, code, prose, table
 
 HEAD = """\

@@ -1,9 +1,9 @@
-"""A fleet on one screen: the last word of each pair, and at a key press the answer of one pair."""
+"""A fleet on one screen: the last heartbeat of each pair, and at a key press the history or overlay of one pair."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -15,9 +15,8 @@ from rich.text import Text
 from coec.adapters.system.keyboard import keys as keyboard
 from coec.adapters.zenoh.client import ask_one, connected_by
 from coec.adapters.zenoh.words import Words
-from coec.cli.commands.watch import Options
-from coec.cli.query import Asked
-from coec.cli.stopping import until_signal
+from coec.cli.options import ServiceAddress
+from coec.cli.signals import until_signal
 from coec.errors import CoecError, UsageError
 from coec.fleet.roster import RANKS, Filter, Name, Roster, of_states
 from coec.reports import console, fleet_board, half_blocks
@@ -30,10 +29,10 @@ from coec.schemas.replies import HistoryReply
 FRAME_S = 0.5
 """Time between two updates of the screen, which shows ages in seconds."""
 
-ASK_AGAIN_S = 10.0
-ASKED_AT_ONCE = 16
-"""How many silent pairs are asked every `ASK_AGAIN_S` whether a word of theirs was lost: at most 2 kB/s, whatever the
-fleet."""
+QUERY_PERIOD_S = 10.0
+QUERIES_AT_ONCE = 16
+"""How many silent pairs are queried every `QUERY_PERIOD_S` for a heartbeat that may have been lost: at most 2 kB/s,
+whatever the fleet."""
 
 RESULTS = 10
 """Most results of a pair's history: 50 kB."""
@@ -53,33 +52,35 @@ QUICK_FILTERS: tuple[tuple[str, frozenset[str]], ...] = (
 )
 
 
-def run(options: Options, asked: Asked) -> int:
-    """Shows the board until the user leaves it, or once; returns 1 if no pair has said anything.
+def show_fleet(
+    address: ServiceAddress, states: Sequence[str], find: str, timeout_s: float, *, once: bool, as_json: bool
+) -> int:
+    """Shows the board until the user leaves it, or once; returns 1 if no pair has sent a heartbeat.
 
     Raises:
         ConnectionFailedError: no router answered.
         UsageError: an unknown state.
     """
-    chosen = Filter(of_states(options.states or (), UsageError), options.find or "")
+    selected = Filter(of_states(states, UsageError), find)
     with (
         until_signal() as stop,
-        connected_by(asked.way, options.timeout_s) as session,
-        connected_by(asked.way, options.timeout_s) as of_tokens,
+        connected_by(address.way, timeout_s) as session,
+        connected_by(address.way, timeout_s) as of_tokens,
     ):
-        words = Words(session, of_tokens, Keys(asked.prefix, asked.vehicle), options.timeout_s)
-        with words.listening():
-            board = Board(Roster(), words, chosen, Asking(session, asked.prefix))
-            if options.once:
-                while not words.told.wait(FRAME_S) and not stop.is_set():
+        heartbeats = Words(session, of_tokens, Keys(address.prefix, address.vehicle), timeout_s)
+        with heartbeats.listening():
+            board = Board(Roster(), heartbeats, selected, PairQuery(session, address.prefix))
+            if once:
+                while not heartbeats.told.wait(FRAME_S) and not stop.is_set():
                     pass
                 fleet = board.once()
-                if options.as_json:
+                if as_json:
                     console.print_json(fleet.model_dump(mode="json"))
                 else:
                     console.out.print(fleet_board.board(fleet, -1, 0, fleet.matching, ""))
                 return 0 if fleet.known else 1
             with (
-                board.asking,
+                board.query,
                 keyboard() as poll,
                 Live(console=console.out, screen=True, auto_refresh=False) as live,
             ):
@@ -88,24 +89,24 @@ def run(options: Options, asked: Asked) -> int:
     return 0 if board.once().known else 1
 
 
-class Asking:
-    """Asks one pair at a time in a thread of its own, so that the screen goes on; shows the answer when it arrives."""
+class PairQuery:
+    """Queries one pair at a time in its own thread, so that the screen goes on; shows the reply when it arrives."""
 
     def __init__(self, session: zenoh.Session, prefix: str) -> None:
         self._session = session
         self._prefix = prefix
-        self._thread = ThreadPoolExecutor(1, "asking")
+        self._thread = ThreadPoolExecutor(1, "query")
         self._future: Future[RenderableType] | None = None
         self._what = ""
 
-    def __enter__(self) -> Asking:
+    def __enter__(self) -> PairQuery:
         return self
 
     def __exit__(self, *raised: object) -> None:
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     def begin(self, what: str, name: Name, size: tuple[int, int]) -> None:
-        """Ask for `history` or `overlay`, unless a question is still open; `size` in characters."""
+        """Query `history` or `overlay`, unless a query is still open; `size` in characters."""
         if self._future is not None and not self._future.done():
             return
         self._what = f"{what} of {name[0]}/{name[1]}"
@@ -115,7 +116,7 @@ class Asking:
     def shown(self) -> RenderableType:
         """The answer, or that it has not arrived yet."""
         if self._future is None or not self._future.done():
-            return Text(f"asking for the {self._what} …", "dim")
+            return Text(f"waiting for the {self._what} …", "dim")
         try:
             return self._future.result()
         except CoecError as error:
@@ -136,26 +137,26 @@ class Board:
     """The content of the screen, and what keys do to it. Owned by one thread.
 
     Attributes:
-        index: of the chosen pair among those that are shown.
-        name: of the pair that a key chose, which stays chosen wherever it moves; None: the first pair is chosen.
+        index: of the selected pair among those that are shown.
+        name: of the pair that a key selected, which stays selected wherever it moves; None: the first pair is selected.
     """
 
-    roster: Roster
-    words: Words
+    state: Roster
+    heartbeats: Words
     given: Filter
-    asking: Asking
+    query: PairQuery
     clock: Callable[[], float] = time.monotonic
     pane: str = "reasons"
     quick: int = 0
     index: int = 0
     name: Name | None = None
-    asked_s: float = field(default=-ASK_AGAIN_S)
+    queried_s: float = field(default=-QUERY_PERIOD_S)
     fleet: FleetNow | None = None
 
     def once(self) -> FleetNow:
         """The fleet, with everything that has arrived by now."""
-        self._hear()
-        return self.roster.now(self.clock(), self.given)
+        self._update()
+        return self.state.now(self.clock(), self.given)
 
     def press(self, key: str | None) -> bool:
         """Act on a key; returns False if the key leaves the board."""
@@ -173,52 +174,52 @@ class Board:
         elif key in ("h", "o") and pair is not None:
             self.name = _name(pair)
             self.pane = {"h": "history", "o": "overlay"}[key]
-            self.asking.begin(self.pane, self.name, (console.out.width, PANE_ROWS * 2))
+            self.query.begin(self.pane, self.name, (console.out.width, PANE_ROWS * 2))
         return key != "q"
 
     def frame(self, width: int, height: int) -> RenderableType:
         """The screen as it is now."""
         del width
-        self._hear()
+        self._update()
         label, states = QUICK_FILTERS[self.quick]
-        chosen = Filter(states or self.given.states, self.given.text)
+        shown = Filter(states or self.given.states, self.given.text)
         pane_rows = PANE_ROWS * (2 if self.pane == "overlay" else 1)
         rows = max(height - pane_rows - 5, 3)
-        self.fleet = self.roster.now(self.clock(), chosen, max(rows, self.index + rows))
+        self.fleet = self.state.now(self.clock(), shown, max(rows, self.index + rows))
         pairs = self.fleet.pairs
-        found = [index for index, pair in enumerate(pairs) if _name(pair) == self.name]
-        self.index = found[0] if found else min(self.index if self.name else 0, max(len(pairs) - 1, 0))
+        at = [index for index, pair in enumerate(pairs) if _name(pair) == self.name]
+        self.index = at[0] if at else min(self.index if self.name else 0, max(len(pairs) - 1, 0))
         pair = pairs[self.index] if pairs else None
         first = max(min(self.index - rows // 2, len(pairs) - rows), 0)
-        filtered = ", ".join(filter(None, (label or ", ".join(sorted(chosen.states)), chosen.text)))
+        filtered = ", ".join(filter(None, (label or ", ".join(sorted(shown.states)), shown.text)))
         parts: list[RenderableType] = [fleet_board.board(self.fleet, self.index, first, rows, filtered)]
-        if not self.words.is_connected:
-            parts.insert(0, Text("no router: nothing new comes, ages go on", "bold red"))
+        if not self.heartbeats.is_connected:
+            parts.insert(0, Text("no router: nothing new arrives, ages go on", "bold red"))
         parts += [Text(fleet_board.KEYS, "dim"), self._pane(pair)]
         return Group(*parts)
 
     def _pane(self, pair: PairNow | None) -> RenderableType:
         if pair is None:
-            told = self.words.told.is_set()
-            return Text("no pair has said anything" if told else "asking who is there …", "dim")
-        return fleet_board.detail(pair) if self.pane == "reasons" else self.asking.shown()
+            answered = self.heartbeats.told.is_set()
+            return Text("no pair has sent a heartbeat" if answered else "looking for pairs …", "dim")
+        return fleet_board.detail(pair) if self.pane == "reasons" else self.query.shown()
 
-    def _hear(self) -> None:
+    def _update(self) -> None:
         now_s = self.clock()
-        for came in self.words.take():
-            if came.kind == "said":
-                self.roster.hear(came.key, came.payload, came.at_s)
-            elif came.kind == "kept":
-                self.roster.recall(came.key, came.payload, came.at_s, time.time_ns())
+        for message in self.heartbeats.take():
+            if message.kind == "said":
+                self.state.hear(message.key, message.payload, message.at_s)
+            elif message.kind == "kept":
+                self.state.recall(message.key, message.payload, message.at_s, time.time_ns())
             else:
-                vehicle, pair = came.key.split("/")[-3:-1]
-                self.roster.present(vehicle, pair, is_there=bool(came.payload))
-        for cause, count in self.words.refused().items():
-            self.roster.refuse(cause, count)
-        if now_s - self.asked_s >= ASK_AGAIN_S and self.words.told.is_set():
-            self.asked_s = now_s
-            for vehicle, pair in self.roster.overdue(now_s, ASKED_AT_ONCE):
-                self.words.ask(vehicle, pair)
+                vehicle, pair = message.key.split("/")[-3:-1]
+                self.state.present(vehicle, pair, is_there=bool(message.payload))
+        for cause, count in self.heartbeats.refused().items():
+            self.state.refuse(cause, count)
+        if now_s - self.queried_s >= QUERY_PERIOD_S and self.heartbeats.told.is_set():
+            self.queried_s = now_s
+            for vehicle, pair in self.state.overdue(now_s, QUERIES_AT_ONCE):
+                self.heartbeats.ask(vehicle, pair)
 
 
 def _name(pair: PairNow) -> Name:

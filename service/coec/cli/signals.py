@@ -31,7 +31,7 @@ def until_signal() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def ended_by_sigterm() -> Iterator[None]:
+def success_on_sigterm() -> Iterator[None]:
     """Ends the process with success on SIGTERM while a service is loaded, before it handles signals itself. The first
     process of a container has no default for a signal: the kernel would drop it, and the engine would wait for nothing.
     """
@@ -56,14 +56,14 @@ def no_interrupt_lost() -> Iterator[None]:
     from C, for example from the compiler."""
     before = sys.unraisablehook
 
-    def hear(what: sys.UnraisableHookArgs) -> None:
+    def resend(what: sys.UnraisableHookArgs) -> None:
         if issubclass(what.exc_type, KeyboardInterrupt):
             # No `threading.Timer`: its start waits for its thread, and an interrupt within this hook is lost for good.
             _thread.start_new_thread(_interrupt_later, (threading.get_ident(),))
         else:
             before(what)
 
-    sys.unraisablehook = hear
+    sys.unraisablehook = resend
     try:
         yield
     finally:
