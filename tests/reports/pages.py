@@ -28,13 +28,6 @@ from coec.calibration.types import (
     Reason,
     Window,
 )
-from coec.cli.demo.outcome import outcome_of
-from coec.cli.demo.page import demo_page
-from coec.cli.demo.rig import report as rig_report
-from coec.cli.demo.rig import story as rig_story
-from coec.cli.demo.rig.outcome import outcome_of as rig_outcome_of
-from coec.cli.demo.rig.told import SensorTold, Told
-from coec.cli.demo.watch import Moment
 from coec.evaluation import paper_published
 from coec.evaluation.paper import MOVES_DEG, Figures
 from coec.evaluation.profiles import Scan, Views
@@ -75,6 +68,13 @@ from coec.schemas.replies import (
     MetricsPoint,
 )
 from coec.schemas.replies import Reason as Said
+from coec_lab.demo.outcome import outcome_of
+from coec_lab.demo.page import demo_page
+from coec_lab.demo.rig import report as rig_report
+from coec_lab.demo.rig import story as rig_story
+from coec_lab.demo.rig.outcome import outcome_of as rig_outcome_of
+from coec_lab.demo.rig.told import SensorTold, Told
+from coec_lab.demo.watch import Moment
 from estimates import RIG, estimate
 
 EVIL = "<script>alert(1)</script>'\"><img src=http://evil/x onerror=alert(2)>"

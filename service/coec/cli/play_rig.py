@@ -13,7 +13,7 @@ from coec.adapters.zenoh.player import Player, SensorKeys, shifted
 from coec.cli.commands.play import Options
 from coec.cli.play import CONNECT_S, LISTENER_S, Target, display, report, say_deaf, say_without_depth
 from coec.cli.play_topics import Programme
-from coec.cli.sim_rig import vehicle_of
+from coec.cli.rig_configuration import vehicle_of
 from coec.cli.stopping import until_signal
 from coec.errors import UsageError
 from coec.simulation.source import open_rig

@@ -27,6 +27,6 @@ class Options:
 
 def run(options: Options) -> int:
     """Estimate from drawn checks how often the monitor accuses a right mount, and how soon it notices a moved one."""
-    from coec.cli import alarms as work
+    from coec_lab.commands import alarms as work
 
     return work.run(options)

@@ -16,6 +16,6 @@ class Options:
 
 def run(options: Options) -> int:
     """Measure the speed of the kernels and of a solve on this machine, beside plain implementations in the same run."""
-    from coec.cli import bench as work
+    from coec_lab import bench as work
 
     return work.run(as_json=options.as_json)

@@ -32,9 +32,9 @@ class Options:
 def run(options: Options) -> int:
     """Knock the mount of a simulated vehicle and show the service notice and repair it: no data, two minutes."""
     if options.rig:
-        from coec.cli.demo import rig
+        from coec_lab.demo import rig
 
         return rig.run(options.output, as_json=options.as_json)
-    from coec.cli import demo as work
+    from coec_lab import demo as work
 
     return work.run(options.output, as_json=options.as_json)

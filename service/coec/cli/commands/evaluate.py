@@ -104,8 +104,8 @@ class Options:
 
 def run(options: Options) -> int:
     """Solve from starts all around the source's calibration: hit rate, bias, spread, and how good the verdicts are."""
-    from coec.cli import closure as closure_work
-    from coec.cli import evaluate as work
+    from coec_lab.commands import closure as closure_work
+    from coec_lab.commands import evaluate as work
 
     if bool(options.source) == (options.closure is not None):
         raise UsageError("coec evaluate: give a SOURCE, or --closure A B, and not both")

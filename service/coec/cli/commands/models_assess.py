@@ -29,6 +29,6 @@ class Options:
 
 def run(options: Options) -> int:
     """Compare a depth network with the LiDAR of a calibrated recording: exit 1 if it is of no use there."""
-    from coec.cli import assess as work
+    from coec_lab.commands import assess as work
 
     return work.run(options)

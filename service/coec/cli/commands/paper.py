@@ -32,6 +32,6 @@ class Options:
 
 def run(options: Options) -> int:
     """Repeat the published experiments on a recording: metrics.png, bullseye.png, drive.png."""
-    from coec.cli import paper as work
+    from coec_lab.commands import paper as work
 
     return work.run(options)

@@ -46,6 +46,6 @@ def run(options: Options) -> int:
     Finished drives are kept in DIR: call again, with more rounds, to go on. A DIR holds results of one state of the
     code.
     """
-    from coec.cli import sim_checks as work
+    from coec_lab.commands import sim_checks as work
 
     return work.run(options)

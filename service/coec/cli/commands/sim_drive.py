@@ -68,9 +68,9 @@ def run(options: Options) -> int:
     at least five are in motion.
     """
     if options.rig is not None:
-        from coec.cli import sim_rig
+        from coec_lab.commands import sim_rig
 
         return sim_rig.drive(options)
-    from coec.cli import sim as work
+    from coec_lab.commands import sim as work
 
     return work.drive(options)

@@ -51,6 +51,6 @@ def run(options: Options) -> int:
     A drive takes about half a minute of one core, the whole matrix most of an hour. Finished drives are kept in DIR:
     call again to go on. A DIR holds results of one state of the code; take another after a change.
     """
-    from coec.cli import sim_matrix as work
+    from coec_lab.commands import sim_matrix as work
 
     return work.run(options)

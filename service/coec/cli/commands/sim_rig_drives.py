@@ -32,6 +32,6 @@ def run(options: Options) -> int:
     on the vehicle. Only the image rows that the LiDAR sees are rendered. Finished drives are kept in DIR: call again,
     with more drives, to go on. A DIR holds results of one state of the code.
     """
-    from coec.cli import sim_rig_drives as work
+    from coec_lab.commands import sim_rig_drives as work
 
     return work.run(options)

@@ -25,6 +25,6 @@ def run(options: Options) -> int:
     Nothing is rendered: checks and windows are drawn at random, with all the errors of real ones. A drive takes one to
     three seconds of a core.
     """
-    from coec.cli import sim_rig_moves as work
+    from coec_lab.commands import sim_rig_moves as work
 
     return work.run(options.drives, options.rigs, as_json=options.as_json)

@@ -27,6 +27,6 @@ class Options:
 
 def run(options: Options) -> int:
     """Write one picture of a drive."""
-    from coec.cli import sim as work
+    from coec_lab.commands import sim as work
 
     return work.view(options)
