@@ -1,176 +1,122 @@
-"""`coec evaluate`: solves one recording with a known pose from many starts around it."""
+"""What `coec evaluate` takes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from rich.progress import Progress
+import typer
 
-from coec.adapters.files import output
-from coec.cli.chosen import choices_of
-from coec.cli.commands.evaluate import Options
-from coec.cli.lens_refusal import drawn_if_refused
-from coec.config import WindowConfig
-from coec.errors import CalibrationError
-from coec.evaluation.experiments import Stages
-from coec.evaluation.statistics import Outcome
-from coec.exit_codes import ExitCode
-from coec.library.evaluating import Plan, Subject, bench_of, report_of, subject_of, tried
-from coec.reports import console, evaluation_tables, page, provenance
-from coec.reports.evaluation_page import comparison_page, evaluation_page
-from coec.reports.page import Block, Page
-from coec.schemas.base import to_json
-from coec.schemas.evaluation import ComparisonReport, EvaluationReport
-from coec.sources import windows
-
-ALL = "all"
-"""Value of the objective that means all `METHODS`, one after the other."""
-
-METHODS = ("fused", "mi", "intensity")
-"""This project's method, the paper's, and the one before the paper."""
-
-
-def run(options: Options) -> int:
-    """Prints the report; how good the figures are is for the reader to judge.
-
-    Raises:
-        CoecError: there is nothing to evaluate.
-    """
-    if options.output is not None:
-        output.try_folder(options.output)
-    with console.progress() as bars:
-        stages = Stages(bars)
-        load = stages.begin("load", None)
-        loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
-        chosen = choices_of(_first_of(options))
-        with drawn_if_refused(options.output, loaded.window.rig.camera):
-            subject = subject_of(
-                options.source, options.frames, loaded, plan_of(options), chosen, options.camera_model, stages
-            )
-        document: EvaluationReport | ComparisonReport
-        if options.objective == ALL:
-            document, told = _compare(options, subject, bars, stages)
-        else:
-            of_method = _evaluate(options, subject, stages)
-            document, told = of_method.report, of_method.page
-    if options.as_json:
-        console.print_json(document.model_dump(mode="json"))
-    elif isinstance(document, ComparisonReport):
-        evaluation_tables.show_comparison(document)
-    else:
-        evaluation_tables.show(document)
-    # Printed first, so that the figures are not lost if they cannot be written.
-    if options.output is not None:
-        output.write(options.output / "report.json", to_json(document))
-        page.write(options.output / "report.html", told())
-    if document.interrupted:
-        console.say("coec: interrupted: the figures are of what was finished")
-    return ExitCode.INTERRUPTED if document.interrupted else 0
-
-
-def plan_of(options: Options) -> Plan:
-    """The experiments that the command line requests."""
-    return Plan(
-        rotation_deg=options.rotation_deg,
-        translation_m=options.translation_m,
-        directions=options.directions,
-        against_frames=options.against_frames,
-        against_slice=options.against_slice,
-        halves=options.halves,
-        nees=options.nees,
-        detection=options.detection,
-        steps=options.steps,
-    )
-
-
-def _first_of(options: Options) -> Options:
-    """The options with one objective, to load what all methods share."""
-    return replace(options, objective=METHODS[0]) if options.objective == ALL else options
+from coec.cli.options import SOURCE_HELP, CameraModel, DegreesOfFreedom, Depth, Frames, Json, NoMotionCompensation
+from coec.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)
-class Evaluated:
-    """One method; `page()` makes the page of it."""
+class Options:
+    """The arguments of the command; None = not given. `halves` and `detection` are numbers of splits, `nees` is one of
+    windows and of splits, `steps` one of knocks of each kind; 0 = none."""
 
-    report: EvaluationReport
-    outcomes: list[Outcome]
-    page: Callable[[], Page]
+    rotation_deg: Annotated[
+        float, typer.Option(help="Radius of the sphere of starts, degrees.", metavar="R", min=0, show_default=False)
+    ]
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP, show_default=False)] = ""
+    closure: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            help="Instead of SOURCE: two cameras (or LiDARs) of one vehicle, each calibrated by itself; reports how "
+            "far their results miss the pose between them.",
+            metavar="A B",
+        ),
+    ] = None
+    relative: Annotated[
+        str | None,
+        typer.Option(
+            help="With --closure: pose of sensor A in the frame of B, degrees and metres. Default: from the "
+            "calibrations of both recordings.",
+            metavar="RX,RY,RZ,TX,TY,TZ",
+        ),
+    ] = None
+    directions: Annotated[int, typer.Option(help="Number of starts.", metavar="N", min=1)] = 200
+    translation_m: Annotated[
+        float, typer.Option(help="Radius of the sphere of starts, metres.", metavar="T", min=0)
+    ] = 0.0
+    depth: Depth = None
+    objective: Annotated[
+        str | None,
+        typer.Option(
+            help="Objective to maximise: fused, mi, intensity as for calibrate, or all three side by side: all.",
+            metavar="NAME",
+        ),
+    ] = None
+    dof: Annotated[
+        DegreesOfFreedom | None,
+        typer.Option(help="Rotation only, or translation too; 6 if --translation-m is given.", show_default=False),
+    ] = None
+    camera_model: CameraModel = None
+    frames: Frames = None
+    no_motion_compensation: NoMotionCompensation = False
+    against_frames: Annotated[
+        bool, typer.Option("--against-frames", help="Also solve windows of 1, 2, 3, 5, ... frames: frames.png.")
+    ] = False
+    against_slice: Annotated[
+        bool, typer.Option("--against-slice", help="Also solve slices of 1/16 to all of the recording: slices.png.")
+    ] = False
+    halves: Annotated[
+        int,
+        typer.Option(
+            help="Also split the frames N times at random into disjoint halves and compare their results.",
+            metavar="N",
+            min=0,
+        ),
+    ] = 0
+    nees: Annotated[
+        int,
+        typer.Option(
+            help="Also compare errors with claimed standard deviations: N consecutive windows against the truth (for a "
+            "recording: its own calibration), and N splits into halves: normalised.png.",
+            metavar="N",
+            min=0,
+        ),
+    ] = 0
+    detection: Annotated[
+        int,
+        typer.Option(
+            help="Also report how well moved extrinsics are detected, over N splits of the frames, as diagnose does.",
+            metavar="N",
+            min=0,
+        ),
+    ] = 0
+    steps: Annotated[
+        int,
+        typer.Option(
+            help="Also simulate knocks of several sizes in the recording, N of each at random times: is the window "
+            "refused, and is the time right?",
+            metavar="N",
+            min=0,
+        ),
+    ] = 0
+    output: Annotated[
+        Path | None, typer.Option(help="Write plots, overlays, starts.csv and report.json.", metavar="DIR")
+    ] = None
+    as_json: Json = False
 
 
-def _compare(
-    options: Options, subject: Subject, bars: Progress, stages: Stages
-) -> tuple[ComparisonReport, Callable[[], Page]]:
-    """Evaluates every method that the source allows; returns the report, and a function that makes the page of all.
+def run(options: Options) -> int:
+    """Solve from starts all around the source's calibration: hit rate, bias, spread, and how good the verdicts are."""
+    from coec_lab.commands import closure as closure_work
+    from coec_lab.commands import evaluate as work
 
-    Raises:
-        CalibrationError: the source allows none.
-    """
-    found: dict[str, Evaluated] = {}
-    not_evaluated: dict[str, str] = {}
-    for method in METHODS:
-        folder = None if options.output is None else options.output / method
-        # The monitor uses both witnesses whatever is maximised, so one table of detection is enough.
-        splits = options.detection if method == METHODS[0] else 0
-        of_method = replace(options, objective=method, output=folder, detection=splits)
-        heard = stages.begin(method, 1)
-        try:
-            found[method] = _evaluate(of_method, subject, Stages(bars, f"{method}: "))
-        except CalibrationError as error:
-            not_evaluated[method] = str(error)
-            continue
-        if folder is not None:
-            output.write(folder / "report.json", to_json(found[method].report))
-            page.write(folder / "report.html", found[method].page())
-        heard(1, "")
-        if found[method].report.interrupted:
-            break
-    interrupted = any(each.report.interrupted for each in found.values())
-    if not found:
-        raise CalibrationError("; ".join(f"{method}: {reason}" for method, reason in not_evaluated.items()))
-    ends: tuple[Block, ...] = ()
-    if options.output is not None and not interrupted:
-        # matplotlib takes a second to import.
-        from coec.reports import evaluation_pictures
-
-        of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
-        outcomes = {method: each.outcomes for method, each in found.items()}
-        ends = evaluation_pictures.write_comparison(options.output, subject.window.window_id, of_starts, outcomes)
-    report = ComparisonReport(
-        source=options.source,
-        methods={method: each.report for method, each in found.items()},
-        not_evaluated=not_evaluated,
-        interrupted=interrupted,
-        elapsed_s=stages.elapsed_s(),
-    )
-    return report, lambda: comparison_page(report, ends, provenance.here())
-
-
-def _evaluate(options: Options, subject: Subject, stages: Stages) -> Evaluated:
-    """Evaluates one method: runs its experiments, and writes everything but the report into the output folder.
-
-    Raises:
-        CalibrationError: there is no result even from the source's calibration.
-    """
-    plan = plan_of(options)
-    bench = bench_of(subject, plan, choices_of(options))
-    done = tried(subject, plan, bench, stages)
-    ends: tuple[Block, ...] = ()
-    worst: tuple[Block, ...] = ()
-    if options.output is not None and not done.interrupted:
-        # matplotlib takes a second to import.
-        from coec.reports import evaluation_pictures
-
-        of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
-        draw = stages.begin("draw", None)
-        drawn = evaluation_pictures.write(
-            options.output, bench, of_starts, done.outcomes, done.frames, done.slices, draw
+    if bool(options.source) == (options.closure is not None):
+        raise UsageError("coec evaluate: give a SOURCE, or --closure A B, and not both")
+    if options.closure is None:
+        if options.relative is not None:
+            raise UsageError("--relative tells the pose between two sources: it needs --closure A B")
+        return work.run(options)
+    others = (options.against_frames, options.against_slice, options.halves, options.nees, options.detection)
+    if options.objective == work.ALL or any((*others, options.steps, options.camera_model)):
+        raise UsageError(
+            "--closure is an experiment of its own: leave out --objective all, --against-frames, --against-slice, "
+            "--halves, --nees, --detection, --steps and --camera-model"
         )
-        ends, worst = drawn.ends, drawn.worst
-        if done.normalised:
-            evaluation_pictures.write_normalised(options.output, bench.window.window_id, done.normalised)
-    if options.output is not None:
-        table = evaluation_tables.csv_of(bench.reference, done.outcomes)
-        output.write(options.output / "starts.csv", table.encode())
-    report = report_of(subject, plan, bench, done, stages.elapsed_s())
-    return Evaluated(report, done.outcomes, lambda: evaluation_page(report, ends, worst, provenance.here()))
+    return closure_work.run(options, *options.closure)
