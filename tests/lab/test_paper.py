@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec_lab.commands.paper import windows_of
+from coec_lab.commands.paper_experiments import windows_of
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_a_failed_drive_of_a_rig_does_not_refuse_the_next(
         return output.write(path, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr("coec_lab.commands.sim_rig.write", full_disk)
+        patch.setattr("coec_lab.commands.drive_bags.write", full_disk)
         assert coec(*words).status == 1
     assert list(folder.iterdir()) == []
     assert coec(*words).status == 0

@@ -1,39 +1,47 @@
-"""`coec alarms`: how often the monitor accuses a right mount, and how soon it notices a wrong one."""
+"""`coec alarms`: false-alarm rate and detection delay of the monitor, on simulated checks."""
 
 from __future__ import annotations
 
-from pydantic import ValidationError
+from pathlib import Path
+from typing import Annotated
 
-from coec.adapters.files import output
-from coec.cli.commands.alarms import Options
-from coec.config import MonitorConfig, describe
-from coec.errors import UsageError
-from coec.evaluation.alarms import measured
-from coec.reports import alarm_reports, console
-from coec.schemas.base import to_json
+import typer
+
+from coec.cli.options import Json
 
 
-def run(options: Options) -> int:
-    """Draws streams of checks, and prints what the change detector makes of them.
+def alarms(
+    hours: Annotated[float, typer.Option(help="Hours of driving with a correct extrinsic.", min=0.1)] = 100.0,
+    steps: Annotated[int, typer.Option(help="Number of simulated steps of each size.", min=1)] = 20,
+    period_s: Annotated[float, typer.Option("--period", help="Seconds between checks.")] = 5.0,
+    between_h: Annotated[float, typer.Option("--between", help="Configured hours between false alarms.")] = 100.0,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for alarms.json and delay.png.", metavar="DIR", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Estimate false-alarm rate and detection delay of the monitor from simulated checks."""
+    from pydantic import ValidationError
 
-    Raises:
-        UsageError: a value is not allowed in a configuration.
-        OutputError: the folder cannot be written.
-    """
+    from coec.adapters.files import output as files
+    from coec.config import MonitorConfig, describe
+    from coec.errors import UsageError
+    from coec.evaluation.alarms import measured
+    from coec.reports import alarm_reports, console
+    from coec.schemas.base import to_json
+
     try:
-        config = MonitorConfig(period_s=options.period_s, hours_between_false_alarms=options.between_h)
+        config = MonitorConfig(period_s=period_s, hours_between_false_alarms=between_h)
     except ValidationError as error:
         raise UsageError(describe(error)) from error
     with console.progress() as bars:
         task = bars.add_task("streams of checks", total=None, note="")
-        alarms = measured(
-            config, options.hours, options.steps, lambda done, total: bars.update(task, completed=done, total=total)
-        )
-    report = alarm_reports.document_of(alarms)
-    if options.output is not None:
-        output.write(options.output / "alarms.json", to_json(report))
-        output.write(options.output / "delay.png", alarm_reports.delay_curve(report))
-    if options.as_json:
+        figures = measured(config, hours, steps, lambda done, total: bars.update(task, completed=done, total=total))
+    report = alarm_reports.document_of(figures)
+    if output is not None:
+        files.write(output / "alarms.json", to_json(report))
+        files.write(output / "delay.png", alarm_reports.delay_curve(report))
+    if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
         alarm_reports.show(report)

@@ -5,30 +5,20 @@ from __future__ import annotations
 import time
 from math import degrees
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, Annotated, cast
 
-import numpy as np
+import typer
 
-from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
-from coec.adapters.files import output
-from coec.adapters.images.codec import GreyImages, decode_bgr
-from coec.calibration.estimators import Sight, sight_of
-from coec.calibration.ports import DepthModel, Silence
-from coec.calibration.types import Window
-from coec.cli.commands.models_assess import Options
-from coec.config import LimitsConfig, WindowConfig
-from coec.errors import CalibrationError, DecodeError
-from coec.evaluation import depth_quality
-from coec.evaluation.depth_quality import DepthQuality
-from coec.evaluation.experiments import Stages
-from coec.library.choices import Choices, configuration_of
-from coec.reports import console
-from coec.reports.evaluation_documents import number
-from coec.reports.page.words import count
-from coec.schemas.base import to_json
-from coec.schemas.evaluation import DepthFrame, Maybe3, ModelAssessment
-from coec.schemas.replies import Vector3
-from coec.sources import windows
+from coec.cli.options import Frames, Json, Source
+
+if TYPE_CHECKING:
+    from coec.calibration.estimators import Sight
+    from coec.calibration.ports import DepthModel
+    from coec.calibration.types import Window
+    from coec.evaluation.depth_quality import DepthQuality
+    from coec.evaluation.experiments import Stages
+    from coec.schemas.evaluation import Maybe3, ModelAssessment
+    from coec.schemas.replies import Vector3
 
 STAGES = 3
 """Steps that an assessment reports."""
@@ -36,34 +26,54 @@ STAGES = 3
 STYLES = {"good": "bold green", "usable_in_fused": "bold yellow", "do_not_use": "bold red"}
 
 
-def run(options: Options) -> int:
-    """Prints the assessment; returns 1 if the network is of no use on this recording.
+def assess(
+    model: Annotated[
+        str,
+        typer.Argument(help="An ONNX file, a built-in name, or `stereo`.", metavar="MODEL", show_default=False),
+    ],
+    source: Source,
+    frames: Frames = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Write curves.png, joint.png, frame.png and report.json.", metavar="DIR")
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Compare a depth network with the LiDAR of a calibrated recording: exit 1 if it is of no use there."""
+    from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
+    from coec.adapters.files import output as files
+    from coec.adapters.images.codec import GreyImages
+    from coec.calibration.estimators import sight_of
+    from coec.calibration.ports import Silence
+    from coec.config import LimitsConfig, WindowConfig
+    from coec.evaluation import depth_quality
+    from coec.evaluation.experiments import Stages
+    from coec.library.choices import Choices, configuration_of
+    from coec.reports import console
+    from coec.schemas.base import to_json
+    from coec.sources import windows
 
-    Raises:
-        CoecError: no such network or source, or nothing to compare.
-    """
-    if options.output is not None:
-        output.try_folder(options.output)
+    if output is not None:
+        files.try_folder(output)
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
-        loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        loaded = windows.load(source, frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         window = loaded.window
-        configuration = configuration_of(Choices(depth=options.model, objective="mi", dof=3), loaded.configuration)
+        configuration = configuration_of(Choices(depth=model, objective="mi", dof=3), loaded.configuration)
         depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
-        took_ms = _infer(window, depth, stages)
-        sight = sight_of(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
-        quality = depth_quality.assess(sight, configuration, stages.begin("compare", STAGES))
-        if options.output is not None:
-            draw = stages.begin("draw", None)
-            _write_pictures(options.output, options, sight, quality)
-            draw(1, "")
+        inference_ms = _infer(window, depth, stages)
+        data = sight_of(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
+        quality = depth_quality.assess(data, configuration, stages.begin("compare", STAGES))
+        if output is not None:
+            on_drawn = stages.begin("draw", None)
+            _write_pictures(output, model, data, quality)
+            on_drawn(1, "")
         elapsed_s = stages.elapsed_s()
-    timed_ms: list[float | None] = took_ms if options.model != STEREO else [None] * len(took_ms)
-    report = _report(options, window, depth.identity, quality, timed_ms, elapsed_s)
-    if options.output is not None:
-        output.write(options.output / "report.json", to_json(report))
-    if options.as_json:
+    timed_ms: list[float | None] = inference_ms if model != STEREO else [None] * len(inference_ms)
+    report = _report((model, source), window, depth.identity, quality, timed_ms, elapsed_s)
+    if output is not None:
+        files.write(output / "report.json", to_json(report))
+    if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
         _show(report)
@@ -76,53 +86,63 @@ def _infer(window: Window, depth: DepthModel, stages: Stages) -> list[float | No
     Raises:
         CalibrationError: a frame has no depth.
     """
-    heard = stages.begin("depth", len(window.pairs))
-    took_ms: list[float | None] = []
+    from coec.errors import CalibrationError, DecodeError
+
+    on_done = stages.begin("depth", len(window.pairs))
+    times_ms: list[float | None] = []
     for done, pair in enumerate(window.pairs, start=1):
         began_s = time.perf_counter()
         try:
             depth.infer(pair.camera)
         except DecodeError as error:
             raise CalibrationError(f"no depth for the camera frame at {pair.stamp_ns} ns: {error}") from error
-        took_ms.append(1e3 * (time.perf_counter() - began_s))
-        heard(done, "")
-    return took_ms
+        times_ms.append(1e3 * (time.perf_counter() - began_s))
+        on_done(done, "")
+    return times_ms
 
 
-def _write_pictures(folder: Path, options: Options, sight: Sight, quality: DepthQuality) -> None:
-    # matplotlib takes a second to import.
+def _write_pictures(folder: Path, model: str, data: Sight, quality: DepthQuality) -> None:
+    from coec.adapters.files import output as files
+    from coec.adapters.images.codec import decode_bgr
+    from coec.config import LimitsConfig
+    from coec.evaluation import depth_quality
     from coec.reports import depth_plots
 
-    name = f"{Path(options.model).name} on {sight.window.window_id}"
+    name = f"{Path(model).name} on {data.window.window_id}"
     _, sentence = depth_quality.suitability(quality)
-    output.write(folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames"))
-    output.write(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
-    index = len(sight.window.pairs) // 2
-    frame, pairing = sight.window.pairs[index].camera, quality.pairings[index]
+    files.write(folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames"))
+    files.write(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
+    index = len(data.window.pairs) // 2
+    frame, pairing = data.window.pairs[index].camera, quality.pairings[index]
     title = f"{name}, frame at {frame.stamp_ns} ns: rank correlation {pairing.rank_correlation:+.2f}"
-    picture = depth_plots.frame(
-        decode_bgr(frame.image, LimitsConfig()), sight.depth.infer(frame).values, pairing, title
-    )
-    output.write(folder / "frame.png", picture)
+    picture = depth_plots.frame(decode_bgr(frame.image, LimitsConfig()), data.depth.infer(frame).values, pairing, title)
+    files.write(folder / "frame.png", picture)
 
 
 def _report(
-    options: Options,
+    names: tuple[str, str],
     window: Window,
     identity: str,
     quality: DepthQuality,
-    took_ms: list[float | None],
+    times_ms: list[float | None],
     elapsed_s: dict[str, float],
 ) -> ModelAssessment:
-    judged, sentence = depth_quality.suitability(quality)
-    timed = [value for value in took_ms if value is not None]
+    """The report of a network and a source, by their `names`."""
+    import numpy as np
+
+    from coec.evaluation import depth_quality
+    from coec.reports.evaluation_documents import number
+    from coec.schemas.evaluation import DepthFrame, ModelAssessment
+
+    suitability, sentence = depth_quality.suitability(quality)
+    timed = [value for value in times_ms if value is not None]
     return ModelAssessment(
-        model=options.model,
-        source=options.source,
+        model=names[0],
+        source=names[1],
         window_id=window.window_id,
         pairs=len(window.pairs),
         depth_identity=identity,
-        suitability=judged.value,
+        suitability=suitability.value,
         verdict=sentence,
         rank_correlation=number(quality.rank_correlation),
         covered=quality.covered,
@@ -141,15 +161,18 @@ def _report(
                 points=len(pairing.value),
                 covered=pairing.covered,
                 rank_correlation=number(pairing.rank_correlation),
-                inference_ms=took,
+                inference_ms=elapsed_ms,
             )
-            for pair, pairing, took in zip(window.pairs, quality.pairings, took_ms, strict=True)
+            for pair, pairing, elapsed_ms in zip(window.pairs, quality.pairings, times_ms, strict=True)
         ),
         elapsed_s=elapsed_s,
     )
 
 
 def _show(report: ModelAssessment) -> None:
+    from coec.reports import console
+    from coec.reports.page.words import count
+
     console.show(f"{Path(report.model).name} on {report.window_id}: {count(report.pairs, 'pair')}")
     console.show(report.verdict, STYLES[report.suitability])
     figures = console.table("figure", "value", "unit", right=(1,))

@@ -1,11 +1,12 @@
-"""`coec paper`: repeats the published experiments on a recording, with the published figures beside ours."""
+"""The experiments of `coec paper`: those of the paper, repeated on a recording, next to the published figures."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from math import degrees, radians
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.estimators import depth_features, sight_of
 from coec.calibration.ports import Silence
-from coec.cli.commands.paper import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import SourceError
 from coec.evaluation import paper, paper_published, starts, statistics
@@ -38,40 +38,61 @@ DRIVE_PAIRS = 5
 """Pairs of one slice of a short drive; the paper takes 25 of 11,518 frames, and so does `slice_s`."""
 
 
-def run(options: Options) -> int:
+@dataclass(frozen=True, slots=True)
+class PaperRequest:
+    """What is repeated.
+
+    Attributes:
+        depth: network; None: the usual one.
+        runs: solves of each experiment.
+        samples: samples of pairs for the failure metrics.
+        frames: most camera frames; None: the usual number.
+        slice_s: length of the windows of the drive, s; None: slices of `DRIVE_PAIRS` pairs.
+    """
+
+    source: str
+    depth: str | None
+    objective: str
+    runs: int
+    samples: int
+    frames: int | None
+    slice_s: float | None
+
+
+def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
     """Writes metrics.png, bullseye.png, drive.png, report.json and report.html, and prints what is in them.
 
     Raises:
         CoecError: an experiment is not possible.
     """
-    output.try_folder(options.output)
+    output.try_folder(folder)
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
-        loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
-        choices = Choices(depth=options.depth, objective=options.objective)
+        loaded = windows.load(request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        choices = Choices(depth=request.depth, objective=request.objective)
         configuration = configuration_of(choices, loaded.configuration)
         window = loaded.window
         depth = inferred(
             window, open_depth(configuration.depth, LimitsConfig()), stages.begin("depth", len(window.pairs))
         )
         bench = Bench(window, depth, greys_of(window), configuration)
-        failure, metrics = _failure_metrics(bench, options, stages)
-        far, ends = _bullseye(bench, options, stages)
-        along, drive = _drive(bench, options, stages)
+        failure, metrics = _failure_metrics(bench, request, folder, stages)
+        far, ends = _bullseye(bench, request, folder, stages)
+        along, drive = _drive(bench, request, folder, stages)
         document = {
-            "source": options.source,
-            "objective": options.objective,
+            "source": request.source,
+            "objective": request.objective,
             "pairs": len(window.pairs),
             "failure_metrics": failure,
             "bullseye": far,
             "drive": along,
-            "run_times": [asdict(row) for row in run_times(options.source, configuration, stages)],
+            "run_times": [asdict(row) for row in run_times(request.source, configuration, stages)],
             "published": paper_published.document(),
         }
-    written = output.write(options.output / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
-    page.write(options.output / "report.html", paper_page(document, Plots(metrics, ends, drive), provenance.here()))
-    if options.as_json:
+    written = output.write(folder / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
+    page.write(folder / "report.html", paper_page(document, Plots(metrics, ends, drive), provenance.here()))
+    if as_json:
         console.print_json(document)
     else:
         _show(document)
@@ -79,24 +100,24 @@ def run(options: Options) -> int:
     return 0
 
 
-def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> tuple[dict[str, Any], Block]:
-    """Learns limits on every second pair and tries them on the others; returns the figures and a plot."""
-    sight = sight_of(bench.window, bench.depth, bench.images, bench.configuration, Silence())
-    frames = depth_features(sight, bench.reference)
-    heard = stages.begin("metrics", 2 * options.samples)
+def _failure_metrics(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) -> tuple[dict[str, Any], Block]:
+    """Learns limits on every second pair and applies them to the others; returns the figures and a plot."""
+    data = sight_of(bench.window, bench.depth, bench.images, bench.configuration, Silence())
+    frames = depth_features(data, bench.reference)
+    on_done = stages.begin("metrics", 2 * request.samples)
     rig, right = bench.window.rig, bench.reference
     known = paper.failure_figures(
-        frames[::2], rig, right, bench.configuration, options.samples, lambda done, _: heard(done, "")
+        frames[::2], rig, right, bench.configuration, request.samples, lambda done, _: on_done(done, "")
     )
     limits = paper.learned(known)
     tried = paper.failure_figures(
-        frames[1::2] or frames, rig, right, bench.configuration, options.samples,
-        lambda done, _: heard(options.samples + done, ""),
+        frames[1::2] or frames, rig, right, bench.configuration, request.samples,
+        lambda done, _: on_done(request.samples + done, ""),
     )  # fmt: skip
     rows = [
         {
             "moved_deg": moved,
-            "checks": options.samples,
+            "checks": request.samples,
             "flagged": float(np.mean([limits.flags(f) for f in tried if f.moved_deg == moved])),
         }
         for moved in paper.MOVES_DEG
@@ -105,45 +126,45 @@ def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> tuple[di
     title = (
         f"{bench.window.window_id}: equation (2), limits learned on the other half of the pairs; flagged at {shares}"
     )
-    output.write(options.output / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
+    output.write(folder / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
     return {"limits": asdict(limits), "moves": rows}, paper_charts.failure_figures(tried, limits)
 
 
-def _bullseye(bench: Bench, options: Options, stages: Stages) -> tuple[dict[str, Any], Block]:
-    heard = stages.begin(f"{FAR_DEG:g} deg", options.runs)
+def _bullseye(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) -> tuple[dict[str, Any], Block]:
+    on_done = stages.begin(f"{FAR_DEG:g} deg", request.runs)
     far = Bench(bench.window, bench.depth, bench.images, _reaching(bench.configuration, FAR_DEG))
     outcomes = []
-    for start in starts.starts(bench.reference, options.runs, radians(FAR_DEG), 0.0):
+    for start in starts.starts(bench.reference, request.runs, radians(FAR_DEG), 0.0):
         outcomes.append(far.solve(start))
-        heard(len(outcomes), f"{sum(outcome.hit for outcome in outcomes)} hits")
+        on_done(len(outcomes), f"{sum(outcome.hit for outcome in outcomes)} hits")
     of = statistics.summarise(outcomes)
     title = (
-        f"{bench.window.window_id}: {options.objective}, {options.runs} runs from {FAR_DEG:g}°: {of.hits} hits, "
+        f"{bench.window.window_id}: {request.objective}, {request.runs} runs from {FAR_DEG:g}°: {of.hits} hits, "
         f"{100 * of.classified_correctly:.0f} % classified correctly"
     )
-    spheres = {"Rotation vectors of the starts": starts.directions(options.runs)}
-    output.write(options.output / "bullseye.png", plots.bullseye(outcomes, spheres, title))
+    spheres = {"Rotation vectors of the starts": starts.directions(request.runs)}
+    output.write(folder / "bullseye.png", plots.bullseye(outcomes, spheres, title))
     return {"start_deg": FAR_DEG, **_figures(outcomes)}, bullseye({"": outcomes}, spheres)
 
 
-def _drive(bench: Bench, options: Options, stages: Stages) -> tuple[list[dict[str, Any]], Block]:
+def _drive(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) -> tuple[list[dict[str, Any]], Block]:
     """Solves every window of the drive from starts all around, in all about `runs` solves for each radius."""
-    count = _window_count(bench, options)
-    per_window = max(options.runs // count, 1)
-    heard = stages.begin("drive", len(DRIVE_DEG) * count * per_window)
-    found: dict[float, list[tuple[float, Outcome]]] = {radius_deg: [] for radius_deg in DRIVE_DEG}
+    count = _window_count(bench, request)
+    per_window = max(request.runs // count, 1)
+    on_done = stages.begin("drive", len(DRIVE_DEG) * count * per_window)
+    solved: dict[float, list[tuple[float, Outcome]]] = {radius_deg: [] for radius_deg in DRIVE_DEG}
     done = 0
-    for number, (middle_s, of_window, indices) in enumerate(_drive_windows(bench, options)):
+    for number, (middle_s, of_window, indices) in enumerate(_drive_windows(bench, request)):
         for radius_deg in DRIVE_DEG:
             near = replace(of_window, configuration=_reaching(bench.configuration, radius_deg))
             poses = starts.starts(bench.reference, per_window * count, radians(radius_deg), 0.0)
             # Every window gets starts from all over the sphere.
             for start in poses[number::count]:
-                found[radius_deg].append((middle_s, near.solve(start, indices)))
+                solved[radius_deg].append((middle_s, near.solve(start, indices)))
                 done += 1
-                heard(done, "")
+                on_done(done, "")
     if not done:
-        raise SourceError(f"{options.source}: no window of {options.slice_s:g} s has a pair of picture and sweep")
+        raise SourceError(f"{request.source}: no window of {request.slice_s:g} s has a pair of picture and sweep")
     rows = [
         {
             "start_deg": radius_deg,
@@ -157,19 +178,19 @@ def _drive(bench: Bench, options: Options, stages: Stages) -> tuple[list[dict[st
                 for middle_s, outcome in outcomes
             ],
         }
-        for radius_deg, outcomes in found.items()
+        for radius_deg, outcomes in solved.items()
     ]
     windows = f"{count} window{'' if count == 1 else 's'}"
-    title = f"{bench.window.window_id}: {options.objective}, {windows}"
-    named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in found.items()}
-    output.write(options.output / "drive.png", paper_plots.drive(named, title))
+    title = f"{bench.window.window_id}: {request.objective}, {windows}"
+    named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in solved.items()}
+    output.write(folder / "drive.png", paper_plots.drive(named, title))
     return rows, paper_charts.drive(named)
 
 
-def _window_count(bench: Bench, options: Options) -> int:
-    if options.slice_s is None:
+def _window_count(bench: Bench, request: PaperRequest) -> int:
+    if request.slice_s is None:
         return len(paper.slices(len(bench.window.pairs), DRIVE_PAIRS))
-    return windows_of(open_source(options.source).camera_stamps_ns, options.slice_s)
+    return windows_of(open_source(request.source).camera_stamps_ns, request.slice_s)
 
 
 def windows_of(stamps_ns: Sequence[int], slice_s: float) -> int:
@@ -181,19 +202,19 @@ def windows_of(stamps_ns: Sequence[int], slice_s: float) -> int:
     return max(int((lasted_s + 1.5 * interval_s) // slice_s), 1)
 
 
-def _drive_windows(bench: Bench, options: Options) -> Iterator[tuple[float, Bench, list[int]]]:
+def _drive_windows(bench: Bench, request: PaperRequest) -> Iterator[tuple[float, Bench, list[int]]]:
     """Middle (s after the first frame), bench and indices of the pairs of every window; one is loaded at a time."""
     pairs = bench.window.pairs
-    if options.slice_s is None:
+    if request.slice_s is None:
         for indices in paper.slices(len(pairs), min(DRIVE_PAIRS, len(pairs))):
             middle = pairs[indices[len(indices) // 2]]
             yield (middle.stamp_ns - pairs[0].stamp_ns) * 1e-9, bench, indices
         return
     model = open_depth(bench.configuration.depth, LimitsConfig())
-    for number in range(_window_count(bench, options)):
-        begin_s, end_s = number * options.slice_s, (number + 1) * options.slice_s
+    for number in range(_window_count(bench, request)):
+        begin_s, end_s = number * request.slice_s, (number + 1) * request.slice_s
         try:
-            loaded = windows.load(options.source, None, WindowConfig().pairs, lambda *_: None, (begin_s, end_s))
+            loaded = windows.load(request.source, None, WindowConfig().pairs, lambda *_: None, (begin_s, end_s))
         except SourceError:
             # A slice in which no camera frame has a sweep is no window.
             continue

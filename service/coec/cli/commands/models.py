@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from coec.cli.commands import models_add, models_assess, models_show
+from coec.cli.commands import models_add, models_show
 from coec.cli.declaring import taking
 from coec.cli.options import Json
 
@@ -23,4 +23,3 @@ def _models(context: typer.Context, as_json: Json = False) -> None:
 
 app.command("show")(taking(models_show.run))
 app.command("add")(taking(models_add.run))
-app.command("assess")(taking(models_assess.run))

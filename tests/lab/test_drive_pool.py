@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from coec.adapters.system.cores import ONE_THREAD
-from coec_lab.commands.drives_at_once import DrivesError, finished
+from coec_lab.commands.drive_pool import DrivesError, finished
 from lab.made_drives import died, made
 
 PATIENCE_S = 60.0
@@ -48,7 +48,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from lab.made_drives import begun
-from coec_lab.commands.drives_at_once import finished
+from coec_lab.commands.drive_pool import finished
 if __name__ == "__main__":
     list(finished(begun, [Path(sys.argv[1])] * 2, 2))
 """
