@@ -1,15 +1,23 @@
-"""The speed table: each figure of the benchmark beside its required bound."""
+"""The whole benchmark and its table: each figure next to its required bound."""
 
 from __future__ import annotations
 
+import os
+import platform
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numba
+from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
 from coec.reports import console
+from coec.simulation.source import require_extra
+from coec_lab.bench import daemon, kernels, processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +91,45 @@ ROWS: tuple[Row, ...] = (
 """The rows in their order. A figure that is a mapping becomes a row for each of its entries."""
 
 
+def run(*, as_json: bool) -> int:
+    """Measures and prints the table; always returns 0: a figure that misses its requirement is marked, but there is no
+    verdict.
+
+    Raises:
+        SourceError: the library that renders the street of one of the solves is not installed.
+    """
+    require_extra()
+    with console.progress(counted=False) as bars:
+        document = {"machine": _machine()} | kernels.measure(bars, kernels.Size()) | measure_processes(bars)
+    if as_json:
+        console.print_json(document)
+    else:
+        _show(document)
+    return 0
+
+
+def measure_processes(bars: Progress) -> dict[str, Any]:
+    """The figures of whole processes, by their names in `ROWS`: worker and daemon, one after the other.
+
+    Raises:
+        CalibrationError: the worker reached no result.
+        ConnectionFailedError: the daemon did not become ready.
+    """
+    task = bars.add_task("processes", total=None, note="")
+
+    def on_step(text: str) -> None:
+        bars.update(task, description=text)
+
+    with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
+        document = processes.measure_worker(Path(folder), kernels.FRAMES, on_step)
+    document |= processes.measure_recording(on_step)
+    with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
+        document |= daemon.measure_native(Path(folder), on_step) | daemon.measure_ros(Path(folder), on_step)
+    with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
+        document |= daemon.measure_rigs(Path(folder), on_step)
+    return document | {"required": required()}
+
+
 def table(document: Mapping[str, Any]) -> Table:
     """The measured figures beside the required bounds."""
     shown = console.table("work", "figure", "required", "", right=(1, 2))
@@ -111,3 +158,32 @@ def _mark(row: Row, figure: float) -> Text:
     if row.required is None:
         return Text("")
     return Text("✓", "green") if row.met(figure) else Text("✗", "red")
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "threads": numba.get_num_threads(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "numba": numba.__version__,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _show(document: dict[str, Any]) -> None:
+    machine = document["machine"]
+    console.show(
+        f"{machine['processor']}, {machine['threads']} threads, Python {machine['python']}, numba {machine['numba']}"
+    )
+    console.out.print(table(document))
+    received = ", ".join(f"{figure:.1f} {name}" for name, figure in document["io_per_second"].items())
+    console.show(f"the load, a second: {received}")

@@ -24,7 +24,7 @@ from coec.geometry.mutual_information import BinnedFrames
 from coec.geometry.projection import unproject
 
 POINTS, BEAMS = 114_000, 64
-"""Points and beams of a sweep, as of the LiDAR of KITTI and KITTI-360."""
+"""Usual number of points, and beams, of a sweep, as of the LiDAR of KITTI and KITTI-360."""
 
 IMAGE_PX, MAP_PX = 1400, 512
 """Side of the image (KITTI-360's fisheye), and of a depth map as a network returns it."""
@@ -48,8 +48,8 @@ CAMERAS: dict[str, Camera] = {
 
 
 JPEG_QUALITY, PLASTER_PX, PLASTER = 90, 6, 13.0
-"""Quality of a picture, and grain of its walls in pixels and in grey values (standard deviation). With this grain, the
-inspection finds pictures as sharp as of a street, and an image of 1400² has half a megabyte."""
+"""Quality of a picture, and texture of its walls in pixels and in grey values (standard deviation). With this texture,
+the inspection rates pictures as sharp as those of a street, and an image of 1400² has half a megabyte."""
 
 FISHEYES = ("double_sphere", "kannala_brandt", "mei", "eucm")
 """Cameras whose image is a circle that touches the borders; the corners are masked."""
@@ -60,11 +60,14 @@ def camera_of(model: str, side_px: int) -> Camera:
     return scaled(CAMERAS[model], side_px / IMAGE_PX, side_px / IMAGE_PX)
 
 
-def objective_of(camera: Camera, frames: int, start: Matrix4, box: SearchBox) -> MutualInformation:
-    """The objective of a window of so many frames of `POINTS` points, as the service builds it."""
+def objective_of(
+    camera: Camera, frames: int, start: Matrix4, box: SearchBox, points: int = POINTS
+) -> MutualInformation:
+    """The objective of a window of so many frames and points per sweep, as the service builds it."""
     rig = rig_of(camera)
-    seen = [_features(scaled(camera, MAP_PX / IMAGE_PX, MAP_PX / IMAGE_PX), seed) for seed in range(frames)]
-    return build_mutual_information(seen, rig, start, box, ObjectiveConfig())
+    of_map = scaled(camera, MAP_PX / IMAGE_PX, MAP_PX / IMAGE_PX)
+    features = [_features(of_map, seed, points) for seed in range(frames)]
+    return build_mutual_information(features, rig, start, box, ObjectiveConfig())
 
 
 def rig_of(camera: Camera) -> Rig:
@@ -74,9 +77,9 @@ def rig_of(camera: Camera) -> Rig:
     return Rig("bench", camera, "camera", "lidar", T_TRUE, np.eye(4), circle if name_of(camera) in FISHEYES else None)
 
 
-def pair(camera: Camera, seed: int, stamp_ns: int) -> FramePair:
+def pair(camera: Camera, seed: int, stamp_ns: int, points: int = POINTS) -> FramePair:
     """A picture and a sweep of the same room, as sensors would send them; the vehicle's motion is not known."""
-    return FramePair(picture(camera, seed, stamp_ns), sweep(seed, stamp_ns))
+    return FramePair(picture(camera, seed, stamp_ns), sweep(seed, stamp_ns, points))
 
 
 def picture(camera: Camera, seed: int, stamp_ns: int) -> CameraFrame:
@@ -85,21 +88,21 @@ def picture(camera: Camera, seed: int, stamp_ns: int) -> CameraFrame:
     side_px = camera.width
     rays, valid = _pixel_rays(camera)
     grey = np.where(valid, 20.0 + 8.0 * _walls_m(rays, phases), 0.0)
-    grains = -(-side_px // PLASTER_PX)
-    grain = PLASTER * rng.standard_normal((grains, grains), np.float32)
-    grain = grain.repeat(PLASTER_PX, axis=0).repeat(PLASTER_PX, axis=1)[:side_px, :side_px]
-    pixels = np.clip(grey.reshape(side_px, side_px) + grain, 0, 255).astype(np.uint8)
+    cells = -(-side_px // PLASTER_PX)
+    texture = PLASTER * rng.standard_normal((cells, cells), np.float32)
+    texture = texture.repeat(PLASTER_PX, axis=0).repeat(PLASTER_PX, axis=1)[:side_px, :side_px]
+    pixels = np.clip(grey.reshape(side_px, side_px) + texture, 0, 255).astype(np.uint8)
     jpeg = encode_jpeg(np.repeat(pixels[:, :, None], 3, axis=2), JPEG_QUALITY)
     return CameraFrame(stamp_ns, "camera", EncodedImage(ImageFormat.JPEG, side_px, side_px, jpeg), sequence=seed)
 
 
-def sweep(seed: int, stamp_ns: int) -> LidarFrame:
-    """A turn of `POINTS` points with intensity and ring: 2 MB."""
+def sweep(seed: int, stamp_ns: int, points: int = POINTS) -> LidarFrame:
+    """A turn of so many points with intensity and ring; 2 MB with the usual number."""
     rng, phases = _room(seed)
-    rays = _beams()
+    rays = _beams(points)
     range_m = _measured_m(rays, phases, rng)
-    ring = np.repeat(np.arange(BEAMS, dtype=np.uint16), -(-POINTS // BEAMS))[:POINTS]
-    intensity = rng.random(POINTS).astype(np.float32)
+    ring = np.repeat(np.arange(BEAMS, dtype=np.uint16), -(-points // BEAMS))[:points]
+    intensity = rng.random(points).astype(np.float32)
     xyz_m = (rays * range_m[:, None]).astype(np.float32)
     return LidarFrame(stamp_ns, "lidar", xyz_m, intensity, ring, sequence=seed)
 
@@ -129,9 +132,9 @@ def repeated(frames: BinnedFrames, times: int) -> BinnedFrames:
     )
 
 
-def _features(camera: Camera, seed: int) -> Features:
+def _features(camera: Camera, seed: int, points: int) -> Features:
     rng, phases = _room(seed)
-    rays = _beams()
+    rays = _beams(points)
     range_m = _measured_m(rays, phases, rng)
     u, v = np.meshgrid(np.arange(MAP_PX, dtype=np.float64), np.arange(MAP_PX, dtype=np.float64))
     of_pixels, valid = unproject(camera, np.column_stack([u.ravel(), v.ravel()]))
@@ -155,11 +158,11 @@ def _pixel_rays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.bool_]]
     return rays @ T_TRUE[:3, :3], valid
 
 
-def _beams() -> NDArray[np.float64]:
-    """(`POINTS`, 3) unit directions of a turn, LiDAR frame, beam by beam."""
-    steps = -(-POINTS // BEAMS)
-    azimuth = np.tile(np.linspace(-np.pi, np.pi, steps, endpoint=False), BEAMS)[:POINTS]
-    elevation = np.repeat(np.linspace(HIGHEST_RAD, LOWEST_RAD, BEAMS), steps)[:POINTS]
+def _beams(points: int) -> NDArray[np.float64]:
+    """(`points`, 3) unit directions of a turn, LiDAR frame, beam by beam."""
+    steps = -(-points // BEAMS)
+    azimuth = np.tile(np.linspace(-np.pi, np.pi, steps, endpoint=False), BEAMS)[:points]
+    elevation = np.repeat(np.linspace(HIGHEST_RAD, LOWEST_RAD, BEAMS), steps)[:points]
     return np.column_stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )

@@ -90,7 +90,7 @@ def main(endpoint: str, name: str, pace: str = "1") -> int:
         begin_s, begin_ns = time.monotonic(), time.time_ns()
         for count in itertools.count():
             drive_s = count / load.camera_hz
-            if _ended(begin_s + drive_s / float(pace) - time.monotonic()):
+            if _input_closed(begin_s + drive_s / float(pace) - time.monotonic()):
                 return 0
             stamp_ns = begin_ns + round(1e9 * drive_s)
             send(EgoMotion(stamp_ns, "ego", (SPEED_MPS, 0.0, 0.0), (0.0, 0.0, 0.0), count), 0)
@@ -148,7 +148,11 @@ def _ros(session: zenoh.Session, load: Load) -> Send:
     return send
 
 
-def _ended(wait_s: float) -> bool:
+def _input_closed(wait_s: float) -> bool:
     """Whether standard input ends within so many seconds."""
     readable, _, _ = select.select([sys.stdin], [], [], max(wait_s, 0.0))
     return bool(readable) and not sys.stdin.buffer.read(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
