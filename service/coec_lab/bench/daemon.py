@@ -52,6 +52,9 @@ POLL_S, READY_S = 0.1, 300.0
 """Period of polling whether the daemon runs, because it cannot announce that; and the time limit, because a first start
 compiles every kernel, for a minute and a half on two busy cores."""
 
+FIRST_FRAME_S = 60.0
+"""Time limit for the first frame of every sensor, once the daemon runs."""
+
 SENSORS = ("-m", "coec_lab.bench.sensors")
 """Arguments of the Python process that sends frames; those of `sensors.main` follow."""
 
@@ -88,7 +91,7 @@ class Timing:
 
     settle: float = 10.0
     measured: float = 25.0
-    first_frame: float = 60.0
+    first_frame: float = FIRST_FRAME_S
 
 
 RIG_SETTLE_S = 20.0
@@ -178,7 +181,7 @@ def loaded(
     on_step: Callable[[str], None],
     pace: float = 1.0,
     program: tuple[str, ...] = SENSORS,
-    first_frame_s: float = Timing.first_frame,
+    first_frame_s: float = FIRST_FRAME_S,
 ) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
     """A daemon under the load `form` of `sensors.LOADS`, at `pace` seconds of driving in a second, with a session:
     frames of every sensor arrive.

@@ -55,12 +55,12 @@ ROWS: tuple[Row, ...] = (
     Row("mi_ms_by_frames", "frames", "ms", 2),
     Row("mi_per_frame_spread_percent", "time of one frame, farthest of these from their mean", "%", 0, 15.0),
     Row("solve_10deg_3dof_s", "MI solve, 3 axes, from 10°", "s", 3, 0.25),
-    Row("solve_10deg_3dof_error_deg", "MI solve: its end beside the truth", "°", 3, OFF_DEG),
-    Row("solve_25deg_6dof_s", "fused solve, 6 axes, from 25°, depth apart", "s", 2, 0.8),
-    Row("solve_25deg_6dof_error_deg", "fused solve: its end beside the truth", "°", 3, OFF_DEG),
-    Row("look_1400_cpu_ms", "a look at six pairs, 1400 px: processor", "ms", 0, 120.0),
-    Row("look_700_cpu_ms", "a look at six pairs, 700 px: processor", "ms", 0, 60.0),
-    Row("look_off_deg", "these looks: beside the truth, image of px", "°", 3, OFF_DEG),
+    Row("solve_10deg_3dof_error_deg", "MI solve: error of its result", "°", 3, OFF_DEG),
+    Row("solve_25deg_6dof_s", "fused solve, 6 axes, from 25°, without depth", "s", 2, 0.8),
+    Row("solve_25deg_6dof_error_deg", "fused solve: error of its result", "°", 3, OFF_DEG),
+    Row("look_1400_cpu_ms", "a check of six pairs, 1400 px: processor", "ms", 0, 120.0),
+    Row("look_700_cpu_ms", "a check of six pairs, 700 px: processor", "ms", 0, 60.0),
+    Row("look_off_deg", "error of these checks, image of px", "°", 3, OFF_DEG),
     Row("worker_first_result_s", "worker: start to first result", "s", 2, 2.0),
     Row("worker_window_s_mi", "worker: a window of 25 frames, MI, with depth and files", "s", 2),
     Row("worker_window_s_fused", "worker: the same, fused", "s", 2),
@@ -80,13 +80,13 @@ ROWS: tuple[Row, ...] = (
     Row("rig_io_cpu_percent", "of that the I/O process", "%", 1, 20.0),
     Row("rig_resident_mb", "its most resident memory (RSS)", "MB", 0, 490.0),
     Row("rig_worker_s", "of that the worker, a minute", "s", 2),
-    Row("rig_unseen_s", "longest time that a pair was not seen", "s", 1, 15.0),
+    Row("rig_unseen_s", "longest time that a pair was not checked", "s", 1, 15.0),
     Row("large_rig_cpu_percent", "eight fisheyes 700² and three LiDARs, 24 pairs, all processes, of one core", "%", 1),
     Row("large_rig_io_cpu_percent", "of that the I/O process", "%", 1),
     Row("large_rig_resident_mb", "its most resident memory (RSS)", "MB", 0, 730.0),
     Row("large_rig_worker_resident_mb", "that of the worker", "MB", 0),
     Row("large_rig_wanted_cores", "what every check and every window would take, of a core", "", 2),
-    Row("large_rig_unseen_s", "longest time that one of these pairs was not seen", "s", 1),
+    Row("large_rig_unseen_s", "longest time that one of these pairs was not checked", "s", 1),
 )
 """The rows in their order. A figure that is a mapping becomes a row for each of its entries."""
 
@@ -131,7 +131,7 @@ def measure_processes(bars: Progress) -> dict[str, Any]:
 
 
 def table(document: Mapping[str, Any]) -> Table:
-    """The measured figures beside the required bounds."""
+    """The measured figures next to the required bounds."""
     shown = console.table("work", "figure", "required", "", right=(1, 2))
     for row in ROWS:
         value = document.get(row.key)

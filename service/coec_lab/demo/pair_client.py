@@ -1,4 +1,5 @@
-"""What a client of the service sees during the demonstration, compared with the truth that only the vehicle knows."""
+"""A client of the service during the demonstration: what it receives, compared with the truth that only the vehicle
+knows, and the outcome: correct before the displacement, an alarm after it, then corrected."""
 
 from __future__ import annotations
 
@@ -18,18 +19,18 @@ from coec.schemas import replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import Keys
 from coec.sources import windows
-from coec_lab.demo.pace import NS_PER_S, Pace, at_rest
+from coec_lab.demo.pair_drive import NS_PER_S, Pace, at_rest
 
 ALARM: Final = "miscalibrated"
 
-ASK_S = 10.0
-"""Timeout of one answer, on a machine that also draws the street."""
+QUERY_S = 10.0
+"""Timeout of one answer, on a machine that also renders the street."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What the service said at one instant. `drive_s` counts seconds of driving. Errors, in degrees, are those of the
-    served extrinsic, which comes from the window `window_id`, against the truth at that time."""
+    """State that the service reported at one instant. `drive_s` counts seconds of driving. Errors, in degrees, are
+    those of the served extrinsic, which comes from the window `window_id`, against the truth at that time."""
 
     t_s: float
     drive_s: float
@@ -44,7 +45,7 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class Snapshot:
     """All answers of one instant."""
 
     moment: Moment
@@ -64,17 +65,17 @@ class Seen:
 
 
 @dataclass(slots=True)
-class Watch:
-    """Asks the service again and again, and keeps what changed.
+class Observer:
+    """Queries the service again and again, and records what changed.
 
     Attributes:
         truth: true T_camera_lidar (4, 4) at a second of the drive.
         first_ns: sensor time at which the drive begins.
         pace: how far the drive may go on.
-        series: everything seen: (second of the drive, error in degrees, health).
+        series: every snapshot: (second of the drive, error in degrees, health).
         timeline: the moments at which something changed.
         alarms: number of the service's alarms that are in the timeline.
-        latest: what was seen last; None before the first answer.
+        latest: the last snapshot; None before the first answer.
     """
 
     session: zenoh.Session
@@ -88,55 +89,58 @@ class Watch:
     series: list[tuple[float, float, str]] = field(default_factory=list)
     timeline: list[Moment] = field(default_factory=list)
     alarms: int = 0
-    latest: Seen | None = None
+    latest: Snapshot | None = None
 
     def may_pass(self, stamp_ns: int) -> bool:
         """Whether the drive may go on to this sensor time."""
         return self.latest is not None and self.pace.may_pass(stamp_ns)
 
-    def look(self, drive_s: float, sent: int) -> Seen | None:
+    def poll(self, drive_s: float, sent: int) -> Snapshot | None:
         """The state after so many seconds of driving and `sent` pictures, or None while the service is not there
         yet."""
-        if not ask(self.session, self.keys.status, ASK_S):
+        if not ask(self.session, self.keys.status, QUERY_S):
             return None
         try:
-            seen = self._ask_all(drive_s)
+            snapshot = self._query_all(drive_s)
         except (NotFoundError, RemoteError):
             return None
-        self.latest = seen
-        rests = at_rest(seen.status.worker, seen.pair, sent)
-        self.pace.saw(seen.health.evaluated_ns, at_rest=rests, stamp_ns=self.first_ns + round(drive_s * NS_PER_S))
-        self._catch_up(seen)
-        self.series.append((drive_s, seen.moment.error_deg, seen.moment.health))
-        if not self.timeline or _essence(seen.moment) != _essence(self.timeline[-1]):
-            self.timeline.append(seen.moment)
-        return seen
+        self.latest = snapshot
+        rests = at_rest(snapshot.status.worker, snapshot.pair, sent)
+        self.pace.update(
+            snapshot.health.evaluated_ns, at_rest=rests, stamp_ns=self.first_ns + round(drive_s * NS_PER_S)
+        )
+        self._catch_up(snapshot)
+        self.series.append((drive_s, snapshot.moment.error_deg, snapshot.moment.health))
+        if not self.timeline or _essence(snapshot.moment) != _essence(self.timeline[-1]):
+            self.timeline.append(snapshot.moment)
+        return snapshot
 
     def events(self) -> tuple[replies.EvidenceEvent, ...]:
-        """Red events that the service has kept."""
-        return from_json(replies.EvidenceReply, self._ask(self.keys.evidence(self.pair))).events
+        """Incidents that the service has recorded."""
+        return from_json(replies.EvidenceReply, self._query(self.keys.evidence(self.pair))).events
 
-    def _catch_up(self, seen: Seen) -> None:
-        """Adds alarms that came and went between two looks, as on a busy machine; the service keeps them as events."""
-        told = seen.health.alarms
-        raised = 0 if told is None else told.confirmed + told.withdrawn + told.open
+    def _catch_up(self, snapshot: Snapshot) -> None:
+        """Adds alarms that began and ended between two polls, as on a busy machine; the service records them as
+        events."""
+        counts = snapshot.health.alarms
+        raised = 0 if counts is None else counts.confirmed + counts.withdrawn + counts.open
         if raised <= self.alarms:
             return
-        if seen.health.state == ALARM:
+        if snapshot.health.state == ALARM:
             self.alarms = raised
             return
         events = self.events()
         for event in events[self.alarms :]:
             second = (event.stamp_ns - self.first_ns) / NS_PER_S
             self.timeline = with_alarm(self.timeline, second)
-            served = next((error for at, error, _ in reversed(self.series) if at <= second), seen.moment.error_deg)
+            served = next((error for at, error, _ in reversed(self.series) if at <= second), snapshot.moment.error_deg)
             self.series = sorted([*self.series, (second, served, ALARM)], key=lambda point: point[0])
         self.alarms = max(self.alarms, len(events))
 
-    def _ask_all(self, drive_s: float) -> Seen:
-        status = from_json(replies.StatusReply, self._ask(self.keys.status))
-        health = from_json(replies.HealthReply, self._ask(self.keys.health(self.pair)))
-        extrinsic = from_json(replies.ExtrinsicReply, self._ask(self.keys.extrinsic(self.pair)))
+    def _query_all(self, drive_s: float) -> Snapshot:
+        status = from_json(replies.StatusReply, self._query(self.keys.status))
+        health = from_json(replies.HealthReply, self._query(self.keys.health(self.pair)))
+        extrinsic = from_json(replies.ExtrinsicReply, self._query(self.keys.extrinsic(self.pair)))
         served = np.array(extrinsic.camera_from_lidar.matrix)
         truth = self.truth(drive_s)
         moment = Moment(
@@ -151,10 +155,10 @@ class Watch:
             error_by_axis_deg=_degrees(served, truth),
             error_deg=windows.rotation_error_deg(served, truth),
         )
-        return Seen(moment, status, health, extrinsic)
+        return Snapshot(moment, status, health, extrinsic)
 
-    def _ask(self, key: str) -> bytes:
-        return ask_one(self.session, f"{key}?format=json", ASK_S).payload
+    def _query(self, key: str) -> bytes:
+        return ask_one(self.session, f"{key}?format=json", QUERY_S).payload
 
 
 def with_alarm(timeline: Sequence[Moment], drive_s: float) -> list[Moment]:
@@ -170,5 +174,78 @@ def _degrees(T_one: Matrix4, T_other: Matrix4) -> tuple[float, float, float]:
 
 
 def _essence(moment: Moment) -> tuple[object, ...]:
-    """What must change to make a new line of the timeline."""
+    """Fields whose change makes a new line of the timeline."""
     return moment.service, moment.health, moment.provenance, moment.status, moment.error_deg
+
+
+@dataclass(frozen=True, slots=True)
+class PairOutcome:
+    """The outcome of the drive, in seconds of driving; None for what did not happen.
+
+    Attributes:
+        false_alarm_s: the first alarm before the knock while the extrinsic was right.
+        alarm_s: the first alarm after the knock.
+        repaired_s: when, after the alarm, the service had an estimate of its own within the limit and was healthy.
+        error_before_deg: largest error of the served extrinsic after the knock, which is that before the repair.
+        error_after_deg: error at the end.
+    """
+
+    knock_s: float
+    false_alarm_s: float | None
+    alarm_s: float | None
+    repaired_s: float | None
+    error_before_deg: float
+    error_after_deg: float
+    health: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether all of it happened, and the service is healthy at the end."""
+        return not self.failures()
+
+    def failures(self) -> tuple[str, ...]:
+        """What did not happen, one sentence each."""
+        sentences = []
+        if self.false_alarm_s is not None:
+            sentences.append(f"The service raised an alarm at {self.false_alarm_s:.0f} s, before the displacement.")
+        if self.alarm_s is None:
+            sentences.append("The service never detected the displacement.")
+        elif self.repaired_s is None:
+            sentences.append("The service detected the displacement, and did not correct it.")
+        elif self.health != "healthy":
+            sentences.append(f"The service corrected the displacement, and is {self.health} at the end.")
+        return tuple(sentences)
+
+
+def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float) -> PairOutcome:
+    """The outcome of a timeline that is not empty.
+
+    Args:
+        timeline: ascending in time.
+        knock_s: second of the drive at which the mount was knocked.
+        max_error_deg: an estimate counts as a repair only if it is nearer to the truth than this, also at the end.
+    """
+    # An alarm about the workshop's calibration, which is served first and is wrong, is no false alarm.
+    false = (m for m in timeline if m.health == ALARM and m.drive_s < knock_s and m.error_deg < max_error_deg)
+    late = [moment for moment in timeline if moment.drive_s >= knock_s]
+    alarm_s = next((moment.drive_s for moment in late if moment.health == ALARM), None)
+    last = timeline[-1]
+    repaired = (
+        moment.drive_s
+        for moment in late
+        if alarm_s is not None and moment.drive_s >= alarm_s and is_repaired(moment, max_error_deg)
+    )
+    return PairOutcome(
+        knock_s=knock_s,
+        false_alarm_s=next((moment.drive_s for moment in false), None),
+        alarm_s=alarm_s,
+        repaired_s=next(repaired, None) if last.error_deg < max_error_deg else None,
+        error_before_deg=max((moment.error_deg for moment in late), default=last.error_deg),
+        error_after_deg=last.error_deg,
+        health=last.health,
+    )
+
+
+def is_repaired(moment: Moment, max_error_deg: float) -> bool:
+    """Whether the service is healthy and serves an estimate of its own within the limit of the truth."""
+    return moment.health == "healthy" and moment.provenance == "estimated" and moment.error_deg < max_error_deg
