@@ -20,17 +20,15 @@ from coec.calibration.types import EgoMotion
 from coec.config import WindowConfig
 from coec.reports.page import render
 from coec.schemas import replies
-from coec_lab.demo import first_look, report, story
-from coec_lab.demo.outcome import Ending, outcome_of
-from coec_lab.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
-from coec_lab.demo.page import demo_page
-from coec_lab.demo.screen import BARS, Screen, curve, view
-from coec_lab.demo.vehicle import NS_PER_S, paced
-from coec_lab.demo.watch import Moment, Seen, with_alarm
+from coec_lab.demo import pair_drive, pair_report
+from coec_lab.demo.pair import BARS, Screen, curve, view
+from coec_lab.demo.pair_client import Moment, PairOutcome, Snapshot, outcome_of, with_alarm
+from coec_lab.demo.pair_drive import LEAD_NS, NS_PER_S, STEP_NS, Pace, at_rest, paced
+from coec_lab.demo.pair_report import demo_page
 from reports.pages import MADE
 from statuses import a_status
 
-KNOCK_S, MAX_ERROR_DEG = story.KNOCK_S, story.MAX_ERROR_DEG
+KNOCK_S, MAX_ERROR_DEG = pair_drive.KNOCK_S, pair_drive.MAX_ERROR_DEG
 
 START = Moment(
     t_s=3.0, drive_s=0.0, service="running", health="unknown", provenance="nominal", status="not_accepted",
@@ -46,46 +44,49 @@ ALARM = replace(KNOCKED, drive_s=51.0, health="miscalibrated")
 REPAIRED = replace(HEALTHY, drive_s=61.0, window_id="w-2", error_deg=0.06)
 
 
-def outcome(*moments: Moment) -> Ending:
+def outcome(*moments: Moment) -> PairOutcome:
     return outcome_of(moments, KNOCK_S, MAX_ERROR_DEG)
 
 
 def test_a_story_that_came_true() -> None:
-    told = outcome(START, HEALTHY, KNOCKED, SUSPECT, ALARM, REPAIRED)
-    assert told.passed
-    assert (told.alarm_s, told.repaired_s, told.false_alarm_s) == (51.0, 61.0, None)
-    assert (told.error_before_deg, told.error_after_deg) == (3.01, 0.06)
+    result = outcome(START, HEALTHY, KNOCKED, SUSPECT, ALARM, REPAIRED)
+    assert result.passed
+    assert (result.alarm_s, result.repaired_s, result.false_alarm_s) == (51.0, 61.0, None)
+    assert (result.error_before_deg, result.error_after_deg) == (3.01, 0.06)
 
 
 def test_an_alarm_at_the_calibration_of_the_workshop_is_no_false_one() -> None:
-    told = outcome(START, replace(START, drive_s=11.0, health="miscalibrated"), HEALTHY, KNOCKED, ALARM, REPAIRED)
-    assert told.passed
+    result = outcome(START, replace(START, drive_s=11.0, health="miscalibrated"), HEALTHY, KNOCKED, ALARM, REPAIRED)
+    assert result.passed
 
 
 def test_an_alarm_that_came_and_went_between_two_looks_is_in_the_story() -> None:
     seen = [START, HEALTHY, KNOCKED, SUSPECT, REPAIRED]
-    told = outcome(*with_alarm(seen, 50.0))
-    assert told.passed
-    assert (told.alarm_s, told.repaired_s, told.error_before_deg) == (50.0, 61.0, 3.01)
+    result = outcome(*with_alarm(seen, 50.0))
+    assert result.passed
+    assert (result.alarm_s, result.repaired_s, result.error_before_deg) == (50.0, 61.0, 3.01)
 
 
 @pytest.mark.parametrize(
     ("moments", "complaint"),
     [
-        ((START, HEALTHY, KNOCKED), "never noticed"),
-        ((START, HEALTHY, KNOCKED, SUSPECT, REPAIRED), "never noticed"),
-        ((START, HEALTHY, KNOCKED, ALARM), "did not repair"),
-        ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, error_deg=0.31)), "did not repair"),
-        ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, error_deg=0.31)), "did not repair"),
-        ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, provenance="nominal")), "did not repair"),
+        ((START, HEALTHY, KNOCKED), "never detected"),
+        ((START, HEALTHY, KNOCKED, SUSPECT, REPAIRED), "never detected"),
+        ((START, HEALTHY, KNOCKED, ALARM), "did not correct"),
+        ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, error_deg=0.31)), "did not correct"),
+        ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, error_deg=0.31)), "did not correct"),
+        ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, provenance="nominal")), "did not correct"),
         ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, health="degraded")), "degraded at the end"),
-        ((START, HEALTHY, replace(ALARM, drive_s=30.0, error_deg=0.04), KNOCKED, ALARM, REPAIRED), "before the knock"),
+        (
+            (START, HEALTHY, replace(ALARM, drive_s=30.0, error_deg=0.04), KNOCKED, ALARM, REPAIRED),
+            "before the displacement",
+        ),
     ],
 )
 def test_a_story_that_did_not(moments: tuple[Moment, ...], complaint: str) -> None:
-    told = outcome(*moments)
-    assert not told.passed
-    assert complaint in " ".join(told.objections())
+    result = outcome(*moments)
+    assert not result.passed
+    assert complaint in " ".join(result.failures())
 
 
 def frames(count: int) -> Iterator[EgoMotion]:
@@ -115,20 +116,20 @@ def test_the_drive_ends_when_it_is_told() -> None:
 
 def test_a_drive_waits_for_a_service_at_work() -> None:
     pace = Pace(judged_ns=0)
-    pace.saw(None, at_rest=False, stamp_ns=LEAD_NS)
+    pace.update(None, at_rest=False, stamp_ns=LEAD_NS)
     assert pace.may_pass(LEAD_NS)
     assert not pace.may_pass(LEAD_NS + 1)
-    pace.saw(5 * NS_PER_S, at_rest=False, stamp_ns=LEAD_NS)
+    pace.update(5 * NS_PER_S, at_rest=False, stamp_ns=LEAD_NS)
     assert pace.may_pass(LEAD_NS + 5 * NS_PER_S)
     assert not pace.may_pass(LEAD_NS + 5 * NS_PER_S + 1)
 
 
 def test_a_service_that_waits_for_more_gets_a_little_more() -> None:
     pace = Pace(judged_ns=0)
-    pace.saw(None, at_rest=True, stamp_ns=LEAD_NS)
+    pace.update(None, at_rest=True, stamp_ns=LEAD_NS)
     assert pace.may_pass(LEAD_NS + STEP_NS)
     assert not pace.may_pass(LEAD_NS + STEP_NS + 1)
-    pace.saw(None, at_rest=True, stamp_ns=NS_PER_S)
+    pace.update(None, at_rest=True, stamp_ns=NS_PER_S)
     assert pace.may_pass(LEAD_NS + STEP_NS), "never less than before"
 
 
@@ -169,17 +170,17 @@ def test_the_curve_has_the_height_of_the_error_and_the_colour_of_the_health() ->
 
 def test_the_page_needs_no_other_file() -> None:
     moments = [START, HEALTHY, KNOCKED, ALARM, REPAIRED]
-    text = told(moments)
+    text = document_of(moments)
     assert "src=" not in text
-    assert "noticed and repaired" in text
+    assert "detected and corrected" in text
     assert re.findall(r'href="(?!#)', text) == []
     for moment in moments:
         assert f"{moment.error_deg:.3f}°" in text
-    assert "never noticed" in told(moments[:3])
+    assert "never detected" in document_of(moments[:3])
     assert "error of the thing" in text
 
 
-def told(moments: Sequence[Moment]) -> str:
+def document_of(moments: Sequence[Moment]) -> str:
     """The document."""
     series = [(moment.drive_s, moment.error_deg, moment.health) for moment in moments]
     happened = [(moment, "") for moment in moments]
@@ -191,7 +192,7 @@ def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) ->
     stream = io.StringIO()
     monkeypatch.setattr("coec.reports.console.out", Console(file=stream, width=140))
     moments = [START, HEALTHY, KNOCKED, replace(SUSPECT, drive_s=ALARM.drive_s), ALARM, REPAIRED]
-    report.show(moments, outcome(*moments), report.Left((), None))
+    pair_report.show(moments, outcome(*moments), pair_report.WrittenFiles((), None))
     said = stream.getvalue()
     for error in ("0.900°", "0.040°", "3.010°", "0.060°"):
         assert error in said
@@ -199,7 +200,7 @@ def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) ->
     assert "25 s after it" in said
     (alarm,) = (line for line in said.splitlines() if line.rstrip().endswith("alarm"))
     assert "miscalibrated" in alarm, "not the line before, of the same second"
-    for what in ("knocked", "alarm", "repaired", "accepted"):
+    for what in ("displaced", "alarm", "corrected", "accepted"):
         assert what in said
 
 
@@ -207,13 +208,13 @@ def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
     pytest.importorskip("embreex", reason="needs ray casting")
     from coec.simulation.drive import SimulatedDrive
 
-    drive = SimulatedDrive(replace(story.drive_config(), seconds=2.0))
-    config = story.service_config(drive.rig, Path("mask.png"), "tcp/127.0.0.1:1")
+    drive = SimulatedDrive(replace(pair_drive.drive_config(), seconds=2.0))
+    config = pair_drive.service_config(drive.rig, Path("mask.png"), "tcp/127.0.0.1:1")
     (pair,) = config.pairs
     assert pair.calibration.objective.kind == "fused"
     assert pair.calibration == type(pair.calibration)(), "with the network that comes with it"
     assert (pair.policy, pair.tracker) == (type(pair.policy)(), type(pair.tracker)())
-    left, top, width, height = story.CLOSE_UP_PX
+    left, top, width, height = pair_drive.CLOSE_UP_PX
     assert left + width <= drive.rig.camera.width
     assert top + height <= drive.rig.camera.height
 
@@ -222,22 +223,22 @@ def test_there_is_something_to_look_at_before_the_service_says_anything(tmp_path
     pytest.importorskip("embreex", reason="needs ray casting")
     from coec.simulation.drive import SimulatedDrive
 
-    drive = SimulatedDrive(replace(story.drive_config(), seconds=2.0, camera="fisheye160", lidar="16"))
-    picture, page = first_look.write(tmp_path, drive)
+    drive = SimulatedDrive(replace(pair_drive.drive_config(), seconds=2.0, camera="fisheye160", lidar="16"))
+    picture, page = pair_report.write_first(tmp_path, drive)
     seen = cv2.imread(str(picture))
     assert seen is not None
     assert float(seen.std()) > 10.0
-    told = page.read_text()
-    assert "Under way" in told
-    assert "data:image/" in told
-    assert page.name == story.REPORT, "the report takes its place"
+    result = page.read_text()
+    assert "Under way" in result
+    assert "data:image/" in result
+    assert page.name == pair_drive.REPORT, "the report takes its place"
 
 
 def check_files(document: Any) -> Path:
     """What the demonstration left; the window that it fetched."""
     written = [Path(path) for path in document["files"]]
     assert all(path.stat().st_size > 0 for path in written)
-    assert (written[0].parent / f"{first_look.PICTURE}.png").stat().st_size > 0
+    assert (written[0].parent / f"{pair_report.PICTURE}.png").stat().st_size > 0
     assert {"timeline.png", "overlay_before.png", "overlay_after.png", "report.html"} <= {path.name for path in written}
     (window,) = (path for path in written if path.suffix == ".mcap")
     return window
@@ -253,17 +254,17 @@ def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_no
 
     # So long that it cannot be over before the window has been judged: see `pace.LEAD_NS`.
     quiet = DriveConfig(
-        seed=story.SEED, seconds=32.0, camera="fisheye600", lidar="64", camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
-        workshop=story.WORKSHOP,
+        seed=pair_drive.SEED, seconds=32.0, camera="fisheye600", lidar="64", camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
+        workshop=pair_drive.WORKSHOP,
     )  # fmt: skip
-    monkeypatch.setattr(story, "drive_config", lambda: quiet)
-    monkeypatch.setattr(story, "WINDOW", WindowConfig(pairs=12, min_pairs=8, slice_s=12.0))
-    monkeypatch.setattr(story, "CLOSE_UP_PX", tuple(value * 6 // 7 for value in story.CLOSE_UP_PX))
+    monkeypatch.setattr(pair_drive, "drive_config", lambda: quiet)
+    monkeypatch.setattr(pair_drive, "WINDOW", WindowConfig(pairs=12, min_pairs=8, slice_s=12.0))
+    monkeypatch.setattr(pair_drive, "CLOSE_UP_PX", tuple(value * 6 // 7 for value in pair_drive.CLOSE_UP_PX))
     outcome = coec("demo", "--json", "--output", tmp_path / "demo")
     assert outcome.status == 1
     document = outcome.document
     assert not document["passed"]
-    assert document["objections"] == ["The service never noticed the knock."]
+    assert document["objections"] == ["The service never detected the displacement."]
     first, last = document["timeline"][0], document["timeline"][-1]
     assert (first["health"], first["provenance"]) == ("unknown", "nominal")
     assert (last["health"], last["provenance"], last["status"]) == ("healthy", "estimated", "accepted")
@@ -287,14 +288,14 @@ def test_the_knock_is_noticed_and_repaired(coec: Coec, tmp_path: Path) -> None:
     assert coec("replay", check_files(document)).status == 0
 
 
-def seen_with(worker: str, t_s: float) -> Seen:
+def seen_with(worker: str, t_s: float) -> Snapshot:
     """What a client sees while the worker of the service is in this state."""
     status = a_status(
         worker=replies.WorkerStatus.model_validate({"state": worker}), pairs=(replies.PairStatus(name="sim"),)
     )
     health: Any = SimpleNamespace(reasons=(), metrics={})
     extrinsic: Any = SimpleNamespace()
-    return Seen(replace(START, t_s=t_s), status, health, extrinsic)
+    return Snapshot(replace(START, t_s=t_s), status, health, extrinsic)
 
 
 def test_a_first_run_says_that_it_compiles_and_then_tells_the_story(capsys: pytest.CaptureFixture[str]) -> None:

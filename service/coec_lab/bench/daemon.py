@@ -3,7 +3,7 @@ worker solves, and how long a pair stays unchecked.
 
 Processes are real: the daemon (which is also the router), the sensors, and this one, which queries. Loads are one
 camera with one LiDAR as native frames and as topics of ROS, and whole vehicles: four fisheyes with one LiDAR (four
-pairs), and eight cameras with three LiDARs (twenty-four pairs) in the default configuration. """
+pairs), and eight cameras with three LiDARs (twenty-four pairs) in the default configuration."""
 
 from __future__ import annotations
 

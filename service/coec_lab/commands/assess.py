@@ -65,9 +65,9 @@ def assess(
         data = sight_of(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
         quality = depth_quality.assess(data, configuration, stages.begin("compare", STAGES))
         if output is not None:
-            on_drawn = stages.begin("draw", None)
+            on_plotted = stages.begin("draw", None)
             _write_pictures(output, model, data, quality)
-            on_drawn(1, "")
+            on_plotted(1, "")
         elapsed_s = stages.elapsed_s()
     timed_ms: list[float | None] = inference_ms if model != STEREO else [None] * len(inference_ms)
     report = _report((model, source), window, depth.identity, quality, timed_ms, elapsed_s)

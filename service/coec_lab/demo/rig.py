@@ -45,8 +45,8 @@ ABOUT = (
 PICTURED = "From above. The redder a line, the more probable that its pair has moved."
 
 EXPLAINED = (
-    "A share is how probable it is that the sensor has moved. It is identified when that was the result twice in a row, and "
-    "two of its pairs agree if it has several; until then it is undecided."
+    "A share is how probable it is that the sensor has moved. It is identified when that was the result twice in a "
+    "row, and two of its pairs agree if it has several; until then it is undecided."
 )
 
 Performance = tuple[ActOutcome, Sequence[RigSnapshot]]
@@ -162,7 +162,7 @@ def summary(outcome: ActOutcome, scenario: Scenario) -> str:
     displaced = f"{_the(act, scenario)} was turned by {act.knock_deg:.2g}° at {scenario.knock_s:.0f} s of driving"
     if not outcome.passed:
         return f"{displaced}. " + " ".join(outcome.failures())
-    assert outcome.named_s is not None  # else it is an objection
+    assert outcome.named_s is not None  # else it is a failure
     return f"{displaced}, and identified {outcome.named_s - scenario.knock_s:.0f} s later, it alone."
 
 
@@ -232,11 +232,9 @@ def page(pictures: Sequence[Path], acts: Sequence[Performance], made: Made, scen
     ]
     failures = [failure for outcome, _ in acts for failure in outcome.failures()]
     verdict = (
-        Verdict("bad", "Not snapshot.", " ".join(failures))
+        Verdict("bad", "Not identified.", " ".join(failures))
         if failures
-        else Verdict(
-            "good", "RigSnapshot apart.", "Both knocks were noticed, and whoever was knocked was named, nobody else."
-        )
+        else Verdict("good", "Identified.", "Each displaced sensor was detected and identified, and no other.")
     )
     return Page("coec demo --rig", TITLE, (verdict, Text((ABOUT,))), (*sections, made.section()))
 
@@ -255,7 +253,7 @@ def _the(act: Act, scenario: Scenario) -> str:
 
 
 def _order(act: Act, snapshot: RigSnapshot) -> tuple[str, ...]:
-    """Sensors, the knocked one first, so that it is visible on a narrow screen."""
+    """Sensors, the displaced one first, so that it is visible on a narrow screen."""
     return (act.sensor, *(name for name in snapshot.sensors if name != act.sensor))
 
 

@@ -104,7 +104,7 @@ SCENARIO = Scenario()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstantFrames:
-    """InstantFrames of one instant: a sweep, a picture by camera, and the motion around them."""
+    """Frames of one instant: a sweep, a picture by camera, and the motion around them."""
 
     sweep: Message
     pictures: Mapping[str, Message]
@@ -189,7 +189,7 @@ def driving(scenario: Scenario = SCENARIO) -> Iterator[RigVehicle]:
 
 
 @dataclass(frozen=True, slots=True)
-class SensorBelief:
+class SensorCondition:
     """What the service reports about a sensor, see `SensorReply`; `moved_deg` is None if it did not move."""
 
     name: str
@@ -213,7 +213,7 @@ class RigSnapshot:
 
     second: float
     checked: str
-    sensors: Mapping[str, SensorBelief]
+    sensors: Mapping[str, SensorCondition]
     edges: Mapping[str, EdgeSeen]
 
     @property
@@ -287,9 +287,9 @@ def snapshot_of(
     )
 
 
-def _sensor(of: SensorReply) -> SensorBelief:
+def _sensor(of: SensorReply) -> SensorCondition:
     moved_deg = None if of.moved is None else hypot(*of.moved.by[:3])
-    return SensorBelief(of.name, of.kind, of.state, of.probability or 0.0, moved_deg, of.reasons[0].text)
+    return SensorCondition(of.name, of.kind, of.state, of.probability or 0.0, moved_deg, of.reasons[0].text)
 
 
 def _edge(camera: str, lidar: str, check: CheckReply) -> EdgeSeen:
