@@ -78,7 +78,7 @@ def copied_checkout(folder: Path) -> Path:
 
 
 def environment(folder: Path, python: str, checkout: Path, *resolution: str) -> Path:
-    """The interpreter of a new environment with coec, the extras and the tools of the tests.
+    """The interpreter of a new environment with coec, its laboratory, the extras and the tools of the tests.
 
     Args:
         python: the interpreter that it is made with.
@@ -89,7 +89,7 @@ def environment(folder: Path, python: str, checkout: Path, *resolution: str) -> 
     interpreter = folder / "bin" / "python"
     completed(
         uv(), "pip", "install", "--quiet", "--python", interpreter, *resolution,
-        "--editable", f".[{','.join(EXTRAS)}]", "--group", "checks", cwd=checkout,
+        "--editable", f".[{','.join(EXTRAS)}]", "--editable", "./service/coec_lab", "--group", "checks", cwd=checkout,
     )  # fmt: skip
     return interpreter
 
