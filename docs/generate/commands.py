@@ -1,12 +1,15 @@
-"""The page on the command line, from the tree of commands that parses it."""
+"""The pages on the command line, from the tree of commands that parses it, and on the package, from its public
+names."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from inspect import ismodule
 from typing import Any, get_args
 
 import typer
 
+import coec
 from coec.cli import application
 from generate.markdown import WRITTEN, code, prose, table
 
@@ -26,34 +29,43 @@ a terminal.
 {sections}"""
 
 
+PYTHON_HEAD = """\
+# Python
+
+{written}
+{doc}
+
+{entries}"""
+
+
 def commands_page() -> str:
     """Markdown: each command, once, with its arguments and options."""
-    found = list(_commands(typer.main.get_command(application(())), ()))
+    commands = list(_commands(typer.main.get_command(application(())), ()))
     rows = [
         (f"[`{name}`](#{_anchor(name)})", prose(_first_sentence(command.help or "")))
-        for name, command in ((_name(words), command) for words, command in found)
+        for name, command in ((_name(path), command) for path, command in commands)
     ]
-    sections = "\n".join(_section(words, command) for words, command in found)
+    sections = "\n".join(_section(path, command) for path, command in commands)
     return HEAD.format(written=WRITTEN, commands=table(("command", "what it does"), rows), sections=sections)
 
 
-def _commands(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+def _commands(command: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
     """The command itself, unless it is the program or a group without an action of its own, and its subcommands."""
     below = getattr(command, "commands", {})
-    if words and (not below or command.invoke_without_command):
-        yield words, command
+    if path and (not below or command.invoke_without_command):
+        yield path, command
     for name, child in below.items():
-        yield from _commands(child, (*words, name))
+        yield from _commands(child, (*path, name))
 
 
-def _section(words: tuple[str, ...], command: Any) -> str:
+def _section(path: tuple[str, ...], command: Any) -> str:
     arguments = [one for one in command.params if not one.opts[0].startswith("-")]
     options = [one for one in command.params if one.opts[0].startswith("-")]
-    usage = " ".join((_name(words), *map(_argument, arguments), *(["[OPTIONS]"] if options else [])))
+    usage = " ".join((_name(path), *map(_argument, arguments), *(["[OPTIONS]"] if options else [])))
     items = "".join(_item(_argument(one).strip("[]"), one) for one in arguments) + "".join(
         _item(_option(one), one) for one in options
     )
-    return f"## {_name(words)}\n\n{_help(command.help or '')}\n\n```text\n{usage}\n```\n\n{items}"
+    return f"## {_name(path)}\n\n{_help(command.help or '')}\n\n```text\n{usage}\n```\n\n{items}"
 
 
 def _help(text: str) -> str:
@@ -69,21 +81,21 @@ def _help(text: str) -> str:
 
 
 def _item(term: str, parameter: Any) -> str:
-    remarks = [prose(parameter.help)]
+    sentences = [prose(parameter.help)]
     choices = get_args(parameter.type_descriptor.annotation)
     if choices and all(isinstance(choice, str) for choice in choices):
-        remarks.append(f"One of {', '.join(map(code, choices))}.")
+        sentences.append(f"One of {', '.join(map(code, choices))}.")
     default = _default(parameter)
     if default is not None:
-        told_in_words = isinstance(default, str) and " " in default
-        remarks.append(f"Default: {prose(str(default)) if told_in_words else code(default)}.")
+        is_sentence = isinstance(default, str) and " " in default
+        sentences.append(f"Default: {prose(str(default)) if is_sentence else code(default)}.")
     elif parameter.required and term.startswith("-"):
-        remarks.append("Required.")
-    return f"`{term}`\n:   {' '.join(remarks)}\n\n"
+        sentences.append("Required.")
+    return f"`{term}`\n:   {' '.join(sentences)}\n\n"
 
 
 def _default(parameter: Any) -> object | None:
-    """The default of a parameter, if it is a value that tells the reader something."""
+    """The default of a parameter, if it is a value that informs the reader."""
     if isinstance(parameter.show_default, str):
         return parameter.show_default
     value = parameter.default
@@ -111,8 +123,8 @@ def _kind(annotation: Any) -> str:
     )
 
 
-def _name(words: tuple[str, ...]) -> str:
-    return " ".join(("coec", *words))
+def _name(path: tuple[str, ...]) -> str:
+    return " ".join(("coec", *path))
 
 
 def _anchor(name: str) -> str:
@@ -121,3 +133,23 @@ def _anchor(name: str) -> str:
 
 def _first_sentence(text: str) -> str:
     return " ".join(text.split()).partition(". ")[0].rstrip(".")
+
+
+def python_page() -> str:
+    """Markdown: the docstring of the package, and an entry for each name in `coec.__all__`."""
+    public = sorted(getattr(coec, "__all__", ("__version__",)), key=str.lower)
+    return PYTHON_HEAD.format(written=WRITTEN, doc=(coec.__doc__ or "").strip(), entries="\n".join(map(_entry, public)))
+
+
+def _entry(name: str) -> str:
+    """The entry of a name. Data have no docstring at run time, so their value is shown."""
+    value = getattr(coec, name)
+    heading = f'<a id="coec.{name}"></a>\n\n## `coec.{name}`\n\n'
+    home = getattr(value, "__module__", None)
+    if ismodule(value):
+        source = value.__name__
+    elif home is not None:
+        source = f"{home}.{value.__qualname__}"
+    else:
+        return f"{heading}`{value!r}`\n"
+    return f"{heading}::: {source}\n    options:\n      show_root_heading: false\n      heading_level: 3\n"

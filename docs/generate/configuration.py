@@ -76,7 +76,7 @@ def _parts(
     What is described elsewhere is left out: all of `awaited`, because its entries are those of `pairs`, and the keys
     that a rig's sensors share with those of a pair.
     """
-    known: set[str] = set().union(*(base.model_fields for base in _SAID if of_rig and issubclass(model, base)))
+    known: set[str] = set().union(*(base.model_fields for base in _SHARED if of_rig and issubclass(model, base)))
     changed = {name for name in known if model.model_fields[name].annotation is not _annotation(model, name)}
     own = [(name, field) for name, field in model.model_fields.items() if name not in known or name in changed]
     if place == "" and of_rig:
@@ -89,12 +89,12 @@ def _parts(
         yield from _parts(child, f"{place}{name}{'[]' if many else ''}.", of_rig=of_rig)
 
 
-_SAID = (OpenCameraConfig, OpenLidarConfig, OpenEgoConfig, RigStages)
+_SHARED = (OpenCameraConfig, OpenLidarConfig, OpenEgoConfig, RigStages)
 
 
 def _annotation(model: type[BaseModel], name: str) -> Any:
     """The annotation of a field in the model from which this model inherits it."""
-    base = next(base for base in _SAID if issubclass(model, base))
+    base = next(base for base in _SHARED if issubclass(model, base))
     return base.model_fields[name].annotation
 
 

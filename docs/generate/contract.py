@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import coec
+import coec_lab
 from coec.runtime.api import payloads
 from coec.schemas import commands, last_word, replies, rig_state
 from coec.schemas import keys as grammar
@@ -119,8 +120,8 @@ def keys_page() -> str:
         if isinstance(member, property):
             key, says = getattr(built, name), member.__doc__
         else:
-            asked = [INSTEAD[one] for one in list(inspect.signature(member).parameters)[1:]]
-            key, says = getattr(built, name)(*asked), member.__doc__
+            arguments = [INSTEAD[one] for one in list(inspect.signature(member).parameters)[1:]]
+            key, says = getattr(built, name)(*arguments), member.__doc__
         rows.append((code(key.replace("<prefix>/@v1/<vehicle>/", "…/")), prose(says or ""), resource.answer))
     parsers = [(one, of.parser) for one, of in RESOURCES.items() if of.parser is not None]
     parameters = [
@@ -206,10 +207,11 @@ def _grammar(parser: Callable[..., Any]) -> str:
 
 
 def _errors() -> Mapping[str, list[str]]:
-    """When each error code is replied, from every class of the package that has one. Read from the source, because what
-    is imported depends on the caller."""
-    found: dict[str, list[str]] = {}
-    for path in sorted(Path(coec.__file__).parent.rglob("*.py")):
+    """When each error code is replied, from every class of the packages that has one. Read from the source, because
+    what is imported depends on the caller."""
+    codes_of: dict[str, list[str]] = {}
+    packages = (Path(package) for package in (*coec.__path__, *coec_lab.__path__))
+    for path in sorted(path for package in packages for path in package.rglob("*.py")):
         source = path.read_text(encoding="utf-8")
         if "reply_code = " not in source:
             continue
@@ -219,8 +221,8 @@ def _errors() -> Mapping[str, list[str]]:
                     one.value.value for one in node.body if _names_code(one) and isinstance(one.value, ast.Constant)
                 ]
                 for name in codes:
-                    found.setdefault(str(name), []).append(_first(ast.get_docstring(node) or ""))
-    return found
+                    codes_of.setdefault(str(name), []).append(_first(ast.get_docstring(node) or ""))
+    return codes_of
 
 
 def _names_code(statement: ast.stmt) -> TypeGuard[ast.Assign]:

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 import coec
-import generate as pages
 from coec.errors import CoecError
 from coec.exit_codes import MEANINGS, ExitCode
 from coec.runtime.api.troubles import TROUBLES
 from coec.runtime.edges.plan import NOT_INSTALLED
 from conftest import REPOSITORY
+from generate.__main__ import PAGES
 
 PACKAGE = Path(coec.__file__).parent
 
@@ -34,10 +34,10 @@ COMPOSED = {
 """Codes that are put together, or handed on, in `runtime/decisions`; `service_stuck` stands with the wire models."""
 
 
-@pytest.mark.parametrize("name", list(pages.PAGES))
+@pytest.mark.parametrize("name", list(PAGES))
 def test_the_page_is_the_one_that_the_code_would_write(name: str) -> None:
     written = (REPOSITORY / "docs" / name).read_text(encoding="utf-8")
-    assert written == pages.PAGES[name](), "python -m generate docs"
+    assert written == PAGES[name](), "PYTHONPATH=docs:service python -m generate docs"
 
 
 def all_errors(base: type[CoecError]) -> Iterator[type[CoecError]]:
