@@ -1,4 +1,4 @@
-"""Metadata of the laboratory's wheel that depend on the version: it needs exactly the coec that it is built beside."""
+"""Metadata of the laboratory's wheel that depend on the version: it needs exactly the coec of the same checkout."""
 
 from __future__ import annotations
 

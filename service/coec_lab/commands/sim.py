@@ -66,7 +66,7 @@ def drive(
     force: Force = False,
     as_json: Json = False,
 ) -> int:
-    """Write a drive as a ROS 2 bag; the truth is on /ground_truth/tf, beside the sensors.
+    """Write a drive as a ROS 2 bag; the truth is on /ground_truth/tf, next to the sensors.
 
     A bag has no place for a mask: its readers detect the vehicle's own body and the rim of the lens from the frames, if
     at least five are in motion.

@@ -186,7 +186,7 @@ class PairOutcome:
         false_alarm_s: the first alarm before the knock while the extrinsic was right.
         alarm_s: the first alarm after the knock.
         repaired_s: when, after the alarm, the service had an estimate of its own within the limit and was healthy.
-        error_before_deg: largest error of the served extrinsic after the knock, which is that before the repair.
+        error_before_deg: largest error of the served extrinsic after the displacement, that before the correction.
         error_after_deg: error at the end.
     """
 
@@ -222,8 +222,8 @@ def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float)
 
     Args:
         timeline: ascending in time.
-        knock_s: second of the drive at which the mount was knocked.
-        max_error_deg: an estimate counts as a repair only if it is nearer to the truth than this, also at the end.
+        knock_s: second of the drive at which the mount was displaced.
+        max_error_deg: an estimate counts as a correction only if it is nearer to the truth than this, also at the end.
     """
     # An alarm about the workshop's calibration, which is served first and is wrong, is no false alarm.
     false = (m for m in timeline if m.health == ALARM and m.drive_s < knock_s and m.error_deg < max_error_deg)

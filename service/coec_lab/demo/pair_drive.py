@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 SEED = 1
 LONGEST_S = 240.0
-"""Longest drive; it ends as soon as the repair is complete."""
+"""Longest drive; it ends as soon as the mount is corrected."""
 
 WORKSHOP = (0.6, -0.5, 0.4, 0.0, 0.0, 0.0)
 """Error of the workshop's calibration: degrees in pitch, yaw, roll, and metres."""
@@ -52,7 +52,7 @@ REPORT = "report.html"
 """File of the page, which exists from the first picture on."""
 
 REST_S = 12.0
-"""Driving after the repair: two more checks of the monitor."""
+"""Driving after the correction: two more checks of the monitor."""
 
 CLOSE_UP_PX = (170, 285, 400, 170)
 """Left, top, width and height of the part of the picture that shows cars and kerbs."""
@@ -65,7 +65,7 @@ MONITOR = MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0)
 """Shorter than on a vehicle, where a window takes three minutes, which is too long to watch."""
 
 MAX_ERROR_DEG = 0.25
-"""How near the repair must be to the truth (geodesic angle)."""
+"""Largest error of a correction (geodesic angle)."""
 
 RATE = 4.0
 """Most seconds of driving in a second; each half second, two pictures with their sweeps must be rendered."""
@@ -184,7 +184,7 @@ class PairVehicle:
     """
 
     def __init__(self, session: zenoh.Session, drive: SimulatedDrive, may_pass: Callable[[int], bool]) -> None:
-        """`may_pass` says whether the drive may go on to a sensor time."""
+        """`may_pass`: whether the drive may go on to a sensor time."""
         self._drive = drive
         self._may_pass = may_pass
         self._player = Player(session, Streams.default(drive.rig.pair), "msgpack")
@@ -210,7 +210,7 @@ class PairVehicle:
         return self.played.frames[CAMERA]
 
     def start(self, wait_s: float) -> list[str]:
-        """Starts the drive once the service listens; returns the keys to which nobody listens after `wait_s`."""
+        """Starts the drive once the service subscribes; returns the keys without a subscriber after `wait_s`."""
         without_listener = self._player.wait_for_listener(wait_s)
         if not without_listener:
             self._thread.start()

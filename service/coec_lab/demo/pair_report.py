@@ -56,7 +56,7 @@ PICTURE = "first_picture"
 """Stem of the picture's file."""
 
 FIRST_ABOUT = (
-    "A simulated vehicle drives, and the service of a real one listens to its camera and its LiDAR. Its mount will be "
+    "A simulated vehicle drives, and the service of a real one receives its camera and its LiDAR. Its mount will be "
     f"displaced by {pair_drive.KNOCK_DEG:g}° after {pair_drive.KNOCK_S:g} s. When the demonstration "
     "ends, this page shows its result: load it again then."
 )
@@ -73,7 +73,7 @@ Sample = tuple[float, float, str]
 
 @dataclass(frozen=True, slots=True)
 class WrittenFiles:
-    """Files that were written, and the result of the window that repaired the mount (None: there is none)."""
+    """Files that were written, and the result of the window that corrected the mount (None: there is none)."""
 
     files: tuple[Path, ...]
     result: replies.CalibrationResult | None
@@ -202,7 +202,7 @@ def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matri
 
 
 def _marks(outcome: PairOutcome) -> list[tuple[float, str]]:
-    named = ((outcome.knock_s, "knock"), (outcome.alarm_s, "alarm"), (outcome.repaired_s, "repair"))
+    named = ((outcome.knock_s, "displacement"), (outcome.alarm_s, "alarm"), (outcome.repaired_s, "correction"))
     return [(second, what) for second, what in named if second is not None]
 
 
@@ -238,11 +238,11 @@ def _summary(outcome: PairOutcome, moments: Sequence[Moment]) -> list[tuple[str,
     return [
         ("error of the workshop's calibration", f"{moments[0].error_deg:.3f}°"),
         ("error after the first window", f"{early[0].error_deg:.3f}°" if early else "no window was accepted"),
-        ("knock", f"{pair_drive.KNOCK_DEG:g}° in pitch at {outcome.knock_s:.0f} s of driving"),
+        ("displacement", f"{pair_drive.KNOCK_DEG:g}° in pitch at {outcome.knock_s:.0f} s of driving"),
         ("alarm", after_knock(outcome.alarm_s)),
-        ("repair", after_knock(outcome.repaired_s)),
-        ("error after the knock", f"{outcome.error_before_deg:.3f}°"),
-        ("error after the repair", f"{outcome.error_after_deg:.3f}°"),
+        ("correction", after_knock(outcome.repaired_s)),
+        ("error after the displacement", f"{outcome.error_before_deg:.3f}°"),
+        ("error after the correction", f"{outcome.error_after_deg:.3f}°"),
         ("in pitch, yaw, roll", axes),
     ]
 
@@ -264,9 +264,9 @@ def demo_page(
         series: everything that was seen, in order of time.
         happened: the moments at which something changed, each with a note that may be empty.
         summary: names and values.
-        result: of the window that repaired the mount; None: there is none.
-        compared: points on the image before and after the repair; None: they were not drawn.
-        window: the recorded window that repaired the mount; None: there is none.
+        result: of the window that corrected the mount; None: there is none.
+        compared: points on the image before and after the correction; None: they were not rendered.
+        window: the recorded window that corrected the mount; None: there is none.
     """
     sections = [Section("Error and health over the drive", (Charts((_curve(series, outcome),)),))]
     if compared is not None:
@@ -290,7 +290,7 @@ def _curve(series: Sequence[Sample], outcome: PairOutcome) -> Chart:
     for state, of_state in groupby(spans_of, key=lambda each: each[2]):
         spans = list(of_state)
         grounds.append(Ground(spans[0][0], spans[-1][1], TONES.get(state, "none"), state))
-    marks = ((outcome.knock_s, "knock"), (outcome.alarm_s, "alarm"), (outcome.repaired_s, "repair"))
+    marks = ((outcome.knock_s, "displacement"), (outcome.alarm_s, "alarm"), (outcome.repaired_s, "correction"))
     worst_deg = max(error_deg for _, error_deg, _ in series)
     return Chart(
         title="Error of the extrinsic that is served, which the service cannot know",

@@ -137,7 +137,7 @@ class RigService:
     """A running service, as a client sees it.
 
     Attributes:
-        sensors: keys on which it listens.
+        sensors: keys to which it subscribes.
         sensors_of: camera and LiDAR of each pair.
     """
 
