@@ -53,7 +53,7 @@ BROKEN = (
     "def broken(*_):\n"
     "    raise RuntimeError('broken')\n"
     "Pairer.push = broken\n"
-    "from coec.cli import main\n"
+    "from coec.cli.main import main\n"
     "sys.exit(main())",
 )
 """`coec` with a fault of the program in it: the first frame ends the thread that takes it."""
@@ -67,7 +67,7 @@ STUBBORN = (
     "def broken(*_):\n"
     "    raise RuntimeError('broken')\n"
     "Bus.undeclare_inputs = Bus.undeclare_queryables = Pair.finish_window = broken\n"
-    "from coec.cli import main\n"
+    "from coec.cli.main import main\n"
     "sys.exit(main())",
 )
 """`coec` whose end has three steps that raise."""

@@ -22,7 +22,7 @@ from certificates import TestAuthority
 from coec import daemon
 from coec.cli import check_config
 from coec.cli.check_config import example, template
-from coec.cli.stopping import ended_by_sigterm
+from coec.cli.signals import success_on_sigterm
 from coec.config import Config, StateConfig, ZenohConfig
 from coec.daemon.service import exit_code_of
 from coec.daemon.state_folder import locked
@@ -363,7 +363,7 @@ def test_a_signal_during_the_start_is_a_stop(tmp_path: Path) -> None:
 
 def test_a_signal_before_the_service_handles_it_is_a_stop() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(SystemExit) as ending, ended_by_sigterm():
+    with pytest.raises(SystemExit) as ending, success_on_sigterm():
         signal.raise_signal(signal.SIGTERM)
     assert ending.value.code == ExitCode.SUCCESS
     assert signal.getsignal(signal.SIGTERM) is before
@@ -371,4 +371,4 @@ def test_a_signal_before_the_service_handles_it_is_a_stop() -> None:
 
 def test_check_config_of_the_template_of_these_tests_succeeds(tmp_path: Path) -> None:
     """Without a fault, none is found."""
-    assert check_config.run(written(tmp_path), defaults=False, as_json=True) == ExitCode.SUCCESS
+    assert check_config.check_config(written(tmp_path), defaults=False, as_json=True) == ExitCode.SUCCESS

@@ -10,7 +10,7 @@ from typing import Any, get_args
 import typer
 
 import coec
-from coec.cli import application
+from coec.cli.main import application
 from generate.markdown import WRITTEN, code, prose, table
 
 HEAD = """\

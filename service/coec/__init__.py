@@ -52,6 +52,7 @@ __version__ = "0.1.0"
 __all__ = [
     "CalibrationConfig",
     "CalibrationError",
+    "CalibrationOptions",
     "CoecError",
     "ConfigError",
     "ConnectionFailedError",
@@ -66,6 +67,7 @@ __all__ = [
     "RecordingError",
     "RemoteError",
     "Result",
+    "SolverOptions",
     "SourceError",
     "StateError",
     "UnavailableError",
@@ -92,24 +94,28 @@ os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")
 
 _LATER = {
     "CalibrationConfig": "coec.config",
-    "Description": "coec.library.recordings",
-    "Recording": "coec.library.recordings",
-    "Result": "coec.library.results",
-    "Window": "coec.library.windows",
-    "calibrate": "coec.library.calls",
-    "evaluate": "coec.library.calls",
-    "open": "coec.library.recordings",
+    "CalibrationOptions": "coec.calibration_options",
+    "Description": "coec.recording",
+    "Recording": "coec.recording",
+    "Result": "coec.recording",
+    "SolverOptions": "coec.calibration_options",
+    "Window": "coec.recording",
+    "calibrate": "coec.api",
+    "open": "coec.api",
 }
 """Public names that are imported when they are first used, and the module of each."""
+
+_ADDED = ("evaluate",)
+"""Public names that another package adds, by the entry points of group `coec.api`."""
 
 TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than everything here
 if TYPE_CHECKING:
     from coec import client
+    from coec.api import calibrate, open
+    from coec.calibration_options import CalibrationOptions, SolverOptions
     from coec.config import CalibrationConfig
-    from coec.library.calls import calibrate, evaluate
-    from coec.library.recordings import Description, Recording, open
-    from coec.library.results import Result
-    from coec.library.windows import Window
+    from coec.library.evaluating import evaluate  # until it is an entry point of another package
+    from coec.recording import Description, Recording, Result, Window
 else:  # hidden from type checkers: with this function in sight they would accept every misspelt name
 
     def __getattr__(name: str) -> object:
@@ -118,11 +124,14 @@ else:  # hidden from type checkers: with this function in sight they would accep
 
         if name == "client":
             return import_module("coec.client")
-        if name not in _LATER:
+        if name in _LATER:
+            value: object = getattr(import_module(_LATER[name]), name)
+        elif name in _ADDED:
+            value = import_module("coec.api").added(name)
+        else:
             raise AttributeError(f"module 'coec' has no attribute {name!r}")
-        found: object = getattr(import_module(_LATER[name]), name)
-        globals()[name] = found
-        return found
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

@@ -2,7 +2,7 @@
 
 import sys
 
-from coec.cli import main
+from coec.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -33,6 +33,6 @@ if __name__ == "__main__":
     step(Path(offset))
     sys.argv = ["coec", *arguments]
 
-    from coec.cli import main
+    from coec.cli.main import main
 
     sys.exit(main())

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from coec.cli import main
+from coec.cli.main import main
 from coec.evaluation import check_run, matrix_run  # noqa: F401  they render themselves, whichever test loads them first
 from coec_lab.commands import drive_bags  # noqa: F401  so does this
 from drives import drawn

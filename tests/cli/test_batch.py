@@ -36,7 +36,7 @@ def test_a_batch_makes_tables_compares_with_the_vehicles_and_goes_on(
 
     second = coec("batch", recorded, bad, "--output", folder, "--jobs", 1, "--resume")
     assert second.status == 0
-    assert "judged before" in second.out
+    assert "evaluated before" in second.out
     rows = duckdb.sql(f"SELECT url FROM read_parquet('{folder}/**/*.parquet')").fetchall()
     assert sorted(Path(url).name for (url,) in rows) == ["bad.mcap", "one-1.mcap", "two-1.mcap"]
 

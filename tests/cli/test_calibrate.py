@@ -166,8 +166,8 @@ def test_without_a_network_the_one_that_comes_with_coec_is_used(coec: Coec) -> N
     ("arguments", "module"),
     [
         (("evaluate", SMALL, "--rotation-deg", 1), "library.evaluating"),
-        (("commission", SMALL), "cli.commission"),
-        (("diagnose", SMALL), "cli.commission"),
+        (("commission", SMALL), "adapters.depth.maps"),
+        (("diagnose", SMALL), "adapters.depth.maps"),
         (("paper", SMALL), "cli.paper"),
     ],
 )

@@ -29,9 +29,9 @@ from coec.adapters.zenoh.endpoints import Endpoint
 from coec.adapters.zenoh.ros_topics import Topics
 from coec.adapters.zenoh.tls import CertificateError, Material, host_and_port, material_of, read_certificate
 from coec.calibration.types import LidarFrame
-from coec.cli.doctor import examine, machine, router
-from coec.cli.doctor.listening import Heard
-from coec.cli.doctor.streams import stream_findings
+from coec.cli import doctor_computer, doctor_connection
+from coec.cli.doctor import examine
+from coec.cli.doctor_streams import StreamSamples, stream_findings
 from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, ZenohConfig, load_config
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.doctor import Finding
@@ -186,7 +186,7 @@ def test_a_rate_is_judged_by_what_a_check_wants(tmp_path: Path, rate_hz: float, 
     """By default six pairs in five seconds are wanted, and four are needed."""
     config = load_config(written(tmp_path, ZenohConfig(), "front"))
     (pair,) = config.pairs
-    camera, silent = Heard(pair.camera.place), Heard(pair.lidar.place)
+    camera, silent = StreamSamples(pair.camera.place), StreamSamples(pair.lidar.place)
     for number in range(count):
         camera.arrivals_s.append(number / rate_hz)
         camera.sizes.append(1000)
@@ -255,7 +255,7 @@ def test_no_router_is_told_and_fails(coec: Coec, tmp_path: Path) -> None:
     assert report["healthy"] is False
     (found,) = [one for one in report["findings"] if one["check"] == "router"]
     assert (found["level"], found["where"]) == ("fail", endpoint)
-    assert "nobody listens at this port" in found["text"]
+    assert "nothing listens at this port" in found["text"]
     assert "session" not in [one["check"] for one in report["findings"]], "there is nobody to talk to"
 
 
@@ -263,13 +263,13 @@ def test_no_router_is_told_and_fails(coec: Coec, tmp_path: Path) -> None:
 def test_a_port_at_which_something_else_answers_is_told_from_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(router, "CONNECT_S", 1.0)
+    monkeypatch.setattr(doctor_connection, "CONNECT_S", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as other:
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
         found = list(examine(written(tmp_path, ZenohConfig(connect=(endpoint,)), "front"), 0.5))
     assert of(found, "router", endpoint)[0] == "ok"
     level, text = of(found, "session", endpoint)
-    assert (level, text) == ("fail", "no Zenoh session comes about")
+    assert (level, text) == ("fail", "no Zenoh session can be opened")
 
 
 def test_a_broken_configuration_is_a_finding(coec: Coec, tmp_path: Path) -> None:
@@ -349,22 +349,22 @@ def found_with(authority: Path, port: int, name: str, folder: Path, vehicle: str
     session = {"connect": {"endpoints": [f"tls/127.0.0.1:{port}"]}, "transport": {"link": {"tls": tls}}}
     file.write_text(json.dumps(session))
     config = configuration(folder).model_copy(update={"zenoh": ZenohConfig(file=file), "vehicle": vehicle})
-    found = [*router.certificate_findings(config), *router.router_findings(config)]
-    with_session = router.session_beside(config)
-    found.append(router.session_finding(config, with_session))
+    found = [*doctor_connection.certificate_findings(config), *doctor_connection.router_findings(config)]
+    with_session = doctor_connection.session_of_client(config)
+    found.append(doctor_connection.session_finding(config, with_session))
     if with_session is not None:
-        as_of_service = router.session_as_of_service(config)
+        as_of_service = doctor_connection.session_as_of_service(config)
         assert as_of_service is not None
         with with_session, as_of_service:
-            found.append(router.rules_finding(config, as_of_service, with_session))
+            found.append(doctor_connection.rules_finding(config, as_of_service, with_session))
     return {one.check: one for one in found}
 
 
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """What does not come about is given up soon."""
-    monkeypatch.setattr(router, "CONNECT_S", 1.0)
-    monkeypatch.setattr(router, "SEEN_S", 0.3)
+    monkeypatch.setattr(doctor_connection, "CONNECT_S", 1.0)
+    monkeypatch.setattr(doctor_connection, "SEEN_S", 0.3)
 
 
 @pytest.mark.usefixtures("soon")
@@ -445,7 +445,7 @@ def test_an_endpoint_has_files_of_its_own(authority: Path) -> None:
 
 
 def levels(config: Config) -> dict[str, str]:
-    return {one.check: one.level for one in machine.state_findings(config.state)}
+    return {one.check: one.level for one in doctor_computer.state_findings(config.state)}
 
 
 @pytest.mark.fault("a full disk before the start", "the doctor says so, and leaves nothing behind on it")
@@ -460,7 +460,7 @@ def test_a_full_disk_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "pwrite", full)
-    (writing,) = (one for one in machine.state_findings(config.state) if one.check == "writing")
+    (writing,) = (one for one in doctor_computer.state_findings(config.state) if one.check == "writing")
     assert writing.level == "fail"
     assert "No space left" in writing.text
     assert writing.advice is not None
@@ -472,9 +472,9 @@ def test_a_service_that_holds_the_state_is_seen_and_not_disturbed(tmp_path: Path
     config = configuration(tmp_path)
     with (tmp_path / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        (held,) = (one for one in machine.state_findings(config.state) if one.check == "lock")
+        (held,) = (one for one in doctor_computer.state_findings(config.state) if one.check == "lock")
         assert "a service runs here" in held.text
-    (free,) = (one for one in machine.state_findings(config.state) if one.check == "lock")
+    (free,) = (one for one in doctor_computer.state_findings(config.state) if one.check == "lock")
     assert "no service runs here" in free.text
 
 
@@ -488,11 +488,11 @@ def test_a_state_directory_that_cannot_be_made_fails(tmp_path: Path) -> None:
 
 def test_a_cold_cache_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
-    cold = machine.kernels_finding()
+    cold = doctor_computer.kernels_finding()
     assert (cold.level, cold.where) == ("warn", str(tmp_path))
     (tmp_path / "geometry").mkdir()
     (tmp_path / "geometry" / "kernel.nbi").write_text("")
-    assert machine.kernels_finding().level == "ok"
+    assert doctor_computer.kernels_finding().level == "ok"
 
 
 @pytest.mark.parametrize(
@@ -507,8 +507,8 @@ def test_a_cold_cache_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_a_clock_that_nobody_keeps_is_told(
     monkeypatch: pytest.MonkeyPatch, state: clock.ClockState | None, level: str
 ) -> None:
-    monkeypatch.setattr(machine, "clock_state", lambda: state)
-    assert machine.clock_finding().level == level
+    monkeypatch.setattr(doctor_computer, "clock_state", lambda: state)
+    assert doctor_computer.clock_finding().level == level
 
 
 def test_the_kernel_tells_of_its_clock() -> None:

@@ -121,7 +121,7 @@ def test_what_the_service_receives_is_in_order(
     absent = of(findings, "stream", "/camera/camera_info")
     assert (absent.level, absent.text) == (
         "fail",
-        "awaited: nothing came in 0.5 s: no publisher of /camera/camera_info",
+        "awaited: no sample in 0.5 s: no publisher of /camera/camera_info",
     )
 
 
@@ -147,7 +147,7 @@ def test_what_the_service_does_not_receive_has_its_cause(
     for topic in TOPICS:
         stream = of(findings, "stream", topic)
         assert stream.level == "fail"
-        assert "nothing came in 0.5 s, while a client of the same router got" in stream.text
+        assert "no sample in 0.5 s, while a client of the same router got" in stream.text
         assert cause in stream.text
         assert way_out in str(stream.advice)
     assert [cause in one.text for one in findings if one.check == "topics"] == [False, True]

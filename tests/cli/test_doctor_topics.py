@@ -9,9 +9,7 @@ import pytest
 
 from coec.adapters.ros.wire.publisher import Publisher
 from coec.adapters.zenoh.ros_topics import Topics
-from coec.cli.doctor.listening import Heard
-from coec.cli.doctor.streams import stream_findings
-from coec.cli.doctor.topics import NAMED, topic_findings
+from coec.cli.doctor_streams import NAMED, StreamSamples, stream_findings, topic_findings
 from coec.config import IDENTITY, Config
 from coec.runtime.ingest.decoder import StreamCounts
 
@@ -75,8 +73,8 @@ def test_tokens_that_were_not_read_are_told() -> None:
 def test_a_silent_stream_is_told_with_who_is_there_and_two_senders_by_name() -> None:
     config = configured()
     (pair,) = config.pairs
-    camera = Heard("/front/image", counts=StreamCounts(9, 9, (LEFT, RIGHT), stamped_by_sender=True))
-    heard = {"camera": camera, "lidar": Heard("/rear/points")}
+    camera = StreamSamples("/front/image", counts=StreamCounts(9, 9, (LEFT, RIGHT), stamped_by_sender=True))
+    heard = {"camera": camera, "lidar": StreamSamples("/rear/points")}
     found = list(stream_findings(pair, heard, config, 1.0, THERE))
     (silent,) = [one for one in found if one.where == "/rear/points"]
     assert (silent.level, "no publisher of /rear/points; there are: /top/points" in silent.text) == ("fail", True)

@@ -173,7 +173,7 @@ def test_whatever_is_fetched_is_metered_and_waited_for(
     [
         (("../x",), UsageError.exit_code, "is no name of a vehicle"),
         ((VEHICLE, "../../etc/passwd"), UsageError.exit_code, "is no red event"),
-        ((VEHICLE, "front-1"), NotFoundError.exit_code, "keeps no such red event"),
+        ((VEHICLE, "front-1"), NotFoundError.exit_code, "has no such red event"),
         (("nobody", "latest"), NotFoundError.exit_code, "nobody answered"),
     ],
 )
@@ -200,7 +200,7 @@ def test_of_a_vehicle_that_is_parked_its_last_word_is_told(coec: Coec, router: R
         wait_until(lambda: bool(storage.kept), "it is kept")
         outcome = coec("fetch", "truck-3", "latest", "--connect", router.endpoint)
     assert outcome.status == NotFoundError.exit_code
-    assert re.search(r"truck-3 does not answer; it took its leave \d+ d ago \(front: miscalibrated\)", outcome.err)
+    assert re.search(r"truck-3 does not answer; it logged off \d+ d ago \(front: miscalibrated\)", outcome.err)
 
 
 @pytest.mark.fault(
@@ -222,12 +222,12 @@ def test_recordings_beyond_the_limit_are_left_out(
     "a vehicle that lists thousands of snippets of one event", "the nearest are fetched, the rest is counted"
 )
 def test_snippets_of_an_event_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = cli_fetch._Fetch(cast(Any, None), KEYS, PAIR, tmp_path, cast(Any, None))
+    bench = cli_fetch.Download(cast(Any, None), KEYS, PAIR, tmp_path, 1.0, 1.0, with_windows=True)
     file: dict[str, Any] = {"size_bytes": 1, "sha256": SHA256, "event": "suspect", "recorded_ns": 8}
     snippets = tuple(SnippetInfo(snippet_id=f"front-{n}.snippet", stamp_ns=n, **file) for n in range(1000))
     listed = WindowsReply(vehicle=VEHICLE, pair=PAIR, windows=(), snippets=snippets)
-    monkeypatch.setattr(cli_fetch._Fetch, "_document", lambda *_: listed)
-    monkeypatch.setattr(cli_fetch._Fetch, "_recording", lambda *_: snippets[0])
+    monkeypatch.setattr(cli_fetch.Download, "_document", lambda *_: listed)
+    monkeypatch.setattr(cli_fetch.Download, "_recording", lambda *_: snippets[0])
     found = sorted(bench._snippets(cast(Any, SimpleNamespace(stamp_ns=100))))
     nearest = sorted(f"front-{n}.snippet" for n in range(92, 108))
     assert (found, len(found)) == (nearest, cli_fetch.MAX_SNIPPETS)

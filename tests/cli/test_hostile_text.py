@@ -18,7 +18,7 @@ from cli.conftest import Coec, Outcome
 from coec.adapters.zenoh.bus import JSON, MSGPACK
 from coec.adapters.zenoh.client import Reply, connected
 from coec.cli import doctor, query
-from coec.cli.doctor.service import service_findings
+from coec.cli.doctor_connection import service_findings
 from coec.config import Config
 from coec.errors import DecodeError, RemoteError
 from coec.reports import console, fleet_board, replies

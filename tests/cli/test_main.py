@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,10 @@ import pytest
 
 from cli.conftest import Coec
 from coec import __version__
-from coec.cli import COMMANDS as COMMANDS_WITHOUT_COMMANDS
-from coec.cli import application
+from coec.cli.main import BUILT_IN, GROUP, application
 
 COMMANDS = ("calibrate", "run", "check-config", "play", "query", "replay", "convert", "models", "demo")
-HELP = "import sys; sys.argv = ['coec', '--help']; from coec.cli import main; sys.exit(main())"
+HELP = "import sys; sys.argv = ['coec', '--help']; from coec.cli.main import main; sys.exit(main())"
 HEAVY = ("cv2", "mcap", "numba", "numpy", "onnxruntime", "pydantic", "rosbags", "zenoh")
 
 
@@ -34,7 +34,7 @@ def test_every_command_has_help(coec: Coec, command: str) -> None:
 def test_help_of_all_commands_imports_nothing_heavy() -> None:
     code = (
         "import sys; sys.argv = ['coec', '--help']\n"
-        "from coec.cli import main; main()\n"
+        "from coec.cli.main import main; main()\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
     path = ":".join(sys.path)
@@ -46,7 +46,7 @@ def test_help_of_all_commands_imports_nothing_heavy() -> None:
 def test_a_source_that_is_refused_is_refused_before_what_draws_is_imported(tmp_path: Path) -> None:
     code = (
         f"import sys; sys.argv = ['coec', 'calibrate', {str(tmp_path / 'absent')!r}]\n"
-        "from coec.cli import main; status = main()\n"
+        "from coec.cli.main import main; status = main()\n"
         "print(status, 'matplotlib' in sys.modules)"
     )
     done = subprocess.run(
@@ -57,7 +57,9 @@ def test_a_source_that_is_refused_is_refused_before_what_draws_is_imported(tmp_p
 
 
 def test_a_user_without_a_home_gets_pictures_without_words_of_the_library_that_draws(tmp_path: Path) -> None:
-    code = "import sys; sys.argv = ['coec', '--version']\nfrom coec.cli import main; main()\nimport matplotlib.figure"
+    code = (
+        "import sys; sys.argv = ['coec', '--version']\nfrom coec.cli.main import main; main()\nimport matplotlib.figure"
+    )
     (tmp_path / "file").touch()
     env = {"PYTHONPATH": ":".join(sys.path), "HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
@@ -67,7 +69,10 @@ def test_a_user_without_a_home_gets_pictures_without_words_of_the_library_that_d
 def test_a_command_is_declared_without_the_others() -> None:
     (alone,) = application(["check-config", "--defaults"]).registered_commands
     assert alone.name == "check-config"
-    assert len(application(["--help", "check-config"]).registered_commands) == len(COMMANDS_WITHOUT_COMMANDS)
+    everything = application(["--help", "check-config"])
+    names = {each.name for each in everything.registered_commands}
+    names |= {each.name for each in everything.registered_groups}
+    assert names == {*BUILT_IN, *(point.name for point in entry_points(group=GROUP) if "." not in point.name)}
 
 
 def test_a_mistyped_command_is_told_which_is_meant(coec: Coec) -> None:
@@ -108,7 +113,7 @@ def test_fault_of_our_own_is_70_with_traceback(coec: Coec, monkeypatch: pytest.M
     def fail(*_: object, **__: object) -> int:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("coec.cli.models.run", fail)
+    monkeypatch.setattr("coec.cli.models._list", fail)
     outcome = coec("models", "--json")
     assert outcome.status == 70
     assert "Traceback" in outcome.err

@@ -15,10 +15,10 @@ import pytest
 
 import coec as package
 from cli.conftest import SMALL, Coec
+from coec import api
 from coec.adapters.mcap.windows import WindowWriter
 from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig
 from coec.errors import NotAcceptedError, OutputError, SourceError, UsageError
-from coec.library import calls, recordings
 from coec.schemas.base import to_json
 from coec.schemas.evaluation import EvaluationReport
 from coec.schemas.replies import CalibrationResult
@@ -84,7 +84,7 @@ def test_every_public_name_is_there_and_is_documented() -> None:
         _ = package.nonsense  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("module", [calls, recordings], ids=lambda module: str(module.__name__))
+@pytest.mark.parametrize("module", [api], ids=lambda module: str(module.__name__))
 def test_the_examples_in_docstrings_do_what_they_say(module: object) -> None:
     outcome = doctest.testmod(module)  # type: ignore[arg-type]
     assert outcome.attempted > 0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import getpass
 import hashlib
+import inspect
 import json
 import socket
 from collections.abc import Iterator, Sequence
@@ -15,9 +15,8 @@ import pytest
 
 from cli.conftest import SMALL, Coec
 from coec.adapters.zenoh.bus import JSON, Answer, Bus, Lane, Request, Route, open_session
-from coec.cli.commands.query import KEYS as HELPED
-from coec.cli.commands.query import Options
-from coec.cli.query import PLAIN_KEYS, WITH_ARGUMENT
+from coec.cli.query import KEYS as HELPED
+from coec.cli.query import PLAIN_KEYS, WITH_ARGUMENT, query
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError
 from coec.schemas.base import Message, to_json
@@ -322,7 +321,7 @@ def test_options_stand_for_the_entries_of_a_payload(
 
 
 def test_every_entry_of_a_payload_has_its_option() -> None:
-    fields = {field.name for field in dataclasses.fields(Options)}
+    fields = set(inspect.signature(query).parameters)
     for command in NAMES:
         for for_rig in (False, True):
             assert {argument.name for argument in arguments_of(command, for_rig=for_rig)} <= fields

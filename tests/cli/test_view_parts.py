@@ -15,10 +15,16 @@ from cli.vehicle_on_screen import PAIR, RIG, configuration, extrinsic, health
 from coec.adapters.foxglove.topics import Pose
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.cli.view import Place, place_of
-from coec.cli.view import streams as streams_module
-from coec.cli.view.moments import SILENT_S, Said, extrinsics_of_service, moment_of_service
-from coec.cli.view.streams import DEPTHS, Streams
+from coec.cli import view_vehicle
+from coec.cli.view import ListenAddress, listen_address
+from coec.cli.view_vehicle import (
+    DEPTHS,
+    SILENT_S,
+    SensorStreams,
+    ServiceState,
+    extrinsics_of_service,
+    moment_of_service,
+)
 from coec.config import load_config
 from coec.errors import UsageError
 from coec.schemas.base import from_msgpack
@@ -29,7 +35,7 @@ from fakes import wait_until
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""
 
-SAID = Said(
+SAID = ServiceState(
     alive=True,
     answer_age_s=1.0,
     health=from_msgpack(HealthReply, health("miscalibrated")),
@@ -38,7 +44,7 @@ SAID = Said(
 )
 
 
-def told(said: Said) -> tuple[str, int, tuple[str, ...]]:
+def told(said: ServiceState) -> tuple[str, int, tuple[str, ...]]:
     moment = moment_of_service("front", said, {}, Counter())
     return moment.state, moment.level, moment.reasons
 
@@ -47,12 +53,12 @@ def test_who_does_not_answer_is_silent_and_who_is_not_there_serves_nothing() -> 
     assert told(SAID) == ("miscalibrated", 2, ("moved",))
     assert told(replace(SAID, answer_age_s=SILENT_S + 0.1)) == ("silent", 3, ("silent",))
     assert told(replace(SAID, alive=False)) == ("not_served", 3, ("not_served",))
-    assert told(Said(alive=True)) == ("silent", 3, ("silent",))
-    assert told(Said()) == ("not_served", 3, ("not_served",))
+    assert told(ServiceState(alive=True)) == ("silent", 3, ("silent",))
+    assert told(ServiceState()) == ("not_served", 3, ("not_served",))
 
 
 def test_what_is_not_known_is_not_drawn_and_says_so() -> None:
-    nothing = extrinsics_of_service(RIG, Said())
+    nothing = extrinsics_of_service(RIG, ServiceState())
     assert nothing[Pose.SERVED].T_camera_lidar is None
     assert nothing[Pose.SERVED].title == "served: not known, not_served"
     np.testing.assert_array_equal(nothing[Pose.NOMINAL].T_camera_lidar, NOMINAL)
@@ -63,10 +69,10 @@ def test_what_is_not_known_is_not_drawn_and_says_so() -> None:
 
 
 @pytest.fixture
-def streams(router: Router, tmp_path: Path) -> Iterator[Streams]:
+def streams(router: Router, tmp_path: Path) -> Iterator[SensorStreams]:
     config = load_config(configuration(tmp_path, router.endpoint))
-    streams = Streams(router.session, config.pairs[0], config)
-    streams.listen(wanted=True)
+    streams = SensorStreams(router.session, config.pairs[0], config)
+    streams.listen(enabled=True)
     yield streams
     streams.close()
 
@@ -79,7 +85,7 @@ def send(router: Router, number: int) -> None:
 
 @pytest.mark.fault("more frames than can be shown", "the newest are shown; the others are passed over and counted")
 def test_the_newest_pair_is_shown_and_older_ones_are_passed_over(
-    router: Router, streams: Streams, record_property: Record
+    router: Router, streams: SensorStreams, record_property: Record
 ) -> None:
     count = 40
     for number in range(count):
@@ -93,14 +99,14 @@ def test_the_newest_pair_is_shown_and_older_ones_are_passed_over(
 
 
 def test_keys_on_which_nothing_comes_are_told(
-    router: Router, streams: Streams, monkeypatch: pytest.MonkeyPatch
+    router: Router, streams: SensorStreams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert not streams.mute, "not at once"
-    monkeypatch.setattr(streams_module, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(view_vehicle, "PATIENCE_S", 0.0)
     assert streams.mute == ("in/camera", "in/lidar")
     router.session.put("in/lidar", b"", encoding=MSGPACK)
     wait_until(lambda: streams.mute == ("in/camera",), "what came")
-    streams.listen(wanted=False)
+    streams.listen(enabled=False)
     assert not streams.mute, "nobody looks"
 
 
@@ -108,17 +114,17 @@ def test_keys_on_which_nothing_comes_are_told(
     ("address", "host"), [("127.0.0.1:8765", "127.0.0.1"), ("localhost:0", "localhost"), ("[::1]:8765", "::1")]
 )
 def test_loopback_is_served_without_a_word(address: str, host: str) -> None:
-    assert place_of(address, insecure=False) == Place(host, int(address.rpartition(":")[2]))
+    assert listen_address(address, insecure=False) == ListenAddress(host, int(address.rpartition(":")[2]))
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0:8765", "[::]:8765", "10.0.0.5:8765", "vehicle.local:8765"])
 def test_other_addresses_are_served_only_if_that_is_said(address: str) -> None:
     with pytest.raises(UsageError, match="--insecure"):
-        place_of(address, insecure=False)
-    assert place_of(address, insecure=True).port == 8765
+        listen_address(address, insecure=False)
+    assert listen_address(address, insecure=True).port == 8765
 
 
 @pytest.mark.parametrize("address", ["8765", "127.0.0.1", "127.0.0.1:65536", "127.0.0.1:-1", "::1:8765", "a b:1"])
 def test_what_is_no_address_is_refused(address: str) -> None:
     with pytest.raises(UsageError, match="HOST:PORT"):
-        place_of(address, insecure=True)
+        listen_address(address, insecure=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from coec.cli import warmup
-from coec.cli.commands.warmup import Options
 from coec.config import Config
 from coec.errors import OutputError, UsageError
 from coec.geometry import compiler
@@ -20,7 +20,7 @@ from rig_said import pair_config
 
 def test_kernels_that_are_there_are_not_compiled_again(capsys: pytest.CaptureFixture[str]) -> None:
     for _ in range(2):
-        assert warmup.run(Options(lenses=["pinhole"], as_json=True)) == 0
+        assert warmup.warmup(lenses=["pinhole"], as_json=True) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (told["lenses"], told["kernels"], told["files_written"]) == (["pinhole"], compiled(1).total, 0)
     assert Path(told["cache"]).is_dir()
@@ -29,10 +29,10 @@ def test_kernels_that_are_there_are_not_compiled_again(capsys: pytest.CaptureFix
 
 
 def test_people_are_told_where_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    assert warmup.run(Options(lenses=["pinhole"])) == 0
+    assert warmup.warmup(lenses=["pinhole"]) == 0
     out = capsys.readouterr().out
     assert f"{compiled(1).total} kernels for pinhole" in out
-    assert f"kept in {compiler.kernel_cache()[0]}" in out
+    assert f"cached in {compiler.kernel_cache()[0]}" in out
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
 
 def test_by_default_it_compiles_for_every_lens_that_there_is(asked: list[list[str]]) -> None:
-    warmup.run(Options())
+    warmup.warmup()
     assert asked == [list(MODELS)]
 
 
@@ -58,23 +58,23 @@ def test_it_compiles_for_the_lenses_of_a_configuration(tmp_path: Path, asked: li
     path = tmp_path / "coec.yaml"
     pair = pair_config("front")
     path.write_text(commented_yaml(Config(pairs=(pair,))))
-    warmup.run(Options(config=path))
+    warmup.warmup(config=path)
     path.write_text("middleware: rmw_zenoh\npairs: [{name: front, camera: /image, points: /points}]\n")
-    warmup.run(Options(config=path))
+    warmup.warmup(config=path)
     assert pair.camera.intrinsics is not None
     assert asked == [[pair.camera.intrinsics.model], list(MODELS)], "a lens that CameraInfo tells may be any"
 
 
-@pytest.mark.parametrize("options", [Options(lenses=["fish"]), Options(lenses=["mei"], config=Path("coec.yaml"))])
-def test_it_refuses_an_unknown_lens_and_two_sources(options: Options, asked: list[list[str]]) -> None:
+@pytest.mark.parametrize("options", [{"lenses": ["fish"]}, {"lenses": ["mei"], "config": Path("coec.yaml")}])
+def test_it_refuses_an_unknown_lens_and_two_sources(options: dict[str, Any], asked: list[list[str]]) -> None:
     with pytest.raises(UsageError):
-        warmup.run(options)
+        warmup.warmup(**options)
     assert asked == []
 
 
 @pytest.mark.fault("no folder for compiled kernels can be written", "`coec warmup` says so, and compiles nothing")
 def test_without_a_cache_it_says_so(asked: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(warmup, "kernel_cache", lambda: (Path("nowhere"), False))
+    monkeypatch.setattr(compiler, "kernel_cache", lambda: (Path("nowhere"), False))
     with pytest.raises(OutputError, match="XDG_CACHE_HOME"):
-        warmup.run(Options())
+        warmup.warmup()
     assert asked == []

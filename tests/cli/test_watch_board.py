@@ -20,7 +20,7 @@ from coec.adapters.system import keyboard
 from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.words import Words
-from coec.cli.watch_board import Asking, Board
+from coec.cli.fleet_screen import Board, PairQuery
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import DecodeError
 from coec.fleet.roster import Filter, Roster
@@ -87,7 +87,7 @@ def test_what_does_not_go_together_is_a_usage_error(
 def board_of(router: Router) -> Iterator[Board]:
     with connected([router.endpoint], 5.0) as session, connected([router.endpoint], 5.0) as of_tokens:
         words = Words(session, of_tokens, ALL, 2.0)
-        with words.listening(), Asking(session, "coec") as asking:
+        with words.listening(), PairQuery(session, "coec") as asking:
             yield Board(Roster(), words, Filter(), asking)
 
 
@@ -149,16 +149,16 @@ def test_a_word_that_was_lost_is_asked_for(router: Router) -> None:
     key = Keys("coec", "truck-5").last("front")
     now_s = 1000.0
     with connected([router.endpoint], 5.0) as vehicle, board_of(router) as board:
-        wait_until(lambda: board.words.told.is_set(), "nobody has said anything")
+        wait_until(lambda: board.heartbeats.told.is_set(), "nobody has said anything")
 
         def answer(query: zenoh.Query) -> None:
             with query:
                 query.reply(key, packed(a_word("truck-5", said_ns=2**62)))
 
         vehicle.declare_queryable(key, answer)
-        board.roster.hear(key, packed(a_word("truck-5", state="suspect")), -now_s)
+        board.state.hear(key, packed(a_word("truck-5", state="suspect")), -now_s)
         assert "silent (suspect)" in text(board)
-        board.asked_s = -now_s
+        board.queried_s = -now_s
         wait_until(lambda: "1 healthy" in text(board), "it has answered")
 
 
@@ -176,16 +176,16 @@ def test_a_link_that_breaks_is_said_and_words_come_again_with_it(
     with ExitStack() as stack:
         with router_at(endpoint) as session:
             board = stack.enter_context(board_of(Router(session, endpoint)))
-            wait_until(lambda: board.words.told.is_set(), "nobody has said anything")
+            wait_until(lambda: board.heartbeats.told.is_set(), "nobody has said anything")
             say(session, "truck-1")
             wait_until(lambda: "1 vehicle, 1 pair: 1 healthy" in text(board), "it is told")
-        wait_until(lambda: "no router: nothing new comes" in text(board), "the link is gone")
+        wait_until(lambda: "no router: nothing new arrives" in text(board), "the link is gone")
         board.clock = lambda: time.monotonic() + 200.0
         assert "silent (healthy)" in text(board), "its last state is not taken for the present one"
         board.clock = time.monotonic
         with router_at(endpoint) as session:
             begun_s = time.monotonic()
-            wait_until(lambda: board.words.is_connected, "the link is back")
+            wait_until(lambda: board.heartbeats.is_connected, "the link is back")
             again = iter(range(1000))
             wait_until(lambda: _hears(board, session, next(again)), "a word comes again")
             record_property("figure", f"{time.monotonic() - begun_s:.1f} s")

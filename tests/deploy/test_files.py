@@ -172,7 +172,7 @@ def test_no_shipped_configuration_listens(name: str) -> None:
 def test_a_shipped_configuration_can_be_used_as_it_is(name: str) -> None:
     from coec.cli import check_config
 
-    assert check_config.run(REPOSITORY / name, defaults=False, as_json=True) == 0
+    assert check_config.check_config(REPOSITORY / name, defaults=False, as_json=True) == 0
 
 
 def leaves(value: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
@@ -224,7 +224,7 @@ def test_the_wheel_of_the_dockerfile_runs_beside_the_packages_of_this_environmen
     target = tmp_path / "installed"
     zipfile.ZipFile(wheel).extractall(target)  # which is what installing a wheel of plain Python comes to
     assert (target / "coec" / "adapters" / "depth" / "cards" / "street.onnx").is_file()
-    program = f"import sys; sys.path.insert(0, {str(target)!r}); from coec.cli import main; sys.exit(main())"
+    program = f"import sys; sys.path.insert(0, {str(target)!r}); from coec.cli.main import main; sys.exit(main())"
     checked = [sys.executable, "-I", "-c", program]
     ended = subprocess.run([*checked, *stages()[-1].last("CMD").words()], capture_output=True, text=True, cwd=tmp_path)
     assert ended.returncode == ConfigError.exit_code

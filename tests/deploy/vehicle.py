@@ -23,7 +23,7 @@ import psutil
 
 from coec import geometry
 from coec.adapters.zenoh.client import ask, ask_one, connected, connected_by
-from coec.cli.query import asked_of
+from coec.cli.options import service_address
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig, load_config
 from coec.errors import RemoteError
 from coec.geometry.compiler import kernel_cache_directory
@@ -338,7 +338,7 @@ def rights_of_viewer(service: Service) -> dict[str, str]:
     keys, pair = service.keys, service.pair
     (file,) = [Path(word) for word in compose()["observer"]["command"] if word.endswith(".json5")]
     found = {}
-    with connected_by(asked_of(None, None, None, None, file).way, PATIENCE_S) as viewer:
+    with connected_by(service_address(None, None, None, None, file).way, PATIENCE_S) as viewer:
         for name, key in (("health", keys.health(pair)), ("command", keys.command(pair, "hold"))):
             replies = ask(viewer, key, PATIENCE_S)
             found[name] = "answered" if replies else "nothing"

@@ -12,7 +12,7 @@ import pytest
 import typer
 from pydantic import BaseModel
 
-from coec.cli import application
+from coec.cli.main import application
 from coec.config import Config
 from coec.config.pair import OpenPairConfig
 from coec.config.rig import RigConfig, RigStages

@@ -18,7 +18,6 @@ from mcap_ros2.decoder import DecoderFactory
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.adapters.zenoh.player import Frame
 from coec.cli import play
-from coec.cli.commands.play import Options
 from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig, WindowConfig
 from coec.sources import open_source
 from e2e.drives import NS_PER_S, SHORT, SHORT_PAIRS, Drive, later, rendered
@@ -226,7 +225,7 @@ def test_playing_to_nobody_says_so(
 ) -> None:
     monkeypatch.setattr(play, "LISTENER_S", 0.1)
     source = drive.source.replace(f"seconds={SHORT_S}", "seconds=1")
-    assert play.run(Options(source, connect=router.endpoint, rate=0.0, as_json=True)) == 0
+    assert play.play(source, connect=router.endpoint, rate=0.0, as_json=True) == 0
     said = capsys.readouterr()
     assert json.loads(said.out)["nobody_listened_to"] == [
         f"sensors/sim/{stream}" for stream in ("camera", "lidar", "ego")

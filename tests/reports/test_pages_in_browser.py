@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser, sync_playwright
 from playwright.sync_api import Page as Tab
 
-from coec.cli import main
+from coec.cli.main import main
 from coec.reports import page as pages_room
 from reports import pages
 

@@ -2,90 +2,97 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
-import numpy as np
-from numpy.typing import NDArray
+import typer
 
-from coec.adapters.files import output
-from coec.calibration.frames.time_offset import TimeOffset
-from coec.cli.chosen import choices_of
-from coec.cli.commands.calibrate import Options
-from coec.cli.lens_refusal import drawn_if_refused
-from coec.config import WindowConfig
-from coec.errors import OutputError
-from coec.geometry.cameras import Camera
-from coec.library.calibrating import Calibrated, calibrated
-from coec.library.camera_fit import CameraFit
-from coec.reports import calibration, console, page, provenance
-from coec.reports.calibration_page import calibration_page
-from coec.reports.page import Pictures
-from coec.reports.page_parts import file_picture
-from coec.reports.stage_times import StageTimes
-from coec.schemas.base import to_json
-from coec.schemas.replies import CalibrationReport, CalibrationResult
-from coec.sources import windows
+from coec.calibration_options import CalibrationOptions
+from coec.cli.options import Json, Source, with_calibration_options
+from coec.errors import LensError, OutputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from coec.geometry.cameras import Camera
+    from coec.recording import Solution
+    from coec.schemas.replies import CalibrationResult
 
 
-def run(options: Options) -> int:
-    """Prints the result; returns 1 if its verdict is negative.
+@with_calibration_options(CalibrationOptions)
+def calibrate(
+    source: Source,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write report.html, overlay_before.png, overlay_after.png, close_ups.png, residuals.png and "
+            "result.json; with --camera-model also lens_residual.png, even if the model is refused.",
+            metavar="DIR",
+        ),
+    ] = None,
+    as_json: Json = False,
+    **options: Unpack[CalibrationOptions],
+) -> int:
+    """Calibrate from a recording: exit 0 if the result is accepted, 1 if the self-diagnosis refuses it."""
+    from coec.adapters.files import output as files
+    from coec.config import WindowConfig
+    from coec.recording import perturbation_of, solve
+    from coec.reports import calibration, console
+    from coec.reports.stage_times import StageTimes
+    from coec.sources import windows
 
-    Raises:
-        CoecError: there is no result, or the output folder cannot be written.
-    """
-    if options.output is not None:
-        output.try_folder(options.output)
-    xi = None if options.perturb is None else windows.vector_of("--perturb", options.perturb)
+    if output is not None:
+        files.try_folder(output)
+    if options.get("perturb") is not None:
+        perturbation_of(options["perturb"] or ())
     with console.progress() as bars:
         times = StageTimes(bars)
         loaded = windows.load(
-            options.source, options.frames, WindowConfig().pairs, lambda done, total: times.step("load", done, total)
+            source, options.get("frames"), WindowConfig().pairs, lambda done, total: times.step("load", done, total)
         )
-        with drawn_if_refused(options.output, loaded.window.rig.camera):
-            done = calibrated(
-                loaded,
-                choices_of(options),
-                times,
-                perturbation=xi,
-                camera_model=options.camera_model,
-                time_offset=options.time_offset,
-            )
-    document = _document(done.result, times.elapsed_s(), done.fit, done.offset)
+        with picture_of_lens_error(output, loaded.window.rig.camera):
+            solution = solve(loaded, options, times)
+    document = _document(solution, times.elapsed_s())
     written: list[Path] = []
     left_out: tuple[str, ...] = ()
     not_written = None
-    if options.output is not None:
+    if output is not None:
         try:
-            written, left_out = _write(options.output, loaded.window.rig.camera, done, document)
+            written, left_out = _write(output, loaded.window.rig.camera, solution, document)
         except OutputError as error:
             not_written = error
             document["not_written"] = str(error)
-    if options.as_json:
+    if as_json:
         console.print_json(document)
     else:
         calibration.show(
-            done.window,
-            done.result,
-            configuration=done.configuration,
+            solution.window,
+            solution.result,
+            configuration=solution.configuration,
             camera_fit=document.get("camera_fit"),
             time_offset=document.get("time_offset"),
             elapsed_s=document["elapsed_s"],
         )
     if not_written is not None:
         console.say(f"coec: {not_written}")
-    elif options.output is not None and not options.as_json:
-        calibration.show_written(options.output, written, left_out)
+    elif output is not None and not as_json:
+        calibration.show_written(output, written, left_out)
     if loaded.unpaired:
         causes = ", ".join(f"{count} {cause}" for cause, count in sorted(loaded.unpaired.items()))
         console.say(f"coec: frames without a partner: {causes}")
-    return 0 if done.result.verdict.decision == "accepted" and not_written is None else 1
+    return 0 if solution.result.verdict.decision == "accepted" and not_written is None else 1
 
 
-def _document(
-    result: CalibrationResult, elapsed_s: dict[str, float], fit: CameraFit | None, offset: TimeOffset | None
-) -> dict[str, Any]:
-    report = CalibrationReport(**dict(result), elapsed_s=elapsed_s)
+def _document(solution: Solution, elapsed_s: dict[str, float]) -> dict[str, Any]:
+    import numpy as np
+
+    from coec.schemas.replies import CalibrationReport
+
+    fit, offset = solution.fit, solution.offset
+    report = CalibrationReport(**dict(solution.result), elapsed_s=elapsed_s)
     document: dict[str, Any] = report.model_dump(mode="json")
     if fit is not None:
         document["camera_fit"] = {
@@ -108,42 +115,84 @@ def _document(
 
 def _finite(value: float) -> float | None:
     """The value, or None if it is not finite, because JSON has no NaN."""
+    import numpy as np
+
     return float(value) if np.isfinite(value) else None
 
 
 def _write(
-    folder: Path, camera: Camera, done: Calibrated, document: dict[str, Any]
+    folder: Path, camera: Camera, solution: Solution, document: dict[str, Any]
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """Writes the files; returns them, and what was left out. `camera` is the recording's, to which another may have
-    been fitted."""
-    # matplotlib takes a second to import.
-    from coec.reports import pictures
-    from coec.reports.close_ups import Caption
+    """Writes the files; returns their paths, and what was left out. `camera` is the recording's, to which another may
+    have been fitted."""
+    import numpy as np
 
-    window, result, compensated = done.window, done.result, done.configuration.motion_compensation
+    from coec.adapters.files import output as files
+    from coec.reports import (
+        calibration,
+        page,
+        pictures,  # matplotlib takes a second to import
+        provenance,
+    )
+    from coec.reports.calibration_page import calibration_page
+    from coec.reports.close_ups import Caption
+    from coec.reports.page import Pictures
+    from coec.reports.page_parts import file_picture
+    from coec.schemas.base import to_json
+    from coec.schemas.replies import CalibrationReport
+
+    window, result, compensated = solution.window, solution.result, solution.configuration.motion_compensation
     caption = Caption(
         before="start",
         after=f"result ({result.verdict.decision})",
         sigma=_sigma_of(result),
-        network=pictures.network_text(done.configuration.depth.model, result.depth_identity),
+        network=pictures.network_text(solution.configuration.depth.model, result.depth_identity),
     )
-    T_found = np.array(result.camera_from_lidar.matrix)
-    drawn = pictures.write_comparison(
-        folder, window, window.T_camera_lidar_start, T_found, caption, compensated, result.independent_looks
+    T_result = np.array(result.camera_from_lidar.matrix)
+    comparison = pictures.write_comparison(
+        folder, window, window.T_camera_lidar_start, T_result, caption, compensated, result.independent_looks
     )
-    files, blocks = list(drawn.files), drawn.blocks
-    if done.fit is not None:
-        files.append(pictures.write_lens(folder, camera, window.rig.camera))
-        blocks = (*blocks, Pictures((file_picture(files[-1]),)))
+    paths, blocks = list(comparison.files), comparison.blocks
+    if solution.fit is not None:
+        paths.append(pictures.write_lens(folder, camera, window.rig.camera))
+        blocks = (*blocks, Pictures((file_picture(paths[-1]),)))
     report = CalibrationReport.model_validate(document)
-    written = output.write(folder / "result.json", to_json(report))
-    said = calibration.remarks(document.get("camera_fit"), document.get("time_offset"))
-    of_result = calibration_page(report, window, calibration.start_of(window), blocks, said, provenance.here())
-    return [*files, written, page.write(folder / "report.html", of_result)], drawn.left_out
+    written = files.write(folder / "result.json", to_json(report))
+    remarks = calibration.remarks(document.get("camera_fit"), document.get("time_offset"))
+    of_result = calibration_page(report, window, calibration.start_of(window), blocks, remarks, provenance.here())
+    return [*paths, written, page.write(folder / "report.html", of_result)], comparison.left_out
 
 
 def _sigma_of(result: CalibrationResult) -> NDArray[np.float64]:
     """(6,) in radians and metres; NaN where there is none."""
+    import numpy as np
+
     sigma = np.array([np.nan if value is None else value for value in result.sigma], dtype=np.float64)
     sigma[:3] = np.radians(sigma[:3])
     return np.where(np.array(result.solved), sigma, np.nan)
+
+
+@contextmanager
+def picture_of_lens_error(folder: Path | None, camera: Camera) -> Iterator[None]:
+    """If a fit to the camera is refused within, writes a picture of the residuals into the folder, and adds its path to
+    the error.
+
+    Raises:
+        LensError: the one from within, plus the path of the picture; without a folder, plus how to get a picture.
+        OutputError: the picture cannot be written.
+    """
+    from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
+
+    try:
+        yield
+    except LensError as error:
+        if folder is None:
+            raise LensError(
+                f"{error}; with --output DIR a picture shows where in the image it is off", error.details
+            ) from error
+        # matplotlib takes a second to import.
+        from coec.reports import pictures
+
+        path = pictures.write_lens(folder, camera, fit_double_sphere(camera).camera)
+        details = {**error.details, "picture": str(path)}
+        raise LensError(f"{error}. Where in the image it is off: {path}", details) from error

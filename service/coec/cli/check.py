@@ -1,25 +1,20 @@
-"""`coec check`: what a recording holds, what it lacks, and what it is good for."""
+"""`coec check`: the content of a recording, what it lacks, and whether a calibration is possible."""
 
 from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import asdict, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.conversions import degrees_or_null
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.calibrator import calibrate
-from coec.calibration.types import Estimate
-from coec.config import LimitsConfig
+from coec.calibration_options import SolverOptions, configuration_of
+from coec.cli.options import Depth, Json, Source
 from coec.errors import CalibrationError, SourceError
-from coec.evaluation.fitness import Cadence, Fitness, Remark, fitness_of
-from coec.library.choices import Choices, configuration_of
-from coec.reports import console
-from coec.reports.page.words import count
-from coec.reports.stage_times import StageTimes
-from coec.sources import Recording, open_source, windows
-from coec.sources.spec import is_bag, parse_spec
+
+if TYPE_CHECKING:
+    from coec.calibration.types import Estimate
+    from coec.evaluation.fitness import Cadence, Fitness, Remark
+    from coec.reports.stage_times import StageTimes
+    from coec.sources import Recording
 
 PAIRS = 6
 """Pairs of the trial, evenly chosen: as many as in a check of the monitor."""
@@ -27,13 +22,17 @@ PAIRS = 6
 LEVEL_STYLES = {"fail": "bold red", "warn": "bold yellow", "ok": ""}
 
 
-def run(source: str, *, depth: str | None, as_json: bool) -> int:
-    """Prints what the recording holds; returns 1 if no calibration can come of it. For a bag that cannot be opened as a
-    recording of a pair, prints its topics.
+def check(
+    source: Source,
+    depth: Depth = None,
+    as_json: Json = False,
+) -> int:
+    """Show the content of a recording and whether it is suitable: exit 1 if it allows no calibration."""
+    from coec.evaluation.fitness import fitness_of
+    from coec.reports import console
+    from coec.reports.stage_times import StageTimes
+    from coec.sources import open_source
 
-    Raises:
-        UsageError, SourceError: the recording cannot be opened, or a file of it cannot be read.
-    """
     try:
         recording = open_source(source)
     except SourceError:
@@ -43,22 +42,28 @@ def run(source: str, *, depth: str | None, as_json: bool) -> int:
     with console.progress() as bars:
         times = StageTimes(bars)
         seen = fitness_of(recording)
-        times.step("look", 1, 1)
-        failed = any(remark.level == "fail" for remark in seen.remarks)
+        times.step("examine", 1, 1)
+        failed = any(note.level == "fail" for note in seen.remarks)
         trial = None if failed else _trial(recording, depth, times)
-    remarks = (*seen.remarks, *_of_trial(trial))
+    notes = (*seen.remarks, *_of_trial(trial))
     if as_json:
-        console.print_json(_document(source, replace(seen, remarks=remarks), trial))
+        console.print_json(_document(source, replace(seen, remarks=notes), trial))
     else:
-        _show(recording.name, replace(seen, remarks=remarks), trial)
+        _show(recording.name, replace(seen, remarks=notes), trial)
     return int(failed or isinstance(trial, CalibrationError))
 
 
 def _trial(recording: Recording, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
     """A calibration of a few pairs near the recording's own extrinsic: shows how well this scene fixes the pose."""
+    from coec.adapters.depth.maps import open_depth
+    from coec.adapters.images.codec import GreyImages
+    from coec.calibration.calibrator import calibrate
+    from coec.config import LimitsConfig
+    from coec.sources import windows
+
     loaded = windows.chosen_from(recording, PAIRS, lambda done, total: times.step("load", done, total))
     window = loaded.window
-    configuration = configuration_of(Choices(depth=depth), loaded.configuration)
+    configuration = configuration_of(SolverOptions(depth=depth), loaded.configuration)
     limits = LimitsConfig()
     try:
         return calibrate(window, open_depth(configuration.depth, limits), GreyImages(limits), configuration, times)
@@ -67,6 +72,8 @@ def _trial(recording: Recording, depth: str | None, times: StageTimes) -> Estima
 
 
 def _of_trial(trial: Estimate | CalibrationError | None) -> tuple[Remark, ...]:
+    from coec.evaluation.fitness import Remark
+
     if isinstance(trial, CalibrationError):
         return (Remark("fail", "no_calibration", str(trial)),)
     if trial is None:
@@ -75,6 +82,9 @@ def _of_trial(trial: Estimate | CalibrationError | None) -> tuple[Remark, ...]:
 
 
 def _document(source: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> dict[str, Any]:
+    from coec.adapters.files.conversions import degrees_or_null
+    from coec.calibration.types import Estimate
+
     document = {"source": source, **asdict(seen), "trial": None}
     if isinstance(trial, Estimate):
         document["trial"] = {
@@ -87,6 +97,9 @@ def _document(source: str, seen: Fitness, trial: Estimate | CalibrationError | N
 
 
 def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> None:
+    from coec.calibration.types import Estimate
+    from coec.reports import console
+
     console.show(f"{name}: {seen.seconds:.1f} s")
     streams = console.table("stream", "frames", "Hz", "longest gap", "what", right=(1, 2, 3))
     camera = f"{seen.width} x {seen.height} px"
@@ -106,21 +119,32 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
     )
     console.show(f"{seen.paired:.0%} of the camera frames have a sweep{sync}; {seen.in_view:.0%} of its points in view")
     if isinstance(trial, Estimate):
-        axes = console.table("axis", "from the recording's own", "± σ", "unit", right=(1, 2))
-        correction, sigma = degrees_or_null(trial.correction), degrees_or_null(trial.sigma)
-        for axis, axis_name in enumerate(console.AXIS_NAMES):
-            if sigma[axis] is not None:
-                found = console.figure(correction[axis], sign=True)
-                axes.add_row(axis_name, found, console.figure(sigma[axis]), console.UNITS[axis])
-        console.show(f"{count(trial.pairs, 'pair')}, tried at the recording's own extrinsic:")
-        console.out.print(axes)
-    for remark in seen.remarks:
-        console.show(f"{remark.level:4}  {remark.text}", LEVEL_STYLES[remark.level])
+        _show_trial(trial)
+    for note in seen.remarks:
+        console.show(f"{note.level:4}  {note.text}", LEVEL_STYLES[note.level])
     if not seen.remarks:
         console.show("nothing is missing", "green")
 
 
+def _show_trial(trial: Estimate) -> None:
+    from coec.adapters.files.conversions import degrees_or_null
+    from coec.reports import console
+    from coec.reports.page.words import count
+
+    axes = console.table("axis", "from the recording's own", "± σ", "unit", right=(1, 2))
+    correction, sigma = degrees_or_null(trial.correction), degrees_or_null(trial.sigma)
+    for axis, axis_name in enumerate(console.AXIS_NAMES):
+        if sigma[axis] is not None:
+            offset = console.figure(correction[axis], sign=True)
+            axes.add_row(axis_name, offset, console.figure(sigma[axis]), console.UNITS[axis])
+    console.show(f"{count(trial.pairs, 'pair')}, tried at the recording's own extrinsic:")
+    console.out.print(axes)
+
+
 def _show_topics(source: str) -> None:
+    from coec.reports import console
+    from coec.sources.spec import is_bag, parse_spec
+
     spec = parse_spec(source)
     if not is_bag(spec):
         return

@@ -3,27 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.rig import check_given, rig_of
-from coec.adapters.tls.conversation import Listener, credentials_of
-from coec.adapters.zenoh.settings import check_certificates, settings_of, where
-from coec.config import (
-    CameraConfig,
-    CameraIntrinsics,
-    Config,
-    EgoConfig,
-    LidarConfig,
-    OpenPairConfig,
-    PairConfig,
-    StateConfig,
-    SweepConfig,
-    config_hash,
-    load_config,
-)
+import typer
+
+from coec.cli.options import Json
 from coec.errors import ConfigError, ModelError, UsageError, require_readable
-from coec.reports import console
-from coec.reports.commented_yaml import commented_yaml
+
+if TYPE_CHECKING:
+    from coec.config import Config, OpenPairConfig, PairConfig
 
 TEMPLATE_HEAD = """\
 # Configuration of coec. Every key stands here with its default, except for what only you can know: the names, keys,
@@ -32,24 +20,31 @@ TEMPLATE_HEAD = """\
 """
 
 
-def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
-    """Prints the effective configuration of a file, or a template.
+def check_config(
+    file: Annotated[Path | None, typer.Argument(help="Configuration (YAML).", show_default=False, readable=False)] = (
+        None
+    ),
+    defaults: Annotated[bool, typer.Option("--defaults", help="Print a commented template instead.")] = False,
+    as_json: Json = False,
+) -> int:
+    """Print the effective configuration with every default; exit 78 if it, or a file it names, cannot be used."""
+    from coec.adapters.tls.conversation import Listener, credentials_of
+    from coec.adapters.zenoh.settings import check_certificates, settings_of, where
+    from coec.config import config_hash, load_config
+    from coec.reports import console
+    from coec.reports.commented_yaml import commented_yaml
 
-    Raises:
-        ConfigError: the file, or a file that it names, cannot be used.
-        UsageError: neither or both were requested.
-    """
-    if defaults == (path is not None):
+    if defaults == (file is not None):
         raise UsageError("give a configuration file, or --defaults")
-    if path is None:
+    if file is None:
         if as_json:
             console.print_json({"config": example().model_dump(mode="json")})
         else:
             console.show_lines(template().rstrip("\n"))
         return 0
-    config = load_config(path)
+    config = load_config(file)
     checks = [check for pair in config.pairs for check in _check(pair, config)]
-    checks += [check for pair in config.awaited for check in _check_awaited(pair, config)]
+    checks += [check for pair in config.awaited for check in _check_undiscovered(pair, config)]
     if config.left_out:
         checks.append(f"no pairs of sensors that see nothing in common: {', '.join(config.left_out)}")
     if config.zenoh.file is not None:
@@ -74,11 +69,24 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
 
 def template() -> str:
     """The commented template."""
+    from coec.reports.commented_yaml import commented_yaml
+
     return TEMPLATE_HEAD + commented_yaml(example())
 
 
 def example() -> Config:
     """A vehicle with one fisheye camera and one spinning LiDAR, defaults everywhere else."""
+    from coec.config import (
+        CameraConfig,
+        CameraIntrinsics,
+        Config,
+        EgoConfig,
+        LidarConfig,
+        PairConfig,
+        StateConfig,
+        SweepConfig,
+    )
+
     intrinsics = CameraIntrinsics(
         model="double_sphere", width=1400, height=1400, fx=430.0, fy=430.0, cx=699.5, cy=699.5, xi=-0.2, alpha=0.6
     )
@@ -94,28 +102,34 @@ def example() -> Config:
 
 
 def _check(pair: PairConfig, config: Config) -> list[str]:
-    """What was found usable for a pair; reads the mask and opens the network.
+    """What is usable of a pair; reads the mask and opens the network.
 
     Raises:
         ConfigError: the rig or the network cannot be used.
     """
+    from coec.adapters.files.rig import rig_of
+
     rig = rig_of(pair)
     mask = f", mask {pair.camera.mask}" if rig.mask is not None else ""
     return [f"pair {pair.name}: rig {pair.camera.intrinsics.model}{mask}", _check_network(pair, config)]
 
 
-def _check_awaited(pair: OpenPairConfig, config: Config) -> list[str]:
-    """What was found usable for a pair whose rig the service finds from its sensors.
+def _check_undiscovered(pair: OpenPairConfig, config: Config) -> list[str]:
+    """What is usable of a pair whose rig the service discovers from its sensors.
 
     Raises:
         ConfigError: the given parts of the rig, or the network, cannot be used.
     """
+    from coec.adapters.files.rig import check_given
+
     check_given(pair)
-    found = "its frames, and what else is left out, come from /tf_static and CameraInfo when the service runs"
-    return [f"pair {pair.name}: {found}", _check_network(pair, config)]
+    rig = "its frames, and what else is left out, come from /tf_static and CameraInfo when the service runs"
+    return [f"pair {pair.name}: {rig}", _check_network(pair, config)]
 
 
 def _check_network(pair: OpenPairConfig, config: Config) -> str:
+    from coec.adapters.depth.maps import open_depth
+
     try:
         depth = open_depth(pair.calibration.depth, config.limits)
     except ModelError as error:

@@ -5,32 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
+import typer
 
-from coec.adapters.depth.maps import CachedDepth, open_depth
-from coec.adapters.files.baseline_file import baseline_hash, baseline_to_json, load_baselines, save_baseline
-from coec.adapters.files.output import try_file
-from coec.adapters.images.codec import CachedGreys, GreyImages
-from coec.calibration.commissioning.baseline import Baseline
-from coec.calibration.commissioning.learning import MAX_PAIRS, commission
-from coec.calibration.ports import DepthModel, ImageReader
-from coec.calibration.types import Window
-from coec.cli.commands.commission import Options
-from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
+from coec.calibration_options import SolverOptions, configuration_of
+from coec.cli.options import SOURCE_HELP, Depth, Dof, Frames, Json, Objective
 from coec.errors import UsageError
-from coec.library.choices import Choices, configuration_of
-from coec.reports import console, page, provenance
-from coec.reports.baseline_page import baselines_page
-from coec.reports.page.words import count
-from coec.reports.stage_times import StageTimes
-from coec.sources import windows
+
+if TYPE_CHECKING:
+    from coec.calibration.commissioning.baseline import Baseline
+    from coec.calibration.ports import DepthModel, ImageReader
+    from coec.calibration.types import Window
+    from coec.config import CalibrationConfig
+    from coec.reports.stage_times import StageTimes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rigged:
-    """Windows of one rig, and what is needed to look at them."""
+class RigWindows:
+    """Windows of one rig, and what is needed to evaluate them."""
 
     windows: tuple[Window, ...]
     configuration: CalibrationConfig
@@ -38,68 +31,106 @@ class Rigged:
     images: ImageReader
 
 
-def run(options: Options) -> int:
-    """Prints and writes the baseline.
+def commission(
+    sources: Annotated[list[str], typer.Argument(metavar="SOURCE...", help=SOURCE_HELP, show_default=False)],
+    output: Annotated[
+        Path,
+        typer.Option(
+            help="Baseline to write, or to add the pair to; a report page is written beside it.", metavar="FILE"
+        ),
+    ] = Path("rig.json"),
+    depth: Depth = None,
+    objective: Objective = None,
+    dof: Dof = None,
+    frames: Frames = None,
+    false_alarm_rate: Annotated[
+        float, typer.Option(help="Fraction of checks at a right extrinsic that may be flagged.", min=1e-4, max=0.2)
+    ] = 0.01,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sensor",
+            help="Serial number of a sensor: camera=SERIAL or lidar=SERIAL; repeatable.",
+            metavar="STREAM=SERIAL",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Learn the baseline of a rig from windows in which its calibration is right: bias, spread, every limit."""
+    from coec.adapters.files.baseline_file import load_baselines, save_baseline
+    from coec.adapters.files.output import try_file
+    from coec.calibration.commissioning.learning import commission as learn
+    from coec.reports import console, page, provenance
+    from coec.reports.baseline_page import baselines_page
+    from coec.reports.stage_times import StageTimes
 
-    Raises:
-        CoecError: no baseline can be learned.
-    """
-    sensors = sensors_of(options.sensors or ())
-    try_file(options.output)
+    serials = _serials_of(sensors or ())
+    try_file(output)
+    given = SolverOptions(depth=depth, objective=objective, dof=None if dof is None else int(dof), frames=frames)
     with console.progress() as bars:
         times = StageTimes(bars)
-        rigged = load(options.sources, options, times)
-        baseline = commission(
-            rigged.windows,
-            rigged.depth,
-            rigged.images,
-            rigged.configuration,
-            sensors=sensors,
-            false_alarm_rate=options.false_alarm_rate,
+        rig = load(sources, given, times)
+        baseline = learn(
+            rig.windows,
+            rig.depth,
+            rig.images,
+            rig.configuration,
+            sensors=serials,
+            false_alarm_rate=false_alarm_rate,
             progress=times,
         )
-    save_baseline(options.output, baseline)
-    told = page.write(
-        _page_beside(options.output),
-        baselines_page(
-            load_baselines(options.output), baseline.pair, options.sources, options.output.name, provenance.here()
-        ),
+    save_baseline(output, baseline)
+    report = page.write(
+        _page_for(output),
+        baselines_page(load_baselines(output), baseline.pair, sources, output.name, provenance.here()),
     )
-    if options.as_json:
+    if as_json:
         console.print_json(document_of(baseline))
     else:
         show(baseline)
-        console.show(f"written to {options.output}, with a page of it, {told.name}, beside it")
+        console.show(f"written to {output}, with a page of it, {report.name}, beside it")
     return 0
 
 
-def _page_beside(path: Path) -> Path:
+def _page_for(path: Path) -> Path:
     """`rig.html` for `rig.json`; never the baseline itself."""
     return path.with_suffix(".page.html" if path.suffix == ".html" else ".html")
 
 
-def load(sources: Sequence[str], options: Options, times: StageTimes) -> Rigged:
+def load(sources: Sequence[str], options: SolverOptions, times: StageTimes) -> RigWindows:
     """The windows of all sources, with the configuration of the first.
 
     Raises:
         UsageError: no source, or an unknown value.
     """
+    from coec.adapters.depth.maps import CachedDepth, open_depth
+    from coec.adapters.images.codec import CachedGreys, GreyImages
+    from coec.calibration.commissioning.learning import MAX_PAIRS
+    from coec.config import LimitsConfig, WindowConfig
+    from coec.sources import windows
+
     if not sources:
         raise UsageError("name at least one recording of a rig whose calibration is right")
     loaded = [
-        windows.load(source, options.frames, WindowConfig().pairs, lambda done, total: times.step("load", done, total))
+        windows.load(
+            source,
+            options.get("frames"),
+            WindowConfig().pairs,
+            lambda done, total: times.step("load", done, total),
+        )
         for source in sources
     ]
-    dof = None if options.dof is None else int(options.dof)
-    choices = Choices(depth=options.depth, objective=options.objective, dof=dof)
-    configuration = configuration_of(choices, loaded[0].configuration)
+    configuration = configuration_of(options, loaded[0].configuration)
     depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), MAX_PAIRS)
     images = CachedGreys(GreyImages(LimitsConfig()), MAX_PAIRS)
-    found = tuple(replace(one.window, T_camera_lidar_start=one.window.rig.T_camera_lidar_nominal) for one in loaded)
-    return Rigged(found, configuration, depth, images)
+    at_nominal = tuple(
+        replace(one.window, T_camera_lidar_start=one.window.rig.T_camera_lidar_nominal) for one in loaded
+    )
+    return RigWindows(at_nominal, configuration, depth, images)
 
 
-def sensors_of(named: Sequence[str]) -> dict[str, str]:
+def _serials_of(named: Sequence[str]) -> dict[str, str]:
     """Serial numbers by stream, from `camera=SERIAL` and the like.
 
     Raises:
@@ -116,18 +147,26 @@ def sensors_of(named: Sequence[str]) -> dict[str, str]:
 
 def document_of(baseline: Baseline) -> dict[str, Any]:
     """What `--json` prints: the baseline as it is written, its hash, and bias and spread in degrees and metres."""
+    import numpy as np
+
+    from coec.adapters.files.baseline_file import baseline_hash, baseline_to_json
+
     sigma = baseline.accuracy.sigma(baseline.pairs)
     return {
         "baseline": baseline_to_json(baseline),
         "hash": baseline_hash(baseline),
-        "bias": _in_degrees(baseline.bias),
-        "bias_sigma": _in_degrees(np.nan_to_num(baseline.bias_sigma)),
-        "sigma_of_a_window": _in_degrees(np.nan_to_num(sigma)),
+        "bias": in_degrees(baseline.bias),
+        "bias_sigma": in_degrees(np.nan_to_num(baseline.bias_sigma)),
+        "sigma_of_a_window": in_degrees(np.nan_to_num(sigma)),
     }
 
 
 def show(baseline: Baseline) -> None:
     """Prints the baseline for people."""
+    from coec.adapters.files.baseline_file import baseline_hash
+    from coec.reports import console
+    from coec.reports.page.words import count
+
     console.show(
         f"{baseline.pair}: commissioned from {count(baseline.pairs, 'pair')} of "
         f"{count(baseline.windows, 'window')}, hash {baseline_hash(baseline)}"
@@ -137,18 +176,32 @@ def show(baseline: Baseline) -> None:
 
 def show_learned(baseline: Baseline) -> None:
     """Prints bias, limits, and what the limits detect, as tables."""
+    from coec.reports import console
+
     table = console.table("axis", "bias", "± σ", "σ of a check at 6 pairs", "unit", right=(1, 2, 3))
-    bias, known = _in_degrees(baseline.pose.bias), _in_degrees(baseline.pose.bias_sigma)
-    of_check = _in_degrees(baseline.pose.sigma(6))
+    bias, bias_sigma = in_degrees(baseline.pose.bias), in_degrees(baseline.pose.bias_sigma)
+    of_check = in_degrees(baseline.pose.sigma(6))
     for axis, name in enumerate(console.AXIS_NAMES):
         table.add_row(
             name,
             console.figure(bias[axis], sign=True),
-            console.figure(known[axis]),
+            console.figure(bias_sigma[axis]),
             console.figure(of_check[axis]),
             console.UNITS[axis],
         )
     console.out.print(table)
+    _show_limits(baseline)
+    detected = ", ".join(f"{name} {100 * share:.0f} %" for name, share in baseline.detected.items())
+    console.show(
+        f"at {100 * baseline.false_alarm_rate:g} % false alarms, checks of the moved extrinsic flagged: {detected}"
+    )
+
+
+def _show_limits(baseline: Baseline) -> None:
+    import numpy as np
+
+    from coec.reports import console
+
     limits = console.table("limit of a check", "value", right=(1,))
     monitor = baseline.monitor
     for name, value in (
@@ -168,13 +221,11 @@ def show_learned(baseline: Baseline) -> None:
         for name, value in sorted(baseline.limits.items()):
             verdicts.add_row(name, console.figure(value))
         console.out.print(verdicts)
-    caught = ", ".join(f"{name} {100 * share:.0f} %" for name, share in baseline.detected.items())
-    console.show(
-        f"at {100 * baseline.false_alarm_rate:g} % false alarms, looks at the moved extrinsic flagged: {caught}"
-    )
 
 
-def _in_degrees(rad_m: Any) -> list[float]:
+def in_degrees(rad_m: Any) -> list[float]:
+    import numpy as np
+
     values = np.array(rad_m, dtype=np.float64)
     values[:3] = np.degrees(values[:3])
     return [float(value) for value in values]

@@ -7,36 +7,19 @@ from contextlib import suppress
 from dataclasses import replace
 from math import floor
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
+import typer
 
-from coec.adapters.depth.maps import STEREO
-from coec.adapters.files import output
-from coec.adapters.files.rig import intrinsics_config, mask_to_png, matrix_rows
-from coec.adapters.mcap.bag_writer import write_bag
-from coec.adapters.zenoh.player import Streams
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
-from coec.cli.commands.convert import Options
-from coec.config import (
-    CalibrationConfig,
-    CameraConfig,
-    Config,
-    DepthConfig,
-    EgoConfig,
-    LidarConfig,
-    PairConfig,
-    StateConfig,
-    SweepConfig,
-    WindowConfig,
-)
+from coec.cli.options import Force, Json, Source
 from coec.errors import OutputError, UsageError
-from coec.reports import console
-from coec.reports.commented_yaml import commented_yaml, short_yaml
-from coec.sources import Recording, open_source
+
+if TYPE_CHECKING:
+    from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+    from coec.config import CalibrationConfig, PairConfig, SweepConfig, WindowConfig
+    from coec.sources import Recording
 
 NS_PER_S = 1_000_000_000
-
 
 ALWAYS = (
     "vehicle",
@@ -58,26 +41,37 @@ COMMENTS = {
 """Comments on keys of a short configuration."""
 
 
-def run(options: Options) -> int:
-    """Writes OUT.
+def convert(
+    source: Source,
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help="OUT.mcap: one ROS 2 MCAP of all frames. OUT.yaml: a daemon configuration for this recording.",
+            show_default=False,
+        ),
+    ],
+    full: Annotated[
+        bool,
+        typer.Option("--full", help="OUT.yaml with every key and a comment on each, not only what has no default."),
+    ] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> int:
+    """Turn a recording into a ROS 2 MCAP, or into a configuration with which `run` serves it."""
+    from coec.adapters.files import output
+    from coec.reports import console
+    from coec.sources import open_source
 
-    Raises:
-        UsageError: OUT is neither .mcap nor .yaml.
-        OutputError: OUT cannot be written, or is there already.
-        SourceError: the recording cannot be read.
-    """
-    out = options.out
     if out.suffix not in (".mcap", ".yaml", ".yml"):
         raise UsageError(f"{out}: OUT must end in .mcap (ROS 2 bag) or .yaml (daemon configuration)")
-    if options.full and out.suffix == ".mcap":
+    if full and out.suffix == ".mcap":
         raise UsageError("--full belongs to a configuration, OUT.yaml")
-    output.require_absent(out, force=options.force)
-    recording = open_source(options.source)
-    if out.suffix == ".mcap":
-        written = _bag(recording, out)
-    else:
-        written = _configuration(recording, out, full=options.full, force=options.force)
-    if options.as_json:
+    output.require_absent(out, force=force)
+    recording = open_source(source)
+    is_bag = out.suffix == ".mcap"
+    written = _bag(recording, out) if is_bag else _configuration(recording, out, full=full, force=force)
+    if as_json:
         console.print_json({"written": [str(path) for path in written]})
     else:
         for path in written:
@@ -90,6 +84,11 @@ def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path 
 
     Its window is one that the recording can fill, see `_window`.
     """
+    from coec.adapters.files.rig import intrinsics_config, matrix_rows
+    from coec.adapters.zenoh.player import Streams
+    from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+    from coec.config import CameraConfig, EgoConfig, LidarConfig, PairConfig
+
     rig = recording.rig
     streams = Streams.default(rig.pair)
     first = first_frames(recording)
@@ -120,6 +119,8 @@ def _window(camera_stamps_ns: Sequence[int]) -> WindowConfig:
     window needs, the whole recording is one slice, and half of the frames are enough: too few would be left as soon as
     some are refused, because the vehicle stood.
     """
+    from coec.config import WindowConfig
+
     window = WindowConfig()
     frames = len(camera_stamps_ns)
     length_s = (camera_stamps_ns[-1] - camera_stamps_ns[0]) / NS_PER_S
@@ -134,6 +135,9 @@ def _window(camera_stamps_ns: Sequence[int]) -> WindowConfig:
 
 def _calibration(camera: CameraFrame) -> CalibrationConfig:
     """The defaults, with the depth maps of the recording where it has them."""
+    from coec.adapters.depth.maps import STEREO
+    from coec.config import CalibrationConfig, DepthConfig
+
     return CalibrationConfig() if camera.depth is None else CalibrationConfig(depth=DepthConfig(model=STEREO))
 
 
@@ -143,6 +147,13 @@ def first_frames(recording: Recording) -> list[CameraFrame | LidarFrame | EgoMot
 
 
 def _configuration(recording: Recording, out: Path, *, full: bool, force: bool) -> list[Path]:
+    import numpy as np
+
+    from coec.adapters.files import output
+    from coec.adapters.files.rig import mask_to_png
+    from coec.config import Config, StateConfig
+    from coec.reports.commented_yaml import commented_yaml, short_yaml
+
     mask, mask_path = recording.rig.mask, out.with_name(f"{out.stem}-mask.png")
     if mask is not None:
         output.require_absent(mask_path, force=force)
@@ -169,6 +180,10 @@ def _configuration(recording: Recording, out: Path, *, full: bool, force: bool) 
 
 
 def _bag(recording: Recording, out: Path) -> list[Path]:
+    from coec.adapters.mcap.bag_writer import write_bag
+    from coec.calibration.types import CameraFrame
+    from coec.reports import console
+
     depth = any(isinstance(frame, CameraFrame) and frame.depth is not None for frame in first_frames(recording))
     if depth:
         console.say("coec: depth maps have no place in a ROS 2 bag of sensors and are left out")
@@ -195,6 +210,10 @@ def _bag(recording: Recording, out: Path) -> list[Path]:
 
 
 def _sweep(rig: Rig) -> SweepConfig | None:
+    import numpy as np
+
+    from coec.config import SweepConfig
+
     if rig.sweep is None:
         return None
     sign: Literal[-1, 1] = 1 if rig.sweep.sign > 0 else -1

@@ -2,66 +2,124 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from coec.adapters.exports.extrinsic import Extrinsic
-from coec.adapters.exports.told import Frames, intrinsics_config_of, of_reply, of_result, pose_of
-from coec.adapters.files import output
-from coec.adapters.files.rig import intrinsics_config
-from coec.adapters.mcap.windows import read_result, read_window
-from coec.calibration.types import Matrix4
-from coec.cli.commands.export import Options
-from coec.cli.one_pair import pair_named
-from coec.config import CameraIntrinsics, Config, load_config
+import typer
+
+from coec.cli.options import Json, pair_named, suggesting
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.library.exporting import MAX_BYTES, accepted, known, text_of
-from coec.reports import console
-from coec.runtime.api.exports import exported
-from coec.runtime.decisions.state_store import STATE_FILE, read_pairs
-from coec.runtime.nominal.kept import with_kept
-from coec.schemas.base import from_json
-from coec.schemas.replies import CalibrationResult, ExtrinsicReply
-from coec.sources.reading import read_bytes
+
+if TYPE_CHECKING:
+    from coec.adapters.exports.extrinsic import Extrinsic
+    from coec.adapters.exports.told import Frames
+    from coec.calibration.types import Matrix4
+    from coec.config import CameraIntrinsics, Config
 
 
-def run(options: Options) -> int:
-    """Writes the file, or prints it.
+def _formats() -> Iterable[str]:
+    from coec.adapters.exports import FORMATS
 
-    Raises:
-        UsageError: no such format, or an option that does not fit.
-        SourceError, WindowError, StateError: the source cannot be read, or holds no calibration.
-        NotAcceptedError: the calibration is not accepted, and `--force` was not given.
-        OutputError: the file cannot be written, or its content cannot be changed.
-    """
-    known(options.format)
-    extrinsic = _read(options)
-    accepted(extrinsic, str(options.source), "--force", force=options.force)
-    text = text_of(extrinsic, options.format, options.output)
-    if options.output is not None:
-        output.replace(options.output, text.encode())
-    if options.as_json:
-        written = None if options.output is None else str(options.output)
-        console.print_json({"format": options.format, "text": text, "written": written})
-    elif options.output is None:
+    return tuple(FORMATS)
+
+
+CalibrationSource = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SOURCE",
+        help="A state directory, a recorded window (.mcap), the JSON of `calibrate` or of `query extrinsic`.",
+        show_default=False,
+    ),
+]
+Format = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        help="tf, urdf, autoware, kalibr, kitti, kitti360, nuscenes, openlabel, colmap, opencv or json.",
+        metavar="NAME",
+        autocompletion=suggesting(_formats),
+        show_default=False,
+    ),
+]
+ParentPose = Annotated[
+    str | None,
+    typer.Option(
+        help="Pose of the LiDAR in the parent: metres and a quaternion.",
+        metavar="X,Y,Z,QX,QY,QZ,QW",
+        show_default="the LiDAR is the parent",
+    ),
+]
+OutputFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="File to write, completely or not at all; in a file with several entries only this one changes. "
+        "Default: print it.",
+        metavar="FILE",
+    ),
+]
+
+
+def export(
+    source: CalibrationSource,
+    format: Format,
+    parent: Annotated[str | None, typer.Option(help="Parent frame in the file.", show_default="the LiDAR's")] = None,
+    child: Annotated[
+        str | None, typer.Option(help="Name of the camera's frame in the file.", show_default="the camera's")
+    ] = None,
+    parent_pose: ParentPose = None,
+    pair: Annotated[str | None, typer.Option(help="Pair, if there are several.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Configuration of the daemon, for intrinsics and frames.", metavar="FILE")
+    ] = None,
+    output: OutputFile = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write a calibration that is not accepted, too; the file says so.")
+    ] = False,
+    as_json: Json = False,
+) -> int:
+    """Write a calibration into the files of other programs: exit 1 if it is not accepted."""
+    from coec.adapters.exports.told import Frames
+    from coec.adapters.files import output as files
+    from coec.recording import export_text, require_accepted, require_format
+    from coec.reports import console
+
+    require_format(format)
+    frames = Frames(parent, child, _pose(parent_pose))
+    extrinsic = _read(source, config, pair, frames)
+    require_accepted(extrinsic, str(source), "--force", force=force)
+    text = export_text(extrinsic, format, output)
+    if output is not None:
+        files.replace(output, text.encode())
+    if as_json:
+        written = None if output is None else str(output)
+        console.print_json({"format": format, "text": text, "written": written})
+    elif output is None:
         console.write(text)
     else:
-        console.show(f"{options.output}  {extrinsic.child} in {extrinsic.parent}, {extrinsic.origin.provenance}")
+        console.show(f"{output}  {extrinsic.child} in {extrinsic.parent}, {extrinsic.origin.provenance}")
     return 0
 
 
-def _read(options: Options) -> Extrinsic:
-    config = None if options.config is None else with_kept(load_config(options.config))
-    frames = Frames(options.parent, options.child, _pose(options.parent_pose))
-    source = options.source
+def _read(source: Path, config: Path | None, pair: str | None, frames: Frames) -> Extrinsic:
+    from coec.config import load_config
+    from coec.runtime.decisions.state_store import STATE_FILE
+    from coec.runtime.nominal.kept import with_kept
+
+    loaded = None if config is None else with_kept(load_config(config))
     if source.is_dir() or source.name == STATE_FILE:
-        return _of_state(source if source.is_dir() else source.parent, options.pair, config, frames)
+        return _of_state(source if source.is_dir() else source.parent, pair, loaded, frames)
     if source.suffix == ".mcap":
         return _of_window(source, frames)
-    return _of_document(source, None if config is None else pair_named(config, options.pair).camera.intrinsics, frames)
+    return _of_document(source, None if loaded is None else pair_named(loaded, pair).camera.intrinsics, frames)
 
 
 def _of_window(path: Path, frames: Frames) -> Extrinsic:
+    from coec.adapters.exports.told import of_result
+    from coec.adapters.files.rig import intrinsics_config
+    from coec.adapters.mcap.windows import read_result, read_window
+
     result = read_result(path)
     if result is None:
         raise SourceError(f"{path} holds no result: `coec calibrate {path} --output DIR` makes one")
@@ -70,7 +128,13 @@ def _of_window(path: Path, frames: Frames) -> Extrinsic:
 
 
 def _of_document(path: Path, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
-    data = read_bytes(path, MAX_BYTES)
+    from coec.adapters.exports.told import of_reply, of_result
+    from coec.recording import MAX_EXPORT_BYTES
+    from coec.schemas.base import from_json
+    from coec.schemas.replies import CalibrationResult, ExtrinsicReply
+    from coec.sources.reading import read_bytes
+
+    data = read_bytes(path, MAX_EXPORT_BYTES)
     with suppress(DecodeError):
         return of_result(from_json(CalibrationResult, data), camera, frames)
     with suppress(DecodeError):
@@ -83,25 +147,31 @@ def _of_document(path: Path, camera: CameraIntrinsics | None, frames: Frames) ->
 
 def _of_state(folder: Path, name: str | None, config: Config | None, frames: Frames) -> Extrinsic:
     """The calibration that the service of a state directory serves, with its full covariance."""
+    from coec.adapters.exports.told import intrinsics_config_of
+    from coec.runtime.api.exports import exported
+    from coec.runtime.decisions.state_store import read_pairs
+
     pairs = read_pairs(folder)
     if name is None and len(pairs) != 1:
-        raise UsageError(f"{folder} holds the pairs {', '.join(sorted(pairs))}: choose one with --pair")
-    chosen = next(iter(pairs)) if name is None else name
-    if chosen not in pairs:
-        raise UsageError(f"{folder} holds no pair {chosen}; it holds {', '.join(sorted(pairs))}")
-    stored, state = pairs[chosen]
+        raise UsageError(f"{folder} holds the pairs {', '.join(sorted(pairs))}: name one with --pair")
+    served = next(iter(pairs)) if name is None else name
+    if served not in pairs:
+        raise UsageError(f"{folder} holds no pair {served}; it holds {', '.join(sorted(pairs))}")
+    stored, state = pairs[served]
     if config is not None:
-        pair = pair_named(config, chosen)
+        pair = pair_named(config, served)
         own = (pair.lidar.frame_id, pair.camera.frame_id)
-        return exported(state, config.vehicle, chosen, own, pair.camera.intrinsics, frames)
+        return exported(state, config.vehicle, served, own, pair.camera.intrinsics, frames)
     if stored.accepted is None:
-        raise UsageError(f"{folder}: nothing was accepted yet; --config says which frames the nominal calibration has")
+        raise UsageError(f"{folder}: nothing was accepted yet; --config gives the frames of the nominal calibration")
     own = (stored.accepted.lidar_frame, stored.accepted.camera_frame)
     camera = intrinsics_config_of(stored.accepted.intrinsics)
-    return exported(state, stored.accepted.vehicle, chosen, own, camera, frames)
+    return exported(state, stored.accepted.vehicle, served, own, camera, frames)
 
 
 def _pose(text: str | None) -> Matrix4 | None:
+    from coec.adapters.exports.told import pose_of
+
     if text is None:
         return None
     try:

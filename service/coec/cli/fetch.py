@@ -1,51 +1,34 @@
-"""`coec fetch`: fetches what a vehicle keeps of a red event, over whatever link there is, and makes a page of it.
+"""`coec fetch`: fetches what a vehicle stores of a red event, over whatever link there is, and makes a page of it.
 
 Nothing that a vehicle sends is trusted: names become file names only where they are valid names, sizes are bounded, and
-what a document says about itself is compared with what was asked for.
+what a document says about itself is compared with what was requested.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
-import zenoh
+import typer
 
 from coec import __version__
-from coec.adapters.files import output
-from coec.adapters.images.codec import decode_bgr, probe
-from coec.adapters.mcap.windows import read_result
-from coec.adapters.zenoh.client import ask, ask_one, connected_by, nobody
-from coec.adapters.zenoh.window_fetch import MAX_WINDOW_BYTES, Recording, fetch_window
-from coec.cli.commands.fetch import Options
-from coec.cli.query import OF_PAIR, asked_of
-from coec.config import LimitsConfig
+from coec.cli.options import Connect, Json, Prefix, SessionFile, service_address
+from coec.cli.query import OF_PAIR
 from coec.errors import CoecError, DecodeError, NotFoundError, OutputError, RemoteError, UsageError, WindowError
-from coec.reports import console, incident_page, provenance, replies
-from coec.reports.fleet_board import duration
-from coec.reports.page import render
-from coec.schemas.base import SCHEMA_VERSION, Message, from_json, json_value, to_json
-from coec.schemas.incident import Absent, FetchedFile, FetchedWindow, IncidentReport
-from coec.schemas.keys import Keys
-from coec.schemas.last_word import read as read_word
-from coec.schemas.replies import (
-    ChainedEntry,
-    EvidenceEvent,
-    EvidenceReply,
-    ExtrinsicReply,
-    HealthReply,
-    HistoryReply,
-    StatusReply,
-    WindowInfo,
-    WindowsReply,
-)
-from coec.schemas.rig_state import RigReply
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from coec.adapters.zenoh.window_fetch import Recording
+    from coec.schemas.base import Message
+    from coec.schemas.incident import Absent, FetchedFile, FetchedWindow, IncidentReport
+    from coec.schemas.keys import Keys
+    from coec.schemas.replies import ChainedEntry, EvidenceEvent, HistoryReply, WindowsReply
 
 LATEST: Final = "latest"
 VEHICLE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -59,9 +42,11 @@ SNIPPET_NS: Final = 60 * 1_000_000_000
 MAX_SNIPPETS: Final = 16
 """Most snippets of one event. A suspicion, the event, and its end within a minute make three."""
 
-MAX_RECORDED_BYTES: Final = MAX_WINDOW_BYTES
+MAX_RECORDED_BYTES: Final = 2**32
 """Most bytes of the recordings of one event together, two windows and its snippets, as the vehicle claims them: as much
 as is fetched of one window. Two windows and three snippets have some 500 MB."""
+
+MAX_PICTURE_BYTES: Final = 16 * 2**20
 
 ENTRIES: Final = 300
 """Most entries of the history, some 6 kB each."""
@@ -71,40 +56,64 @@ WAIT_S: Final = 0.5
 
 WAITS: Final = frozenset({"uplink_busy", "busy", "not_drawn"})
 
-PICTURE: Final = LimitsConfig(max_message_bytes=16 * 2**20)
-
 PAGE = "index.html"
 REPORT = "incident.json"
 
-M = TypeVar("M", bound=Message)
+M = TypeVar("M", bound="Message")
 
 
-def run(options: Options) -> int:
-    """Fetches an event, or lists events; returns 1 if something that the vehicle keeps could not be fetched.
+def fetch(
+    vehicle: Annotated[str, typer.Argument(metavar="VEHICLE", help="Name of the vehicle.", show_default=False)],
+    event: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="EVENT",
+            help="Id of a red event, or `latest`; without it, the vehicle's red events are listed.",
+            show_default=False,
+        ),
+    ] = None,
+    pair: Annotated[str | None, typer.Option(help="Pair whose events are searched.", show_default="all")] = None,
+    prefix: Prefix = None,
+    connect: Connect = None,
+    zenoh: SessionFile = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder to write.", metavar="DIR", show_default="VEHICLE-EVENT")
+    ] = None,
+    no_windows: Annotated[bool, typer.Option("--no-windows", help="Do not download the recordings.")] = False,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", help="Seconds to wait for the router and for each answer.", min=0.1)
+    ] = 10.0,
+    patience_s: Annotated[
+        float,
+        typer.Option("--patience", help="Seconds without a piece of a window before giving up.", min=0.1),
+    ] = 120.0,
+    as_json: Json = False,
+) -> int:
+    """Fetch a red event into one folder: pictures, recordings, history, and a report page.
 
-    Raises:
-        UsageError: an argument is no valid name.
-        ConnectionFailedError: no router answered.
-        NotFoundError: no such event, or the vehicle does not answer; then its last word is given, if kept.
-        RemoteError: an error reply, or an answer about something else.
-        OutputError: the folder cannot be written.
+    The same command resumes an interrupted download.
     """
-    if not VEHICLE.fullmatch(options.vehicle):
-        raise UsageError(f"{options.vehicle!a} is no name of a vehicle")
-    if options.pair is not None and not VEHICLE.fullmatch(options.pair):
-        raise UsageError(f"{options.pair!a} is no name of a pair")
-    if options.event not in (None, LATEST) and not OF_PAIR.fullmatch(str(options.event)):
-        raise UsageError(f"{options.event!a} is no red event: `coec fetch {options.vehicle}` lists them")
-    asked = asked_of(None, options.vehicle, options.prefix, options.connect, options.zenoh)
-    keys = Keys(asked.prefix, asked.vehicle)
-    with connected_by(asked.way, options.timeout_s) as session:
-        events = _events(session, keys, options)
-        if options.event is None:
-            return _list(events, options)
-        event = _chosen(events, options)
-        folder = options.output or Path(f"{keys.vehicle}-{event.event_id}")
-        report = _Fetch(session, keys, event.pair, folder, options).fetch(event.event_id)
-    if options.as_json:
+    from coec.adapters.zenoh.client import connected_by
+    from coec.reports import console, incident_page
+    from coec.schemas.keys import Keys
+
+    if not VEHICLE.fullmatch(vehicle):
+        raise UsageError(f"{vehicle!a} is no name of a vehicle")
+    if pair is not None and not VEHICLE.fullmatch(pair):
+        raise UsageError(f"{pair!a} is no name of a pair")
+    if event not in (None, LATEST) and not OF_PAIR.fullmatch(str(event)):
+        raise UsageError(f"{event!a} is no red event: `coec fetch {vehicle}` lists them")
+    address = service_address(None, vehicle, prefix, connect, zenoh)
+    keys = Keys(address.prefix, address.vehicle)
+    with connected_by(address.way, timeout_s) as session:
+        events = _events(session, keys, pair, timeout_s)
+        if event is None:
+            return _list(events, vehicle, as_json=as_json)
+        selected = _select(events, event, vehicle)
+        folder = output or Path(f"{keys.vehicle}-{selected.event_id}")
+        download = Download(session, keys, selected.pair, folder, timeout_s, patience_s, with_windows=not no_windows)
+        report = download.fetch(selected.event_id)
+    if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
         console.show(f"{folder / PAGE}  {incident_page.sentence(report)}")
@@ -113,31 +122,39 @@ def run(options: Options) -> int:
     return 1 if report.absent else 0
 
 
-def _events(session: zenoh.Session, keys: Keys, options: Options) -> list[EvidenceEvent]:
-    """Red events of the chosen pairs, the latest last."""
-    selector = f"{keys.evidence(options.pair or '*')}?format=json"
-    answers = ask(session, selector, options.timeout_s)
+def _events(session: zenoh.Session, keys: Keys, pair: str | None, timeout_s: float) -> list[EvidenceEvent]:
+    """Red events of the pair (None: of every pair), the latest last."""
+    from coec.adapters.zenoh.client import ask
+    from coec.schemas.base import from_json
+    from coec.schemas.replies import EvidenceReply
+
+    selector = f"{keys.evidence(pair or '*')}?format=json"
+    answers = ask(session, selector, timeout_s)
     if not answers:
-        raise _nobody(session, keys, options, selector)
-    found: list[EvidenceEvent] = []
+        raise _nobody(session, keys, timeout_s, selector)
+    events: list[EvidenceEvent] = []
     for answer in answers:
         reply = from_json(EvidenceReply, answer.payload)
-        found += [event for event in reply.events if _is_of(event, keys.vehicle, reply.pair)]
-    return sorted(found, key=lambda event: event.wall_ns)
+        events += [event for event in reply.events if _is_of(event, keys.vehicle, reply.pair)]
+    return sorted(events, key=lambda event: event.wall_ns)
 
 
-def _nobody(session: zenoh.Session, keys: Keys, options: Options, selector: str) -> NotFoundError:
-    """The error that nobody answers, with the last word of the vehicle, if one is kept."""
-    for answer in ask(session, keys.last("*"), options.timeout_s):
+def _nobody(session: zenoh.Session, keys: Keys, timeout_s: float, selector: str) -> NotFoundError:
+    """The error that nobody answers, with the last heartbeat of the vehicle, if one is stored."""
+    from coec.adapters.zenoh.client import ask, nobody
+    from coec.reports.fleet_board import duration
+    from coec.schemas.last_word import read as read_word
+
+    for answer in ask(session, keys.last("*"), timeout_s):
         try:
             word = read_word(answer.key, answer.payload)
         except DecodeError:
             continue
         ago = duration(max((time.time_ns() - word.said_ns) * 1e-9, 0.0))
-        left = "took its leave" if word.service == "stopping" else "was heard last"
+        left = "logged off" if word.service == "stopping" else "was last received"
         return NotFoundError(
-            f"{word.vehicle} does not answer; it {left} {ago} ago ({word.pair}: {word.state}). What it keeps is on "
-            "board: fetch it when it is back"
+            f"{word.vehicle} does not answer; it {left} {ago} ago ({word.pair}: {word.state}). Its data are on "
+            "board: fetch them when it is back"
         )
     return nobody(selector)
 
@@ -147,65 +164,79 @@ def _is_of(event: EvidenceEvent, vehicle: str, pair: str) -> bool:
     return named is not None and (event.vehicle, event.pair, named["pair"]) == (vehicle, pair, pair)
 
 
-def _list(events: Sequence[EvidenceEvent], options: Options) -> int:
-    if options.as_json:
+def _list(events: Sequence[EvidenceEvent], vehicle: str, *, as_json: bool) -> int:
+    from coec.reports import console, replies
+    from coec.schemas.base import to_json
+    from coec.schemas.replies import EvidenceReply
+
+    if as_json:
         console.print_json({"events": [event.model_dump(mode="json") for event in events]})
         return 0
     for pair in sorted({event.pair for event in events}):
         ours = tuple(event for event in events if event.pair == pair)
-        replies.evidence(to_json(EvidenceReply(vehicle=options.vehicle, pair=pair, events=ours)))
+        replies.evidence(to_json(EvidenceReply(vehicle=vehicle, pair=pair, events=ours)))
     if not events:
-        console.show(f"{options.vehicle} keeps no red event")
+        console.show(f"{vehicle} has no red event")
     return 0
 
 
-def _chosen(events: Sequence[EvidenceEvent], options: Options) -> EvidenceEvent:
-    if options.event == LATEST and events:
+def _select(events: Sequence[EvidenceEvent], event_id: str, vehicle: str) -> EvidenceEvent:
+    if event_id == LATEST and events:
         return events[-1]
-    found = next((event for event in events if event.event_id == options.event), None)
-    if found is None:
-        raise NotFoundError(f"{options.vehicle} keeps no such red event: `coec fetch {options.vehicle}` lists them")
-    return found
+    match = next((event for event in events if event.event_id == event_id), None)
+    if match is None:
+        raise NotFoundError(f"{vehicle} has no such red event: `coec fetch {vehicle}` lists them")
+    return match
 
 
 @dataclass(slots=True)
-class _Fetch:
+class Download:
     """Fetches one event. What cannot be fetched is noted with the reason, and does not stop the rest."""
 
     session: zenoh.Session
     keys: Keys
     pair: str
     folder: Path
-    options: Options
+    timeout_s: float
+    patience_s: float
+    with_windows: bool
     files: dict[str, FetchedFile] = field(default_factory=dict)
     absent: list[Absent] = field(default_factory=list)
     recorded_bytes: int = 0
 
     def fetch(self, event_id: str) -> IncidentReport:
+        from coec.adapters.files import output as files
+        from coec.reports import incident_page, provenance
+        from coec.reports.page import render
+        from coec.schemas.base import to_json
+        from coec.schemas.incident import IncidentReport
+        from coec.schemas.replies import EvidenceEvent, ExtrinsicReply, HealthReply, HistoryReply, StatusReply
+        from coec.schemas.rig_state import RigReply
+
         keys, pair = self.keys, self.pair
         event = self._document(EvidenceEvent, keys.evidence_of(pair, event_id))
         if event.event_id != event_id or not _is_of(event, keys.vehicle, pair):
-            raise RemoteError("malformed", f"who answered for {event_id} spoke of another event")
-        self._keep("event.json", to_json(event))
+            raise RemoteError("malformed", f"the answer for {event_id} is about another event")
+        self._store("event.json", to_json(event))
         history = self._optional("history.json", HistoryReply, _around(keys.history(pair), event))
         health = self._optional("health.json", HealthReply, keys.health(pair))
         extrinsic = self._optional("extrinsic.json", ExtrinsicReply, keys.extrinsic(pair))
         status = self._optional("status.json", StatusReply, keys.status)
         self._optional("rig.json", RigReply, keys.rig)
-        self._try("config.json", lambda: self._keep("config.json", self._configuration()))
+        self._try("config.json", lambda: self._store("config.json", self._configuration()))
         for side in event.overlays:
             self._try(f"{side}.jpg", lambda side=side: self._picture(event_id, side))  # type: ignore[misc]
         windows = [
             fetched
             for window_id in dict.fromkeys(filter(None, (event.window_before, event.window_after)))
-            if not self.options.no_windows and (fetched := self._window(window_id, history)) is not None
+            if self.with_windows and (fetched := self._window(window_id, history)) is not None
         ]
-        snippets = () if self.options.no_windows else tuple(self._snippets(event))
+        snippets = () if not self.with_windows else tuple(self._snippets(event))
         holds = None if history is None else chain_holds(history)
-        told = (event, history, health, extrinsic, status)
-        story = incident_page.Story(*told, tuple(windows), tuple(self.absent), holds, snippets)
+        documents = (event, history, health, extrinsic, status)
+        story = incident_page.Story(*documents, tuple(windows), tuple(self.absent), holds, snippets)
         pictures = {name: (self.folder / name).read_bytes() for name in incident_page.PICTURED if name in self.files}
-        self._keep(PAGE, render(incident_page.page(story, pictures, provenance.here())).encode())
+        self._store(PAGE, render(incident_page.page(story, pictures, provenance.here())).encode())
         report = IncidentReport(
             folder=str(self.folder),
             vehicle=keys.vehicle,
@@ -219,36 +250,47 @@ class _Fetch:
             chain_holds=holds,
             absent=tuple(self.absent),
         )
-        output.replace(self.folder / REPORT, to_json(report))
+        files.replace(self.folder / REPORT, to_json(report))
         return report
 
-    # --- what is asked for ------------------------------------------------------------------------------------------
-
     def _document(self, model: type[M], selector: str) -> M:
+        from coec.schemas.base import from_json
+
         joined = ";" if "?" in selector else "?"
         return from_json(model, self._answer(f"{selector}{joined}format=json"))
 
     def _optional(self, name: str, model: type[M], selector: str) -> M | None:
-        found: list[M] = []
+        from coec.schemas.base import to_json
 
-        def ask_for() -> None:
-            found.append(self._document(model, selector))
-            self._keep(name, to_json(found[0]))
+        documents: list[M] = []
 
-        self._try(name, ask_for)
-        return found[0] if found else None
+        def fetch() -> None:
+            documents.append(self._document(model, selector))
+            self._store(name, to_json(documents[0]))
+
+        self._try(name, fetch)
+        return documents[0] if documents else None
 
     def _configuration(self) -> bytes:
         """The configuration as the vehicle sends it; a newer vehicle may have keys that this program does not know."""
+        from coec.schemas.base import json_value
+
         document = json_value(self._answer(f"{self.keys.config}?format=json"))
         return json.dumps(document, indent=2, sort_keys=True).encode()
 
     def _picture(self, event_id: str, side: str) -> None:
+        from coec.adapters.images.codec import decode_bgr, probe
+        from coec.config import LimitsConfig
+
         data = self._answer(f"{self.keys.evidence_of(self.pair, event_id)}?overlay={side}")
-        decode_bgr(probe(data, PICTURE), PICTURE)
-        self._keep(f"{side}.jpg", data)
+        limits = LimitsConfig(max_message_bytes=MAX_PICTURE_BYTES)
+        decode_bgr(probe(data, limits), limits)
+        self._store(f"{side}.jpg", data)
 
     def _window(self, window_id: str, history: HistoryReply | None) -> FetchedWindow | None:
+        from coec.schemas.incident import FetchedWindow
+        from coec.schemas.replies import WindowInfo
+
         info = self._recording(window_id)
         if not isinstance(info, WindowInfo):
             return None
@@ -263,6 +305,9 @@ class _Fetch:
 
     def _snippets(self, event: EvidenceEvent) -> Iterator[str]:
         """Ids of the snippets that were recorded at full rate about the event."""
+        from coec.schemas.incident import Absent
+        from coec.schemas.replies import WindowsReply
+
         listed: list[WindowsReply] = []
         self._try("snippets", lambda: listed.append(self._document(WindowsReply, self.keys.windows(self.pair))))
         near = [
@@ -280,11 +325,15 @@ class _Fetch:
             self.absent.append(Absent(what=f"{len(near) - MAX_SNIPPETS} snippets", why=f"{why}; {how}"))
 
     def _recording(self, recording_id: str) -> Recording | None:
+        from coec.adapters.zenoh.window_fetch import fetch_window
+        from coec.reports import console
+        from coec.schemas.incident import Absent, FetchedFile
+
         if (named := OF_PAIR.fullmatch(recording_id)) is None or named["pair"] != self.pair:
-            self.absent.append(Absent(what="a recording", why="what the vehicle calls it is no name of one"))
+            self.absent.append(Absent(what="a recording", why="the vehicle reports an invalid name for it"))
             return None
         name = _recorded(recording_id)
-        found: list[Recording] = []
+        recordings: list[Recording] = []
         left = MAX_RECORDED_BYTES - self.recorded_bytes
         if left <= 0:
             how = f"`coec query windows/{recording_id} --output FILE` fetches it"
@@ -300,29 +349,33 @@ class _Fetch:
                     self.pair,
                     recording_id,
                     self.folder / name,
-                    self.options.timeout_s,
-                    self.options.patience_s,
+                    self.timeout_s,
+                    self.patience_s,
                     bars.add_download(recording_id),
                     left,
                 )
             self.recorded_bytes += info.size_bytes
             self.files[name] = FetchedFile(name=name, sha256=str(info.sha256), size_bytes=info.size_bytes)
-            found.append(info)
+            recordings.append(info)
 
         self._try(name, fetch)
-        return found[0] if found else None
+        return recordings[0] if recordings else None
 
     def _answer(self, selector: str) -> bytes:
-        deadline_s = time.monotonic() + self.options.patience_s
+        from coec.adapters.zenoh.client import ask_one
+
+        deadline_s = time.monotonic() + self.patience_s
         while True:
             try:
-                return ask_one(self.session, selector, self.options.timeout_s).payload
+                return ask_one(self.session, selector, self.timeout_s).payload
             except RemoteError as error:
                 if error.reply_code not in WAITS or time.monotonic() + WAIT_S > deadline_s:
                     raise
             time.sleep(WAIT_S)
 
     def _try(self, what: str, fetch: Callable[[], None]) -> None:
+        from coec.schemas.incident import Absent
+
         try:
             fetch()
         except OutputError:
@@ -330,14 +383,21 @@ class _Fetch:
         except CoecError as error:
             self.absent.append(Absent(what=what, why=str(error)))
 
-    def _keep(self, name: str, data: bytes) -> None:
-        output.replace(self.folder / name, data)
+    def _store(self, name: str, data: bytes) -> None:
+        import hashlib
+
+        from coec.adapters.files import output as files
+        from coec.schemas.incident import FetchedFile
+
+        files.replace(self.folder / name, data)
         self.files[name] = FetchedFile(name=name, sha256=hashlib.sha256(data).hexdigest(), size_bytes=len(data))
 
 
 def chain_holds(history: HistoryReply) -> bool | None:
     """Whether the entries match their hashes, and each holds the hash of the entry before it in its book, as far as
     that was fetched. None: unknown, because no two fetched entries follow each other, or another version wrote them."""
+    from coec.schemas.base import SCHEMA_VERSION
+
     linked = 0
     last: dict[str, ChainedEntry] = {}
     for chained in sorted(history.entries, key=lambda item: item.entry.sequence):
@@ -373,17 +433,24 @@ def _around(key: str, event: EvidenceEvent) -> str:
 
 
 def _in_history(path: Path, window_id: str, history: HistoryReply | None) -> bool | None:
+    from coec.adapters.mcap.windows import read_result
+    from coec.schemas.base import SCHEMA_VERSION
+
     entries = () if history is None else history.entries
-    kept = [item.entry.result_sha256 for item in entries if item.entry.window_id == window_id]
-    told = [sha256 for sha256 in kept if sha256 is not None]
+    stored = [item.entry.result_sha256 for item in entries if item.entry.window_id == window_id]
+    known = [sha256 for sha256 in stored if sha256 is not None]
     try:
         result = read_result(path)
     except WindowError:
         return None
-    if result is None or not told or result.schema_version != SCHEMA_VERSION:
+    if result is None or not known or result.schema_version != SCHEMA_VERSION:
         return None
-    return _sha256(result) in told
+    return _sha256(result) in known
 
 
 def _sha256(message: Message) -> str:
+    import hashlib
+
+    from coec.schemas.base import to_json
+
     return hashlib.sha256(to_json(message)).hexdigest()

@@ -1,56 +1,79 @@
-"""`coec fleet report`: what many windows say about a fleet."""
+"""`coec fleet`: combines the results and baselines of many vehicles."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from coec.adapters.files import output
-from coec.cli.commands.fleet_report import Options
+import typer
+
+from coec.cli.commission import document_of, show_learned
+from coec.cli.options import Json
 from coec.errors import DecodeError, UsageError
-from coec.fleet import questions, report
-from coec.reports import console, fleet_page, page, provenance
-from coec.reports.console import figure
-from coec.reports.page.words import count
-from coec.schemas.base import from_json, to_json
-from coec.schemas.fleet import AXES, FleetReport
-from coec.schemas.fleet_now import FleetNow
+
+if TYPE_CHECKING:
+    from coec.calibration.commissioning.baseline import Baseline
+    from coec.schemas.fleet import FleetReport
+    from coec.schemas.fleet_now import FleetNow
+
+app = typer.Typer(no_args_is_help=True, help="Combine results of many vehicles.")
 
 SHOWN = 15
 """Most pairs in the table on the screen; the page has all."""
 
 
-def run(options: Options) -> int:
-    """Writes page and document into the output folder, if one is given, and prints the most urgent pairs.
+@app.command()
+def report(
+    results: Annotated[
+        Path, typer.Argument(metavar="RESULTS", help="Output folder of `coec batch`.", show_default=False)
+    ],
+    output: Annotated[Path | None, typer.Option(help="Write report.html and report.json.", metavar="DIR")] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="Results of an earlier batch over the same windows.", metavar="RESULTS")
+    ] = None,
+    now: Annotated[
+        Path | None,
+        typer.Option(help="Output of `coec watch --once --json`: also count false alarms.", metavar="FILE"),
+    ] = None,
+    sql: Annotated[bool, typer.Option("--sql", help="Print only the columns and useful queries.")] = False,
+    as_json: Json = False,
+) -> int:
+    """Report drift of every pair, what is refused and why, and what an earlier batch decided otherwise."""
+    from coec.adapters.files import output as files
+    from coec.fleet import report as fleet_report
+    from coec.reports import console, fleet_page, page, provenance
+    from coec.schemas.base import to_json
 
-    Raises:
-        UsageError: there are no tables, or the file of `--now` is no such document.
-        SourceError: the optional extra is not installed.
-        OutputError: a file cannot be written.
-    """
-    if options.sql:
-        _show_sql(options.results)
+    if sql:
+        _show_sql(results)
         return 0
-    now = None if options.now is None else _said(options.now)
-    told = report.report(options.results, options.against, now)
-    if options.output is not None:
-        of_fleet = fleet_page.page(told, f"Fleet: {options.results.resolve().name}", provenance.here())
-        page.write(options.output / "report.html", of_fleet)
-        output.write(options.output / "report.json", to_json(told))
-    if options.as_json:
-        console.print_json(told.model_dump(mode="json"))
+    fleet_now = None if now is None else _fleet_now(now)
+    summary = fleet_report.report(results, against, fleet_now)
+    if output is not None:
+        of_fleet = fleet_page.page(summary, f"Fleet: {results.resolve().name}", provenance.here())
+        page.write(output / "report.html", of_fleet)
+        files.write(output / "report.json", to_json(summary))
+    if as_json:
+        console.print_json(summary.model_dump(mode="json"))
         return 0
-    _show(told)
-    if options.output is not None:
-        console.show(f"{options.output / 'report.html'}")
+    _show(summary)
+    if output is not None:
+        console.show(f"{output / 'report.html'}")
     return 0
 
 
-def _show(told: FleetReport) -> None:
-    console.show(fleet_page.sentence(told))
+def _show(summary: FleetReport) -> None:
+    from coec.reports import console, fleet_page
+    from coec.reports.console import figure
+    from coec.reports.page.words import count
+    from coec.schemas.fleet import AXES
+
+    console.show(fleet_page.sentence(summary))
     table = console.table(
         "vehicle", "pair", "windows", "accepted", "worst axis", "drift", "urgency", right=(2, 3, 5, 6)
     )
-    for pair in told.pairs[:SHOWN]:
+    for pair in summary.pairs[:SHOWN]:
         axis = None if pair.worst is None else AXES.index(pair.worst)
         table.add_row(
             pair.vehicle,
@@ -62,20 +85,23 @@ def _show(told: FleetReport) -> None:
             f"{pair.urgency:.1f}",
         )
     console.out.print(table)
-    if len(told.pairs) > SHOWN:
-        console.show(f"and {len(told.pairs) - SHOWN} more")
-    if told.changes is not None:
-        changes = told.changes
+    if len(summary.pairs) > SHOWN:
+        console.show(f"and {len(summary.pairs) - SHOWN} more")
+    if summary.changes is not None:
+        changes = summary.changes
         console.show(
             f"against the earlier batch: {count(changes.both, 'window')} in both, {changes.identical} identical, "
             f"{changes.newly_accepted} newly accepted, {changes.newly_refused} newly refused, "
             f"{changes.newly_failing} without a result any more"
         )
-    if told.false_alarms is not None:
-        console.show(fleet_page.sentence_of_alarms(told.false_alarms))
+    if summary.false_alarms is not None:
+        console.show(fleet_page.sentence_of_alarms(summary.false_alarms))
 
 
-def _said(path: Path) -> FleetNow:
+def _fleet_now(path: Path) -> FleetNow:
+    from coec.schemas.base import from_json
+    from coec.schemas.fleet_now import FleetNow
+
     try:
         return from_json(FleetNow, path.read_bytes())
     except OSError as error:
@@ -85,9 +111,66 @@ def _said(path: Path) -> FleetNow:
 
 
 def _show_sql(results: Path) -> None:
+    from coec.fleet import questions
+    from coec.reports import console
+
     console.write(f"-- the view `{questions.WINDOWS}` of the examples below\n")
     console.write(f"{questions.statement(questions.WINDOWS, results)};\n\n")
     for name, kind in questions.columns(results):
         console.write(f"--   {name:<22} {kind}\n")
     for question, query in questions.EXAMPLES.items():
         console.write(f"\n-- {question}{query};\n")
+
+
+@app.command()
+def commission(
+    baselines: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RIG...", help="rig.json files of commissioned vehicles of one model.", show_default=False
+        ),
+    ],
+    output: Annotated[Path, typer.Option(help="File to write: the baselines of the model.", metavar="FILE")] = Path(
+        "model.json"
+    ),
+    as_json: Json = False,
+) -> int:
+    """Learn from commissioned vehicles what others of their model start from (`state.model`): bias, spread, limits."""
+    from coec.adapters.files.baseline_file import load_baselines, save_baseline
+    from coec.calibration.commissioning.of_model import of_model
+    from coec.reports import console
+
+    vehicles = [load_baselines(path) for path in _each_once(baselines)]
+    for path, pairs in zip(baselines, vehicles, strict=True):
+        if not pairs:
+            raise UsageError(f"{path} holds no baseline: `coec commission`, or the command `commission`, makes them")
+    shared = sorted(set.intersection(*(set(pairs) for pairs in vehicles)))
+    if not shared:
+        raise UsageError("there is no pair that all of the vehicles have")
+    models = [of_model([pairs[name] for pairs in vehicles]) for name in shared]
+    for model in models:
+        save_baseline(output, model)
+    if as_json:
+        console.print_json({"vehicles": len(vehicles), "pairs": [document_of(model) for model in models]})
+        return 0
+    for model in models:
+        _show_model(model, len(vehicles))
+    console.show(f"written to {output}: name it as `state.model` on vehicles that are not commissioned")
+    return 0
+
+
+def _each_once(paths: Sequence[Path]) -> Sequence[Path]:
+    twice = sorted({str(path) for path in paths if paths.count(path) > 1})
+    if twice:
+        raise UsageError(f"named twice: {', '.join(twice)}; each vehicle counts once")
+    return paths
+
+
+def _show_model(model: Baseline, vehicles: int) -> None:
+    from coec.reports import console
+    from coec.reports.page.words import count
+
+    console.show(
+        f"{model.pair}: {count(vehicles, 'vehicle')}, {count(model.pairs, 'pair')} of {count(model.windows, 'window')}"
+    )
+    show_learned(model)

@@ -1,41 +1,59 @@
-"""`coec lidars`: where one LiDAR of a vehicle sits relative to another, from what both see."""
+"""`coec lidars`: estimates the pose of one LiDAR of a vehicle relative to another, from surfaces that both see."""
 
 from __future__ import annotations
 
 import time
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
+import typer
 
-from coec.adapters.registration.nearest import Trees
-from coec.calibration.lidar_to_lidar.registration import register
-from coec.calibration.lidar_to_lidar.types import LidarEdge
-from coec.cli.commands.lidars import Options
-from coec.geometry.se3 import difference
-from coec.reports import console
-from coec.reports.page.words import count
-from coec.sources.lidars import LidarRecording, open_lidars
+from coec.cli.options import Json
 
-DEGREES = np.array([*np.rad2deg(np.ones(3)), *np.ones(3)])
-"""From rad and m to degrees and m."""
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from coec.calibration.lidar_to_lidar.types import LidarEdge
+    from coec.sources.lidars import LidarRecording
 
 
-def run(options: Options) -> int:
-    """Prints the pose of `b` in `a`; returns 1 if they see too little in common.
+def lidars(
+    source: Annotated[
+        str,
+        typer.Argument(help="A ROS 2 bag, or sim:rig=four-fisheyes&seconds=60.", metavar="SOURCE", show_default=False),
+    ],
+    a: Annotated[
+        str,
+        typer.Argument(
+            help="Topic of the denser LiDAR; for a simulated rig, its name.", metavar="A", show_default=False
+        ),
+    ],
+    b: Annotated[
+        str, typer.Argument(help="The same of the LiDAR whose pose in A is estimated.", metavar="B", show_default=False)
+    ],
+    pairs: Annotated[
+        int, typer.Option(help="Number of pairs of sweeps, spread evenly over the recording.", min=1, max=200)
+    ] = 12,
+    as_json: Json = False,
+) -> int:
+    """Find the pose of one LiDAR in another from the surfaces that both see: exit 1 if those are too few."""
+    from coec.adapters.registration.nearest import Trees
+    from coec.calibration.lidar_to_lidar.registration import register
+    from coec.geometry.se3 import difference
+    from coec.reports import console
+    from coec.sources.lidars import open_lidars
 
-    Raises:
-        UsageError, SourceError: see `open_lidars`; or the library that searches clouds is not installed.
-    """
     search = Trees()
-    recording = open_lidars(options.source, options.a, options.b)
+    recording = open_lidars(source, a, b)
     started_s = time.monotonic()
     with console.progress() as bars:
         bars.add_task(recording.name, total=None, note="sweeps")
-        pairs = recording.pairs(options.pairs)
-        edge = register(recording.rig, pairs, search)
+        sweeps = recording.pairs(pairs)
+        edge = register(recording.rig, sweeps, search)
     error = None
     if recording.truth is not None:
-        error = DEGREES * difference(edge.T_a_b, recording.truth(pairs[len(pairs) // 2].a.stamp_ns))
-    if options.as_json:
+        error = _in_degrees(difference(edge.T_a_b, recording.truth(sweeps[len(sweeps) // 2].a.stamp_ns)))
+    if as_json:
         console.print_json(_document(edge, error, time.monotonic() - started_s))
     else:
         _show(recording, edge, error)
@@ -43,12 +61,15 @@ def run(options: Options) -> int:
 
 
 def _show(recording: LidarRecording, edge: LidarEdge, error: np.ndarray | None) -> None:
-    told = console.table("axis of " + edge.rig.a, "correction", "sigma", *(["error"] if error is not None else []))
-    rows = zip(console.AXES, console.UNITS, DEGREES * edge.correction, DEGREES * edge.sigma, strict=True)
+    from coec.reports import console
+    from coec.reports.page.words import count
+
+    table = console.table("axis of " + edge.rig.a, "correction", "sigma", *(["error"] if error is not None else []))
+    rows = zip(console.AXES, console.UNITS, _in_degrees(edge.correction), _in_degrees(edge.sigma), strict=True)
     for number, (axis, unit, correction, sigma) in enumerate(rows):
         off = [] if error is None else [f"{error[number]:+.3f} {unit}"]
-        told.add_row(axis, f"{correction:+.3f} {unit}", f"{sigma:.3f} {unit}", *off)
-    console.out.print(told)
+        table.add_row(axis, f"{correction:+.3f} {unit}", f"{sigma:.3f} {unit}", *off)
+    console.out.print(table)
     bias = edge.range_bias
     console.show(
         f"{recording.name}: {edge.rig.b} in {edge.rig.a}, {count(edge.pairs, 'pair')} of sweeps, {edge.points} points "
@@ -64,8 +85,8 @@ def _document(edge: LidarEdge, error: np.ndarray | None, elapsed_s: float) -> di
         "a": edge.rig.a,
         "b": edge.rig.b,
         "T_a_b": edge.T_a_b.tolist(),
-        "correction": (DEGREES * edge.correction).tolist(),
-        "sigma": (DEGREES * edge.sigma).tolist(),
+        "correction": _in_degrees(edge.correction).tolist(),
+        "sigma": _in_degrees(edge.sigma).tolist(),
         "covariance": edge.covariance.tolist(),
         "error": None if error is None else error.tolist(),
         "range_bias_m": edge.range_bias.longer_m,
@@ -77,3 +98,10 @@ def _document(edge: LidarEdge, error: np.ndarray | None, elapsed_s: float) -> di
         "reasons": [{"code": reason.code, "text": reason.text} for reason in edge.reasons],
         "elapsed_s": elapsed_s,
     }
+
+
+def _in_degrees(rad_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Six values in degrees and metres, from radians and metres."""
+    import numpy as np
+
+    return np.array([*np.rad2deg(np.ones(3)), *np.ones(3)]) * rad_m

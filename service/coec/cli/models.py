@@ -1,23 +1,35 @@
-"""`coec models`: lists the known depth networks, and puts their files where they are looked for."""
+"""`coec models`: lists the known depth networks, and copies their files to where services load them."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from coec.adapters.depth import network_files
-from coec.adapters.depth.model_cards import find_card, list_models
-from coec.adapters.depth.network_files import models_folder
-from coec.adapters.depth.onnx_network import file_identity
+import typer
+
+from coec.cli.options import Force, Json
 from coec.errors import ModelError
-from coec.reports import console
+
+app = typer.Typer(
+    help="Depth networks: list the known ones and whose file is present, add a file, show its card, assess it."
+)
 
 
-def show(file: Path, *, as_json: bool) -> int:
-    """Prints the card of a file.
+@app.callback(invoke_without_command=True)
+def models(context: typer.Context, as_json: Json = False) -> int:
+    return _list(as_json=as_json) if context.invoked_subcommand is None else 0
 
-    Raises:
-        ModelError: the file is absent or has no card.
-    """
+
+@app.command()
+def show(
+    file: Annotated[Path, typer.Argument(help="An ONNX file.", metavar="FILE", show_default=False)],
+    as_json: Json = False,
+) -> int:
+    """Show the model card with which a network file is run."""
+    from coec.adapters.depth.model_cards import find_card
+    from coec.adapters.depth.onnx_network import file_identity
+    from coec.reports import console
+
     if not file.is_file():
         raise ModelError(f"there is no file {file}")
     digest, identity = file_identity(file)
@@ -30,24 +42,39 @@ def show(file: Path, *, as_json: bool) -> int:
     return 0
 
 
-def add(file: Path, name: str | None, *, force: bool, as_json: bool) -> int:
-    """Copies the file of a known network to where it is looked for, and says so.
+@app.command()
+def add(
+    file: Annotated[Path, typer.Argument(help="The ONNX file of a known network.", metavar="FILE", show_default=False)],
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--as", help="Network that the file is an export of, if its sha256 and name do not say so.", metavar="NAME"
+        ),
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> int:
+    """Copy the file of a known depth network to where this user's services load it, after checking it."""
+    from coec.adapters.depth import network_files
+    from coec.reports import console
 
-    Raises:
-        ModelError, UsageError, OutputError: see `network_files.add`.
-    """
     card, place, copied = network_files.add(file, name, force=force)
     if as_json:
         console.print_json({"name": card.name, "path": str(place), "copied": copied})
     elif copied:
         console.show(f"{card.name}: checked, copied to {place}; `--depth {card.name}` uses it. Licence: {card.licence}")
     else:
-        console.show(f"{card.name}: the same file is there already, {place}")
+        console.show(f"{card.name}: the same file exists already, {place}")
     return 0
 
 
-def run(*, as_json: bool) -> int:
+def _list(*, as_json: bool) -> int:
     """Lists the built-in cards: whose file is present, and where the others come from."""
+    from coec.adapters.depth import network_files
+    from coec.adapters.depth.model_cards import list_models
+    from coec.adapters.depth.network_files import models_folder
+    from coec.reports import console
+
     cards = list_models()
     folder = models_folder()
     files = {card.name: network_files.file_of(card) for card in cards}
@@ -74,7 +101,7 @@ def run(*, as_json: bool) -> int:
         if path is not None:
             console.show(f"{name}: {path}")
     console.show(
-        f"an absent network is looked for as NAME.onnx in {folder}; `coec models add FILE` checks it and puts it there"
+        f"an absent network is expected as NAME.onnx in {folder}; `coec models add FILE` checks it and copies it there"
     )
     console.show("any other ONNX file is used by its path (docs/own-network.md)")
     return 0

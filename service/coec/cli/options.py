@@ -1,16 +1,51 @@
-"""Options of several commands. Each option is declared once, here or in the module of its only command.
+"""Options of several commands, and what they stand for: the options of a calibration, a service, a pair.
 
-The imports decide how long a help text takes, so nothing heavy may be imported here or in `commands`.
+Each option is declared once, here or in the module of its only command; the options of a calibration are made from
+their list, `coec.calibration_options`. Every command imports this module, so it imports nothing heavy at its top.
 """
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from coec.cli import completing
+from coec.calibration_options import Entry, entries
+from coec.errors import UsageError
+
+if TYPE_CHECKING:
+    from coec.adapters.tls.conversation import Credentials
+    from coec.adapters.zenoh.client import Way
+    from coec.config import Config, PairConfig
+
+
+def suggesting(values: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """A completion for an option: the values that begin with what is typed."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [value for value in values() if value.startswith(incomplete)]
+
+    return complete
+
+
+def _option(entry: Entry) -> Any:
+    """The option of the command line for an entry of the list of calibration options."""
+    flag = entry.flag
+    suggestions = None if flag.suggestions is tuple else suggesting(flag.suggestions)
+    return typer.Option(
+        *([flag.name] if flag.name else [f"--{entry.name.replace('_', '-')}"] if entry.annotation is bool else []),
+        help=entry.text,
+        metavar=flag.metavar,
+        min=flag.minimum,
+        show_default=flag.shown or True,
+        autocompletion=suggestions,
+    )
+
 
 SOURCE_HELP = (
     "a recorded window or ROS 2 bag (.mcap), kitti360:ROOT?camera=image_00, kitti-raw:ROOT?..., a folder or "
@@ -18,7 +53,7 @@ SOURCE_HELP = (
 )
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, nothing else.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite files that are there already.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
 Source = Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP, show_default=False)]
 ConfigFile = Annotated[
     Path,
@@ -45,37 +80,64 @@ Jobs = Annotated[
 DegreesOfFreedom = Literal["3", "6"]
 """Degrees of freedom of a search: rotation only, or translation too."""
 
-Depth = Annotated[
-    str | None,
-    typer.Option(
-        help="An ONNX file, a built-in name (`coec models`), or `stereo` for the depth maps of the source. Default: "
-        "the network that a recorded window names, else the one that comes with coec.",
-        metavar="MODEL",
-        autocompletion=completing.depth_models,
-    ),
-]
-Objective = Annotated[
-    str | None,
-    typer.Option(
-        help="Objective to maximise: fused (edges and depth), mi (the paper) or intensity.",
-        metavar="NAME",
-        autocompletion=completing.objectives,
-    ),
-]
-CameraModel = Annotated[
-    str | None,
-    typer.Option(
-        help="Fit this model to the camera and use it: double_sphere. Refused if it does not fit the lens.",
-        metavar="NAME",
-        autocompletion=completing.camera_models,
-    ),
-]
-Frames = Annotated[
-    int | None, typer.Option(help="Use at most this many camera frames, evenly chosen.", min=1, show_default="25")
-]
-NoMotionCompensation = Annotated[
-    bool, typer.Option("--no-motion-compensation", help="Use the clouds as they were recorded.")
-]
+_CALIBRATION = {name: _option(entry) for name, entry in entries().items()}
+
+Depth = Annotated[str | None, _CALIBRATION["depth"]]
+Objective = Annotated[str | None, _CALIBRATION["objective"]]
+Dof = Annotated[DegreesOfFreedom | None, _CALIBRATION["dof"]]
+CameraModel = Annotated[str | None, _CALIBRATION["camera_model"]]
+Frames = Annotated[int | None, _CALIBRATION["frames"]]
+NoMotionCompensation = Annotated[bool, _CALIBRATION["motion_compensation"]]
+Perturb = Annotated[str | None, _CALIBRATION["perturb"]]
+
+
+def with_calibration_options(options: type) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Adds an option for every entry of a list of calibration options to a command that takes `**options`.
+
+    The options stand behind the arguments of the command. An option that the command declares itself stays as it is.
+    What is given on the command line is passed on with the types of the list; what is not given is left out.
+    """
+    listed = entries(options)
+
+    def decorate(command: Callable[..., int]) -> Callable[..., int]:
+        declared = inspect.signature(command, eval_str=True)
+        own = [each for each in declared.parameters.values() if each.kind is not each.VAR_KEYWORD]
+        added = {name: entry for name, entry in listed.items() if name not in declared.parameters}
+
+        @wraps(command)
+        def run(**given: Any) -> int:
+            typed = {name: given.pop(name) for name in added}
+            values = {name: _value(added[name], value) for name, value in typed.items()}
+            return command(**given, **{name: value for name, value in values.items() if value is not None})
+
+        arguments = [each for each in own if each.default is each.empty]
+        rest = [each for each in own if each.default is not each.empty]
+        parameters = [*arguments, *map(_parameter, added.values()), *rest]
+        run.__signature__ = declared.replace(  # type: ignore[attr-defined]
+            parameters=[each.replace(kind=each.KEYWORD_ONLY) for each in parameters]
+        )
+        return run
+
+    return decorate
+
+
+def _parameter(entry: Entry) -> inspect.Parameter:
+    kind = entry.flag.typed or entry.annotation
+    is_switch = kind is bool
+    return inspect.Parameter(
+        entry.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=False if is_switch else None,
+        annotation=Annotated[kind if is_switch else kind | None, _CALIBRATION[entry.name]],
+    )
+
+
+def _value(entry: Entry, given: Any) -> Any:
+    """The value of an option from what was typed; None: not given."""
+    if given is None or given is False:
+        return None
+    return given if entry.flag.value is None else entry.flag.value(given)
+
 
 # Options about a running service.
 ServiceConfig = Annotated[
@@ -96,6 +158,68 @@ SessionFile = Annotated[
     ),
 ]
 RouterTimeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the router.", min=0.01)]
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceAddress:
+    """The service of a vehicle, and the way to its router. `credentials` authenticate commands; None: the session has
+    none."""
+
+    vehicle: str
+    prefix: str
+    way: Way
+    credentials: Credentials | None = None
+
+
+def service_address(
+    config: Path | None,
+    vehicle: str | None,
+    prefix: str | None,
+    connect: str | None,
+    zenoh_file: Path | None = None,
+) -> ServiceAddress:
+    """The service of a configuration, or one with the default names; other given arguments take precedence.
+
+    Raises:
+        ConfigError: the configuration, or the Zenoh configuration, cannot be read.
+    """
+    from coec.adapters.zenoh.client import Way
+    from coec.adapters.zenoh.settings import connected_of
+    from coec.adapters.zenoh.settings_file import credentials_in, read_settings
+    from coec.config import Config, ZenohConfig, load_config
+
+    if config is not None:
+        loaded = load_config(config)
+        usual_vehicle, usual_prefix, zenoh_config = loaded.vehicle, loaded.prefix, loaded.zenoh
+    else:
+        fields = Config.model_fields
+        usual_vehicle, usual_prefix, zenoh_config = fields["vehicle"].default, fields["prefix"].default, ZenohConfig()
+    file = zenoh_file or zenoh_config.file
+    settings = None if file is None else read_settings(file)
+    endpoints = () if settings is None else connected_of(settings)
+    return ServiceAddress(
+        usual_vehicle if vehicle is None else vehicle,
+        usual_prefix if prefix is None else prefix,
+        Way((endpoints or zenoh_config.router) if connect is None else (connect,), file),
+        None if settings is None else credentials_in(settings),
+    )
+
+
+def pair_named(config: Config, name: str | None) -> PairConfig:
+    """The pair of this name, or with None the only one.
+
+    Raises:
+        UsageError: no pair has this name, there are several, or the pair is not discovered yet.
+    """
+    pairs = {pair.name: pair for pair in config.pairs}
+    if name is None and len(pairs) == 1:
+        return config.pairs[0]
+    if name in {pair.name for pair in config.awaited} or (name is None and not pairs):
+        raise UsageError("the pair is not complete: the service has not discovered what its configuration leaves out")
+    if name is None or name not in pairs:
+        raise UsageError(f"--pair: the configuration has the pairs {', '.join(pairs)}; name one of them")
+    return pairs[name]
+
 
 # Options about a simulated vehicle.
 Seed = Annotated[int, typer.Option(help="Seed of the drive: the same seed gives the same bytes.", min=0)]

@@ -1,51 +1,37 @@
-"""`coec query`: asks a running service."""
+"""`coec query`: queries a running service, and sends it commands."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import zenoh
+import typer
 
-from coec.adapters.files import output
-from coec.adapters.tls.conversation import Credentials, Speaker
-from coec.adapters.zenoh.bus import JSON, MSGPACK
-from coec.adapters.zenoh.client import (
-    Reply,
-    Way,
-    ask,
-    ask_one,
-    connected_by,
-    is_alive,
-    key_expression,
-    myself,
-    nobody,
-    patience_ms,
-    single_key,
-)
-from coec.adapters.zenoh.proven import give
-from coec.adapters.zenoh.settings import connected_of
-from coec.adapters.zenoh.settings_file import credentials_in, read_settings
-from coec.adapters.zenoh.window_fetch import fetch_window
-from coec.cli.commands.query import Options
-from coec.config import Config, ZenohConfig, load_config
+from coec.cli.options import Connect, Json, Prefix, ServiceAddress, ServiceConfig, Vehicle, service_address, suggesting
 from coec.errors import DecodeError, NotFoundError, UsageError
-from coec.reports import console, replies
-from coec.schemas.base import from_json, json_value
-from coec.schemas.commands import CANDIDATE, NAMES, REASON, RELEASE, SENSOR, TO, arguments_of
-from coec.schemas.keys import RIG, VERSION_CHUNK, Keys
-from coec.schemas.replies import Acknowledgement, StatusReply
 from coec.untrusted import Untrusted
 
+if TYPE_CHECKING:
+    import zenoh
+
+    from coec.adapters.zenoh.client import Reply, Way
+    from coec.schemas.keys import Keys
+
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
+
 PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
+
 PLAIN_KEYS = (*PAIR_KEYS, "overlay", *VEHICLE_KEYS)
+
 WITH_ARGUMENT = {"windows": "ID", "evidence": "ID", "command": "NAME"}
+
 JPEG = "image/jpeg"
+
 PATIENCE_S = 60.0
 """How long to wait for a window of which no piece arrives; what has arrived is kept for the next attempt."""
 
@@ -57,85 +43,190 @@ PICTURE_KEYS = ("overlay", "evidence")
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """Which service is asked, and how its router is reached. `credentials` of the session prove commands; None: the
-    session has none."""
+class Key:
+    """What can be queried. `parameters` are those of `--param`, in addition to `format`."""
 
-    vehicle: str
-    prefix: str
-    way: Way
-    credentials: Credentials | None = None
+    key: str
+    answer: str
+    parameters: str = ""
 
 
-def asked_of(
-    config: Path | None,
-    vehicle: str | None,
-    prefix: str | None,
-    connect: str | None,
-    zenoh_file: Path | None = None,
-) -> Asked:
-    """The service of a configuration, or one with the default names; other given arguments take precedence.
-
-    Raises:
-        ConfigError: the configuration, or the Zenoh configuration, cannot be read.
-    """
-    if config is not None:
-        loaded = load_config(config)
-        usual_vehicle, usual_prefix, zenoh_config = loaded.vehicle, loaded.prefix, loaded.zenoh
-    else:
-        named = Config.model_fields
-        usual_vehicle, usual_prefix, zenoh_config = named["vehicle"].default, named["prefix"].default, ZenohConfig()
-    file = zenoh_file or zenoh_config.file
-    settings = None if file is None else read_settings(file)
-    endpoints = () if settings is None else connected_of(settings)
-    return Asked(
-        usual_vehicle if vehicle is None else vehicle,
-        usual_prefix if prefix is None else prefix,
-        Way((endpoints or zenoh_config.router) if connect is None else (connect,), file),
-        None if settings is None else credentials_in(settings),
-    )
+KEYS = (
+    Key("extrinsic", "where the camera is, with sigma", "format=tf, urdf, ... as `coec export`; parent, child"),
+    Key("health", "state, reasons, figures and their limits"),
+    Key("history", "past results, and who changed what", "since=NS, until=NS, limit=COUNT"),
+    Key("windows", "recorded windows and snippets"),
+    Key("windows/ID", "one of them, into --output FILE, its sha256 verified"),
+    Key("overlay", "picture of the latest window, into --output FILE.jpg", "at=nominal, window=ID"),
+    Key("evidence", "stored red events"),
+    Key("evidence/ID", "one of them; a picture of it with --output FILE.jpg", "overlay=before, overlay=after"),
+    Key("rig", "all sensors of the vehicle together"),
+    Key("status", "the service itself: streams, worker, budget, problems"),
+    Key("config", "its effective configuration, without secrets"),
+    Key("metrics", "OpenMetrics text"),
+    Key("command/NAME", "calibrate, apply, rollback, reset, commission, hold", "timeout_ms=COUNT"),
+)
+"""In the order of the help text."""
 
 
-def run(options: Options) -> int:
-    """Asks and prints the answers; returns 1 if a command was not accepted.
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What is requested: a key, of one pair or sensor, with the parameters of `--param`."""
 
-    Raises:
-        UsageError: no such key, the arguments make no valid key, or the pair is ambiguous.
-        NotFoundError: nobody answered.
-        RemoteError: an error reply.
-        NotProvenError: a command was answered by someone other than the service.
-    """
-    asked = asked_of(options.config, options.vehicle, options.prefix, options.connect, options.zenoh)
-    keys = _keys(options, asked)
-    head, _, argument = options.key.partition("/")
-    whole = f"/{VERSION_CHUNK}/" in options.key
-    if not whole and head == "windows" and argument:
-        return _download(options, asked.way, keys, argument)
-    if options.output is not None:
-        return _save_picture(options, asked.way, keys, head, argument)
-    payload = _payload(options)
-    with connected_by(asked.way, options.timeout_s) as session:
-        key, kind = _resolve(session, options, keys)
-        if any(item.startswith("format=") for item in options.params or ()):
+    key: str
+    pair: str | None
+    sensor: str | None
+    params: tuple[str, ...]
+    timeout_s: float
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the key is a whole key expression."""
+        from coec.schemas.keys import VERSION_CHUNK
+
+        return f"/{VERSION_CHUNK}/" in self.key
+
+
+def _typable() -> Iterable[str]:
+    """Keys that a shell suggests; commands each by name."""
+    from coec.schemas.commands import NAMES
+
+    plain = (each.key for each in KEYS if "/" not in each.key)
+    return (*plain, "windows/", "evidence/", *(f"command/{name}" for name in NAMES))
+
+
+KeyArgument = Annotated[
+    str,
+    typer.Argument(
+        help="One of the keys above, or a whole key expression with @v1 in it.",
+        metavar="KEY",
+        autocompletion=suggesting(_typable),
+        show_default=False,
+    ),
+]
+Pair = Annotated[
+    str | None, typer.Option(help="Pair to query; default: all. A command needs it if there are several pairs.")
+]
+SessionCredentials = Annotated[
+    Path | None,
+    typer.Option(
+        help="Zenoh configuration (JSON5) to connect with; its certificate authenticates commands.",
+        metavar="FILE",
+    ),
+]
+Anonymous = Annotated[bool, typer.Option("--anonymous", help="Send a command without authentication.")]
+Params = Annotated[
+    list[str] | None,
+    typer.Option("--param", help="Parameter of the query, for example limit=5; repeatable.", metavar="K=V"),
+]
+RollbackTo = Annotated[
+    str | None,
+    typer.Option(help="For command/rollback: window or sha256 from `query history` to serve again.", metavar="HASH"),
+]
+Candidate = Annotated[
+    str | None,
+    typer.Option(
+        help="For command/apply: window or sha256 of the candidate from `query extrinsic`; another one is refused.",
+        metavar="HASH",
+    ),
+]
+Release = Annotated[bool, typer.Option("--release", help="For command/hold: end the hold.")]
+Reason = Annotated[
+    str | None,
+    typer.Option(
+        help="For any command: the reason. It appears in `query history`, and for a hold also in extrinsic and health.",
+        metavar="TEXT",
+    ),
+]
+Sensor = Annotated[
+    str | None,
+    typer.Option(help="For any command: apply it to all pairs of this sensor of the rig.", metavar="NAME"),
+]
+Payload = Annotated[
+    str | None, typer.Option(help="Payload of a command as JSON, instead of these options.", metavar="JSON")
+]
+OutputFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="File to write, byte for byte as it was sent: windows/ID with its sha256 verified, overlay, or a "
+        "picture of evidence/ID.",
+        metavar="FILE",
+    ),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace a FILE that holds something else than the window.")]
+
+
+def query(
+    key: KeyArgument,
+    pair: Pair = None,
+    config: ServiceConfig = None,
+    vehicle: Vehicle = None,
+    prefix: Prefix = None,
+    connect: Connect = None,
+    zenoh: SessionCredentials = None,
+    anonymous: Anonymous = (False),
+    params: Params = None,
+    to: RollbackTo = None,
+    candidate: Candidate = None,
+    release: Release = False,
+    reason: Reason = None,
+    sensor: Sensor = None,
+    payload: Payload = None,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", help="Seconds to wait for the router and for the answer.", min=0.01)
+    ] = 5.0,
+    output: OutputFile = None,
+    force: ForceOption = False,
+    as_json: Json = False,
+) -> int:
+    from coec.adapters.zenoh.client import connected_by, is_alive, nobody
+
+    address = service_address(config, vehicle, prefix, connect, zenoh)
+    request = Request(key, pair, sensor, tuple(params or ()), timeout_s)
+    keys = _keys(request, address)
+    head, _, argument = key.partition("/")
+    if not request.is_whole and head == "windows" and argument:
+        return _download(request, address.way, keys, argument, output, force=force, as_json=as_json)
+    if output is not None:
+        return _save_picture(request, address.way, keys, output, as_json=as_json)
+    arguments = {"to": to, "candidate": candidate, "release": release, "reason": reason, "sensor": sensor}
+    data = _payload(request, arguments, payload)
+    with connected_by(address.way, timeout_s) as session:
+        selected, kind = _resolve(session, request, keys)
+        if any(item.startswith("format=") for item in request.params):
             kind = None
-        replies = _answers(session, key, options, asked, payload)
-        if not replies:
-            raise nobody(key, service_is_there=is_alive(session, keys, options.timeout_s))
-    return _show(replies, kind, options, key)
+        answers = _answers(session, selected, request, address, data, anonymous=anonymous)
+        if not answers:
+            raise nobody(selected, service_is_there=is_alive(session, keys, timeout_s))
+    _show(answers, kind, request, selected, as_json=as_json)
+    return 0 if all(_succeeded(answer, kind) for answer in answers) else 1
 
 
-def _answers(session: zenoh.Session, key: str, options: Options, asked: Asked, payload: bytes | None) -> list[Reply]:
-    """Answers to the query; a command is proven if the session has a certificate."""
-    selector = _selector(key, _params(key, options))
-    credentials = asked.credentials
+def _answers(
+    session: zenoh.Session,
+    key: str,
+    request: Request,
+    address: ServiceAddress,
+    data: bytes | None,
+    *,
+    anonymous: bool,
+) -> list[Reply]:
+    """Answers to the query; a command is authenticated if the session has a certificate."""
+    from coec.adapters.tls.conversation import Speaker
+    from coec.adapters.zenoh.bus import JSON, MSGPACK
+    from coec.adapters.zenoh.client import ask, myself
+    from coec.adapters.zenoh.proven import give
+
+    selector = _selector(key, _params(key, request))
+    credentials = address.credentials
     if not _is_command(key):
-        return ask(session, selector, options.timeout_s, payload)
-    if credentials is None or options.anonymous:
-        return ask(session, selector, options.timeout_s, payload, myself())
-    speaker = Speaker(credentials, asked.vehicle)
-    encoding = MSGPACK if "format=msgpack" in (options.params or ()) else JSON
+        return ask(session, selector, request.timeout_s, data)
+    if credentials is None or anonymous:
+        return ask(session, selector, request.timeout_s, data, myself())
+    speaker = Speaker(credentials, address.vehicle)
+    encoding = MSGPACK if "format=msgpack" in request.params else JSON
     try:
-        return [give(session, selector, payload, options.timeout_s, speaker, encoding)]
+        return [give(session, selector, data, request.timeout_s, speaker, encoding)]
     except NotFoundError:  # nobody answered; treated as for every other key
         return []
 
@@ -144,66 +235,78 @@ def _is_command(key: str) -> bool:
     return key.split("/")[-2] == "command"
 
 
-def _keys(options: Options, asked: Asked) -> Keys:
+def _keys(request: Request, address: ServiceAddress) -> Keys:
     """The keys of the service, after checking that everything typed fits into a key.
 
     Raises:
         UsageError: something does not fit; the message names it.
     """
-    if not math.isfinite(options.timeout_s):
-        raise UsageError(f"--timeout {options.timeout_s}: give a number of seconds")
-    keys = Keys(asked.prefix, asked.vehicle)
-    for typed in (asked.prefix, asked.vehicle, options.key, options.pair):
+    from coec.adapters.zenoh.client import key_expression
+    from coec.schemas.keys import VERSION_CHUNK, Keys
+
+    if not math.isfinite(request.timeout_s):
+        raise UsageError(f"--timeout {request.timeout_s}: give a number of seconds")
+    keys = Keys(address.prefix, address.vehicle)
+    for typed in (address.prefix, address.vehicle, request.key, request.pair):
         if typed is not None:
             key_expression(typed)
-    head, _, argument = options.key.partition("/")
+    head, _, argument = request.key.partition("/")
     of_several = head in WITH_ARGUMENT and argument
-    if not (f"/{VERSION_CHUNK}/" in options.key or options.key in PLAIN_KEYS or of_several):
+    if not (request.is_whole or request.key in PLAIN_KEYS or of_several):
         known = ", ".join((*PLAIN_KEYS, *(f"{name}/{what}" for name, what in WITH_ARGUMENT.items())))
-        raise UsageError(f"unknown key {options.key}; known: {known}, or a whole key expression with {VERSION_CHUNK}")
+        raise UsageError(f"unknown key {request.key}; known: {known}, or a whole key expression with {VERSION_CHUNK}")
     return keys
 
 
-def _pair_of(session: zenoh.Session, options: Options, keys: Keys, named: str) -> str:
+def _pair_of(session: zenoh.Session, request: Request, keys: Keys, named: str) -> str:
     """The pair of a window or a red event: the given one, else the one in its name, else the vehicle's only one."""
-    if options.pair is not None:
-        return options.pair
-    found = OF_PAIR.fullmatch(named)
-    return found["pair"] if found else _only_pair(session, options, keys)
+    if request.pair is not None:
+        return request.pair
+    match = OF_PAIR.fullmatch(named)
+    return match["pair"] if match else _only_pair(session, request, keys)
 
 
-def _resolve(session: zenoh.Session, options: Options, keys: Keys) -> tuple[str, str | None]:
+def _resolve(session: zenoh.Session, request: Request, keys: Keys) -> tuple[str, str | None]:
     """The key expression, and the kind of reply, which decides how it is printed (None: as it comes)."""
-    head, _, argument = options.key.partition("/")
-    if f"/{VERSION_CHUNK}/" in options.key:
-        return options.key, None
-    if options.key in VEHICLE_KEYS:
-        return f"{keys.root}/{options.key}", options.key
-    if options.key in PAIR_KEYS:
-        return f"{keys.root}/{options.pair or '*'}/{options.key}", options.key
+    from coec.adapters.zenoh.client import single_key
+    from coec.schemas.keys import RIG
+
+    head, _, argument = request.key.partition("/")
+    if request.is_whole:
+        return request.key, None
+    if request.key in VEHICLE_KEYS:
+        return f"{keys.root}/{request.key}", request.key
+    if request.key in PAIR_KEYS:
+        return f"{keys.root}/{request.pair or '*'}/{request.key}", request.key
     if head == "command" and argument:
-        of = options.pair or (RIG if options.sensor is not None else _only_pair(session, options, keys))
+        of = request.pair or (RIG if request.sensor is not None else _only_pair(session, request, keys))
         return single_key(keys.command(of, argument)), "command"
     if head == "evidence" and argument:
-        return keys.evidence_of(_pair_of(session, options, keys, argument), argument), "event"
-    raise UsageError("say where to with --output FILE.jpg")
+        return keys.evidence_of(_pair_of(session, request, keys, argument), argument), "event"
+    raise UsageError("give the file with --output FILE.jpg")
 
 
-def _only_pair(session: zenoh.Session, options: Options, keys: Keys) -> str:
+def _only_pair(session: zenoh.Session, request: Request, keys: Keys) -> str:
     """The name of the vehicle's pair, if it has one."""
-    reply = ask_one(session, f"{keys.status}?format=json", options.timeout_s)
+    from coec.adapters.zenoh.client import ask_one
+    from coec.schemas.base import from_json
+    from coec.schemas.replies import StatusReply
+
+    reply = ask_one(session, f"{keys.status}?format=json", request.timeout_s)
     names = [pair.name for pair in from_json(StatusReply, reply.payload).pairs]
     if len(names) != 1:
         raise UsageError(f"several pairs are served, name one with --pair: {', '.join(names)}")
     return names[0]
 
 
-def _params(key: str, options: Options) -> tuple[str, ...]:
+def _params(key: str, request: Request) -> tuple[str, ...]:
     """The given parameters; to a command is added how long its acknowledgement is awaited."""
-    given = tuple(options.params or ())
+    from coec.adapters.zenoh.client import patience_ms
+
+    given = request.params
     if not _is_command(key) or any(item.startswith("timeout_ms=") for item in given):
         return given
-    return (*given, f"timeout_ms={patience_ms(options.timeout_s)}")
+    return (*given, f"timeout_ms={patience_ms(request.timeout_s)}")
 
 
 def _selector(key: str, params: tuple[str, ...]) -> str:
@@ -214,31 +317,33 @@ def _selector(key: str, params: tuple[str, ...]) -> str:
     return f"{key}?{';'.join(given)}"
 
 
-def _payload(options: Options) -> bytes | None:
-    """The payload of a command: as given, or made from the options that stand for its entries.
+def _payload(request: Request, arguments: Mapping[str, str | bool | None], payload: str | None) -> bytes | None:
+    """The payload of a command: as given, or made from the request that stand for its entries.
 
     Raises:
         UsageError: what was given does not fit the command; the message says what does.
     """
-    typed = {argument.name: getattr(options, argument.name) for argument in (TO, CANDIDATE, RELEASE, REASON, SENSOR)}
-    given = {name: value for name, value in typed.items() if value not in (None, False)}
-    chunks = options.key.split("/")
+    from coec.schemas.commands import NAMES, arguments_of
+    from coec.schemas.keys import RIG
+
+    given = {name: value for name, value in arguments.items() if value not in (None, False)}
+    chunks = request.key.split("/")
     command = chunks[-1] if len(chunks) > 1 and chunks[-2] == "command" else None
     if command is None:
-        unfit = [*(f"--{name}" for name in given), *([] if options.payload is None else ["--payload"])]
+        unfit = [*(f"--{name}" for name in given), *([] if payload is None else ["--payload"])]
         if unfit:
-            raise UsageError(f"{', '.join(unfit)}: {options.key} is no command, and takes none")
+            raise UsageError(f"{', '.join(unfit)}: {request.key} is no command, and takes none")
         return None
-    if options.payload is not None:
+    if payload is not None:
         if given:
-            raise UsageError(f"--payload says it all: leave --{', --'.join(given)} out, or --payload")
+            raise UsageError(f"--payload is the whole payload: leave --{', --'.join(given)} out, or --payload")
         try:
-            return json.dumps(json.loads(options.payload), separators=(",", ":")).encode()
+            return json.dumps(json.loads(payload), separators=(",", ":")).encode()
         except ValueError as error:
             raise UsageError(f"--payload is not JSON: {error}") from error
     if command not in NAMES:
         raise UsageError(f"there is no command {command}; known: {', '.join(NAMES)}")
-    of_rig = options.pair == RIG or (options.pair is None and options.sensor is not None)
+    of_rig = request.pair == RIG or (request.pair is None and request.sensor is not None)
     known = {argument.name: argument.meaning for argument in arguments_of(command, for_rig=of_rig)}
     unknown = [name for name in given if name not in known]
     if unknown:
@@ -248,21 +353,22 @@ def _payload(options: Options) -> bytes | None:
     return json.dumps(given, separators=(",", ":")).encode() if given else None
 
 
-def _show(replies: list[Reply], kind: str | None, options: Options, key: str) -> int:
-    if options.as_json:
-        values = [{"key": reply.key, "value": _value(reply)} for reply in replies]
-        if "*" in key and f"/{VERSION_CHUNK}/" in options.key:
+def _show(answers: list[Reply], kind: str | None, request: Request, key: str, *, as_json: bool) -> None:
+    from coec.reports import console
+
+    if as_json:
+        values = [{"key": answer.key, "value": _value(answer)} for answer in answers]
+        if "*" in key and request.is_whole:
             console.print_json(values)
         elif len(values) > 1:
             console.print_json({"pairs": {value["key"].split("/")[-2]: value["value"] for value in values}})
         else:
             console.print_json(values[0]["value"])
-    else:
-        for index, reply in enumerate(sorted(replies, key=lambda reply: reply.key)):
-            if index:
-                console.show("")
-            _render(reply, kind)
-    return 0 if all(_succeeded(reply, kind) for reply in replies) else 1
+        return
+    for index, answer in enumerate(sorted(answers, key=lambda answer: answer.key)):
+        if index:
+            console.show("")
+        _render(answer, kind)
 
 
 def _value(reply: Reply) -> Any:
@@ -271,13 +377,19 @@ def _value(reply: Reply) -> Any:
     Raises:
         DecodeError: the sender calls it JSON, but it is not.
     """
+    from coec.adapters.zenoh.bus import JSON
+
     if reply.encoding.startswith(JSON):
         return _json(reply)
     return reply.payload.decode("utf-8", errors="replace")
 
 
 def _render(reply: Reply, kind: str | None) -> None:
-    shown = replies.BY_KIND.get(kind or "")
+    from coec.adapters.zenoh.bus import JSON
+    from coec.reports import console
+    from coec.reports import replies as tables
+
+    shown = tables.BY_KIND.get(kind or "")
     if shown is not None:
         shown(reply.payload)
     elif reply.encoding.startswith(JSON):
@@ -287,6 +399,9 @@ def _render(reply: Reply, kind: str | None) -> None:
 
 
 def _succeeded(reply: Reply, kind: str | None) -> bool:
+    from coec.schemas.base import from_json
+    from coec.schemas.replies import Acknowledgement
+
     return kind != "command" or from_json(Acknowledgement, reply.payload).accepted
 
 
@@ -296,6 +411,8 @@ def _json(reply: Reply) -> Any:
     Raises:
         DecodeError: it is none; says what is wrong with it, whose it is, and what to do.
     """
+    from coec.schemas.base import json_value
+
     try:
         return json_value(reply.payload)
     except DecodeError as error:
@@ -306,53 +423,79 @@ def _json(reply: Reply) -> Any:
         ) from error
 
 
-def _save_picture(options: Options, way: Way, keys: Keys, head: str, argument: str) -> int:
+def _save_picture(request: Request, way: Way, keys: Keys, path: Path, *, as_json: bool) -> int:
     """Saves `overlay`, or `evidence/ID` with `--param overlay=before`, as a JPEG file."""
+    from coec.adapters.files import output as files
+    from coec.adapters.zenoh.client import ask_one, connected_by, single_key
+    from coec.reports import console
+
+    head, _, argument = request.key.partition("/")
     if head not in PICTURE_KEYS or (head == "evidence") != bool(argument):
         raise UsageError(
             "--output belongs to windows/ID, overlay, and evidence/ID with --param overlay=before or after"
         )
-    path = Path(str(options.output))
     if path.suffix.lower() not in ("", ".jpg", ".jpeg"):
         raise UsageError(f"{path}: the picture is a JPEG, its name must end in .jpg")
-    with connected_by(way, options.timeout_s) as session:
+    with connected_by(way, request.timeout_s) as session:
         if head == "overlay":
-            key = keys.overlay(options.pair or _only_pair(session, options, keys))
+            key = keys.overlay(request.pair or _only_pair(session, request, keys))
         else:
-            key = keys.evidence_of(_pair_of(session, options, keys, argument), argument)
-        reply = ask_one(session, _selector(single_key(key), tuple(options.params or ())), options.timeout_s)
+            key = keys.evidence_of(_pair_of(session, request, keys, argument), argument)
+        reply = ask_one(session, _selector(single_key(key), request.params), request.timeout_s)
     if reply.encoding != JPEG:
         raise UsageError("the answer is no picture: give --param overlay=before or overlay=after")
-    output.replace(path, reply.payload)
-    if options.as_json:
+    files.replace(path, reply.payload)
+    if as_json:
         console.print_json({"path": str(path), "size_bytes": len(reply.payload)})
     else:
         console.show(f"{path}  {len(reply.payload)} bytes")
     return 0
 
 
-# --- windows/ID -----------------------------------------------------------------------------------------------
+def _download(
+    request: Request, way: Way, keys: Keys, window_id: str, output: Path | None, *, force: bool, as_json: bool
+) -> int:
+    from coec.adapters.zenoh.client import connected_by, single_key
+    from coec.adapters.zenoh.window_fetch import fetch_window
+    from coec.reports import console
 
-
-def _download(options: Options, way: Way, keys: Keys, window_id: str) -> int:
-    if options.output is None:
-        raise UsageError("say where to with --output FILE")
-    with connected_by(way, options.timeout_s) as session, console.progress(counted=False) as bars:
-        pair = _pair_of(session, options, keys, window_id)
+    if output is None:
+        raise UsageError("give the file with --output FILE")
+    with connected_by(way, request.timeout_s) as session, console.progress(counted=False) as bars:
+        pair = _pair_of(session, request, keys, window_id)
         single_key(keys.window(pair, window_id))
         info = fetch_window(
             session,
             keys,
             pair,
             window_id,
-            options.output,
-            options.timeout_s,
+            output,
+            request.timeout_s,
             PATIENCE_S,
             bars.add_download(window_id),
-            replaces=options.force,
+            replaces=force,
         )
-    if options.as_json:
-        console.print_json({"path": str(options.output), **info.model_dump(mode="json")})
+    if as_json:
+        console.print_json({"path": str(output), **info.model_dump(mode="json")})
     else:
-        console.show(f"{options.output}  {info.size_bytes} bytes, sha256 {info.sha256} verified")
+        console.show(f"{output}  {info.size_bytes} bytes, sha256 {info.sha256} verified")
     return 0
+
+
+def _help() -> str:
+    """Every key, what it answers and its parameters, in columns, by the mark that help texts have for them."""
+    width = max(len(each.key) for each in KEYS)
+    rows = []
+    for each in KEYS:
+        rows.append(f"{each.key:{width}}  {each.answer}")
+        if each.parameters:
+            rows.append(f"{'':{width}}    --param {each.parameters}")
+    listed = "\n".join(rows)
+    several = (
+        "With --json, several pairs give one document: {pairs: {NAME: answer of the pair}}; one pair, or --pair, gives "
+        "its answer alone."
+    )
+    return f"Query a running service, or send it a command.\n\n\b\n{listed}\n\n{several}"
+
+
+query.__doc__ = _help()

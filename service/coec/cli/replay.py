@@ -1,53 +1,60 @@
-"""`coec replay`: reaches the recorded decision again, from the file alone."""
+"""`coec replay`: computes the recorded decision again, from the file alone."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.conversions import comparable, result_of
-from coec.adapters.images.codec import GreyImages
-from coec.adapters.mcap.windows import read_result, read_window
-from coec.calibration.calibrator import calibrate
-from coec.config import LimitsConfig
+import typer
+
+from coec.cli.options import Json
 from coec.errors import WindowError
-from coec.reports import console
-from coec.reports.stage_times import StageTimes
-from coec.schemas.base import to_json
 
 
-def run(path: Path, *, depth: str | None, as_json: bool) -> int:
-    """Prints whether the result is the recorded one; returns 1 if not.
+def replay(
+    window: Annotated[Path, typer.Argument(help="A recorded window with its result (.mcap).", show_default=False)],
+    depth: Annotated[
+        str | None, typer.Option(help="Depth network, if it has moved since the window was recorded.", metavar="MODEL")
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Reproduce the recorded decision from the file alone: exit 1 if a byte of it differs."""
+    from coec.adapters.depth.maps import open_depth
+    from coec.adapters.files.conversions import comparable, result_of
+    from coec.adapters.images.codec import GreyImages
+    from coec.adapters.mcap.windows import read_result, read_window
+    from coec.calibration.calibrator import calibrate
+    from coec.config import LimitsConfig
+    from coec.reports import console
+    from coec.reports.stage_times import StageTimes
+    from coec.schemas.base import to_json
 
-    Raises:
-        WindowError: the file is damaged or holds no result.
-        ModelError, CalibrationError: no decision can be reached.
-    """
-    recorded = read_result(path)
+    recorded = read_result(window)
     if recorded is None:
-        raise WindowError(f"{path} holds no result to compare with: `coec calibrate {path}` makes one")
-    window, configuration = read_window(path)
+        raise WindowError(f"{window} holds no result to compare with: `coec calibrate {window}` makes one")
+    recorded_window, configuration = read_window(window)
     network = configuration.depth if depth is None else configuration.depth.model_copy(update={"model": depth})
     limits = LimitsConfig()
     with console.progress() as bars:
-        estimate = calibrate(window, open_depth(network, limits), GreyImages(limits), configuration, StageTimes(bars))
-    reached = comparable(result_of(estimate, window.rig, recorded.vehicle), recorded)
+        estimate = calibrate(
+            recorded_window, open_depth(network, limits), GreyImages(limits), configuration, StageTimes(bars)
+        )
+    reached = comparable(result_of(estimate, recorded_window.rig, recorded.vehicle), recorded)
     identical = to_json(reached) == to_json(recorded)
     differences = _differences(recorded.model_dump(mode="json"), reached.model_dump(mode="json"))
     if as_json:
         console.print_json(
             {
-                "window_id": window.window_id,
+                "window_id": recorded_window.window_id,
                 "identical": identical,
                 "differences": [{"field": f, "recorded": a, "reached": b} for f, a, b in differences],
                 "result": reached.model_dump(mode="json"),
             }
         )
     elif identical:
-        console.out.print(f"{window.window_id}: identical, ", console.styled(reached.verdict.decision), sep="")
+        console.out.print(f"{recorded_window.window_id}: identical, ", console.styled(reached.verdict.decision), sep="")
     else:
-        console.show(f"{window.window_id}: differs", "bold red")
+        console.show(f"{recorded_window.window_id}: differs", "bold red")
         table = console.table("field", "recorded", "reached")
         for field, before, after in differences:
             table.add_row(field, str(before), str(after))

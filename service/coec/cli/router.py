@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Annotated
 
-from coec.adapters.system import logs
-from coec.adapters.system.notify import Notifier
-from coec.adapters.zenoh.router import open_router
-from coec.cli.stopping import until_signal
+import typer
+
+from coec.cli.signals import success_on_sigterm, until_signal
 
 _log = logging.getLogger(__name__)
 
 
-def run(file: Path) -> int:
-    """Routes until told to stop.
+def router(
+    config: Annotated[
+        Path,
+        typer.Option(
+            help="Zenoh configuration of a router (JSON5).", metavar="FILE", show_default=False, readable=False
+        ),
+    ],
+) -> int:
+    """Run a Zenoh router for the vehicle, with the access control of its configuration (deploy/router.json5)."""
+    with success_on_sigterm():
+        from coec.adapters.system import logs
+        from coec.adapters.system.notify import Notifier
+        from coec.adapters.zenoh.router import open_router
 
-    Raises:
-        ConfigError: the configuration, or a certificate that it names, cannot be used.
-        UnavailableError: a port is taken.
-    """
-    logs.configure("info", "auto")
-    notifier = Notifier.from_environment()
-    with until_signal() as stop, open_router(file) as session:
-        _log.info("routing", extra={"fields": {"router": str(session.info.zid()), "configuration": str(file)}})
-        notifier.ready()
-        stop.wait()
-        notifier.stopping()
-        _log.info("stopping")
+        logs.configure("info", "auto")
+        notifier = Notifier.from_environment()
+        with until_signal() as stop, open_router(config) as session:
+            _log.info("routing", extra={"fields": {"router": str(session.info.zid()), "configuration": str(config)}})
+            notifier.ready()
+            stop.wait()
+            notifier.stopping()
+            _log.info("stopping")
     return 0

@@ -1,4 +1,4 @@
-"""`coec sbom`: what this installation is made of, and under which licences."""
+"""`coec sbom`: the bill of materials of this installation, with licences."""
 
 from __future__ import annotations
 
@@ -8,29 +8,37 @@ import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from coec.adapters.depth.model_cards import CARDS, list_models
-from coec.adapters.depth.onnx_network import file_identity
-from coec.adapters.files.output import write
-from coec.adapters.system.installed import installed, pinned_hashes
+import typer
+
+from coec.cli.options import Json
 from coec.errors import UsageError
-from coec.reports import bill_of_materials, console
-from coec.reports.bill_of_materials import Inventory, Network
+
+if TYPE_CHECKING:
+    from coec.reports.bill_of_materials import Inventory, Network
 
 APPLICATION = "coec"
+
 DOCUMENT, TABLE = "coec.cdx.json", "licences.md"
+
 SOURCE_DATE_EPOCH = "SOURCE_DATE_EPOCH"
 """Variable with the time of a reproducible build (reproducible-builds.org)."""
 
 
-def run(lock: Path | None, output: Path | None, *, as_json: bool) -> int:
-    """Prints the table or the document, and writes both to a folder if one is given.
+def sbom(
+    lock: Annotated[
+        Path | None,
+        typer.Option(help="requirements.lock of the installation, for hashes.", metavar="FILE"),
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="Write coec.cdx.json and licences.md.", metavar="DIR")] = None,
+    as_json: Json = False,
+) -> int:
+    """List the packages of this installation: a table of licences, with --json a bill of materials (CycloneDX)."""
+    from coec.adapters.files.output import write
+    from coec.adapters.system.installed import pinned_hashes
+    from coec.reports import bill_of_materials, console
 
-    Raises:
-        NotFoundError: coec is not installed as a package, or something it needs is not.
-        UsageError: the lock file cannot be read, or SOURCE_DATE_EPOCH is no time.
-        OutputError: a file cannot be written.
-    """
     hashes = {} if lock is None else pinned_hashes(lock)
     inventory = inventory_here()
     document = bill_of_materials.cyclonedx(inventory, hashes, _build_time())
@@ -70,6 +78,9 @@ def inventory_here() -> Inventory:
     Raises:
         NotFoundError: coec is not installed as a package, or something it needs is not.
     """
+    from coec.adapters.system.installed import installed
+    from coec.reports.bill_of_materials import Inventory
+
     packages = installed(APPLICATION)
     application = packages.pop(APPLICATION)
     return Inventory(application, packages, platform.python_version(), _networks())
@@ -77,10 +88,14 @@ def inventory_here() -> Inventory:
 
 def _networks() -> Sequence[Network]:
     """The networks whose file comes with the package."""
-    found = []
+    from coec.adapters.depth.model_cards import CARDS, list_models
+    from coec.adapters.depth.onnx_network import file_identity
+    from coec.reports.bill_of_materials import Network
+
+    networks = []
     for card in list_models():
         file = CARDS / f"{card.name}.onnx"
         if file.is_file():
             digest, _ = file_identity(file)
-            found.append(Network(card.name, digest, card.licence))
-    return found
+            networks.append(Network(card.name, digest, card.licence))
+    return networks

@@ -5,19 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from coec.cli.commands.warmup import Options
-from coec.config import Config, OpenPairConfig, PairConfig, load_config
+import typer
+
+from coec.cli.options import Json
 from coec.errors import OutputError, UsageError
-from coec.geometry import compile_news
-from coec.geometry.cameras.registry import MODELS
-from coec.geometry.compiler import kernel_cache
-from coec.reports import console
-from coec.reports.stage_times import StageTimes
-from coec.runtime.worker.kernels import compiled
-from coec.runtime.worker.second_compiler import second_compiler
-from coec.runtime.worker.tasks import Solver
+
+if TYPE_CHECKING:
+    from coec.config import OpenPairConfig, PairConfig
 
 SIZE = {"width": 160, "height": 120, "fx": 60.0, "fy": 60.0, "cx": 79.5, "cy": 59.5}
 """Kernels are compiled for types, not for sizes."""
@@ -25,53 +21,84 @@ SIZE = {"width": 160, "height": 120, "fx": 60.0, "fy": 60.0, "cx": 79.5, "cy": 5
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def run(options: Options) -> int:
-    """Compiles, and prints where the kernels are.
+def warmup(
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            help="Compile for the lenses in this configuration of the daemon (YAML); default: for every lens model.",
+            metavar="FILE",
+            show_default=False,
+        ),
+    ] = None,
+    lenses: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--lens",
+            help="Compile for this lens model, such as pinhole; repeatable.",
+            metavar="MODEL",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Compile the kernels that the service and the calibration use, so that no first start has to.
 
-    Raises:
-        UsageError: an unknown lens model, or both a configuration and models.
-        ConfigError: the configuration cannot be used.
-        OutputError: there is no folder in which kernels could be kept.
+    They are cached for the user who runs the command and for processors like this one. Cached kernels are not compiled
+    again.
     """
-    lenses = _lenses(options)
-    folder, is_kept = kernel_cache()
-    if not is_kept:
+    from coec.geometry.compiler import kernel_cache
+    from coec.reports import console
+
+    models = _lens_models(config, lenses)
+    folder, is_writable = kernel_cache()
+    if not is_writable:
         text = "set XDG_CACHE_HOME or NUMBA_CACHE_DIR to one that belongs to this user"
         raise OutputError(f"no folder for compiled kernels can be written: {text}")
     before, started_s = _files(folder), time.monotonic()
-    total = _compile(lenses)
+    total = _compile(models)
     fresh, took_s = len(_files(folder) - before), time.monotonic() - started_s
-    if options.as_json:
-        document = {"cache": str(folder), "lenses": lenses, "kernels": total, "files_written": fresh, "seconds": took_s}
+    if as_json:
+        document = {"cache": str(folder), "lenses": models, "kernels": total, "files_written": fresh, "seconds": took_s}
         console.print_json(document)
     else:
         done = "nothing had to be compiled" if not fresh else f"compiled in {took_s:.0f} s"
-        console.show(f"{total} kernels for {', '.join(lenses)}: {done}")
-        console.show(f"kept in {folder}")
+        console.show(f"{total} kernels for {', '.join(models)}: {done}")
+        console.show(f"cached in {folder}")
     return 0
 
 
-def _lenses(options: Options) -> list[str]:
+def _lens_models(config: Path | None, lenses: Sequence[str] | None) -> list[str]:
     """The lens models to compile for, in the order of the registry."""
-    if options.config is not None and options.lenses:
+    from coec.config import load_config
+    from coec.geometry.cameras.registry import MODELS
+
+    if config is not None and lenses:
         raise UsageError("give either --config or --lens")
-    named = set(options.lenses or MODELS)
+    named = set(lenses or MODELS)
     if unknown := sorted(named - set(MODELS)):
         raise UsageError(f"--lens {unknown[0]}: unknown; known are {', '.join(MODELS)}")
-    if options.config is not None:
-        found = set(map(_lens, load_config(options.config).every_pair))
-        named = set(MODELS) if None in found else {lens for lens in found if lens is not None}
+    if config is not None:
+        models = set(map(_lens_model, load_config(config).every_pair))
+        named = set(MODELS) if None in models else {lens for lens in models if lens is not None}
     return [lens for lens in MODELS if lens in named]
 
 
-def _lens(pair: PairConfig | OpenPairConfig) -> str | None:
-    """The lens model of a pair; None if `CameraInfo` is to tell it."""
+def _lens_model(pair: PairConfig | OpenPairConfig) -> str | None:
+    """The lens model of a pair; None if it is to come from `CameraInfo`."""
     intrinsics = pair.camera.intrinsics
     return None if intrinsics is None else intrinsics.model
 
 
 def _compile(lenses: Sequence[str]) -> int:
     """Runs every kernel once; returns how many there are."""
+    from coec.config import Config
+    from coec.geometry import compile_news
+    from coec.reports import console
+    from coec.reports.stage_times import StageTimes
+    from coec.runtime.worker.kernels import compiled
+    from coec.runtime.worker.second_compiler import second_compiler
+    from coec.runtime.worker.tasks import Solver
+
     config = Config.model_validate({"pairs": list(_pairs(lenses))})
     total = compiled(len(lenses)).total
     with console.progress(compiling=False) as bars:
@@ -86,7 +113,9 @@ def _compile(lenses: Sequence[str]) -> int:
 
 
 def _pairs(lenses: Sequence[str]) -> Iterable[dict[str, Any]]:
-    """A pair for each lens, on LiDARs of two kinds: one that tells the times of its points, and one that does not."""
+    """A pair for each lens, on LiDARs of two kinds: with and without times of its points."""
+    from coec.geometry.cameras.registry import MODELS
+
     for lens in lenses:
         parameters = dict.fromkeys(MODELS[lens].parameters, 0.0) | SIZE
         if "alpha" in parameters:

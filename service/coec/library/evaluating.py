@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from math import degrees, radians
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 from pydantic import ValidationError
+from rich.progress import Progress as Bars
 
+from coec import calibration_options
 from coec.adapters.depth.maps import open_depth
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import Matrix4, Window
+from coec.calibration_options import Progress, SolverOptions, checked
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
 from coec.errors import CalibrationError, UsageError
 from coec.evaluation import experiments, normalised_errors, split_halves, statistics
@@ -21,9 +24,8 @@ from coec.evaluation.normalised_errors import NormalisedErrors
 from coec.evaluation.split_halves import Halves
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
 from coec.geometry.cameras import name_of
-from coec.library import choices
-from coec.library.camera_fit import refitted
-from coec.library.choices import Choices
+from coec.recording import CallbackProgress, Recording, fit_camera
+from coec.recording import Window as PublicWindow
 from coec.reports.evaluation_documents import (
     angle_spread_of,
     detection_of,
@@ -107,15 +109,16 @@ class Experiments:
     interrupted: bool = False
 
 
-def configuration_of(plan: Plan, chosen: Choices, recorded: CalibrationConfig | None) -> CalibrationConfig:
+def configuration_of(plan: Plan, options: SolverOptions, recorded: CalibrationConfig | None) -> CalibrationConfig:
     """The configuration as for `coec calibrate`, with a search box that contains the starts. If the starts are moved in
-    translation, six degrees of freedom are searched unless `chosen` says otherwise.
+    translation, six degrees of freedom are searched unless `options` say otherwise.
 
     Raises:
         UsageError: a value that does not exist, or starts farther away than any search box reaches.
     """
-    dof = 6 if chosen.dof is None and plan.translation_m > 0 else chosen.dof
-    configuration = choices.configuration_of(replace(chosen, dof=dof), recorded)
+    if options.get("dof") is None and plan.translation_m > 0:
+        options = {**options, "dof": 6}
+    configuration = calibration_options.configuration_of(options, recorded)
     values: dict[str, Any] = configuration.model_dump()
     search = values["search"]
     search["rotation_deg"] = max(search["rotation_deg"], plan.rotation_deg + MARGIN_DEG)
@@ -136,7 +139,7 @@ def subject_of(
     frames: int | None,
     loaded: windows.Loaded,
     plan: Plan,
-    chosen: Choices,
+    options: SolverOptions,
     camera_model: str | None,
     stages: Stages,
 ) -> Subject:
@@ -150,21 +153,21 @@ def subject_of(
     if plan.detection:
         require_enough(len(window.pairs))
     if camera_model is not None:
-        window, _ = refitted(window, camera_model)
+        window, _ = fit_camera(window, camera_model)
     if plan.steps and loaded.configuration is None:  # a recorded window brings the pairs between its own
         window = with_between(window, open_source(source), WindowConfig())
-    model = open_depth(configuration_of(plan, chosen, loaded.configuration).depth, LimitsConfig())
+    model = open_depth(configuration_of(plan, options, loaded.configuration).depth, LimitsConfig())
     depth = experiments.inferred(window, model, stages.begin("depth", len(window.pairs)))
     return Subject(source, frames, window, model, depth, loaded.configuration, loaded.vehicle)
 
 
-def bench_of(subject: Subject, plan: Plan, chosen: Choices) -> Bench:
+def bench_of(subject: Subject, plan: Plan, options: SolverOptions) -> Bench:
     """What all solves share.
 
     Raises:
         UsageError: as `configuration_of`.
     """
-    configuration = configuration_of(plan, chosen, subject.recorded)
+    configuration = configuration_of(plan, options, subject.recorded)
     return Bench(subject.window, subject.depth, experiments.greys_of(subject.window), configuration)
 
 
@@ -210,8 +213,8 @@ def _try_further(
     if plan.nees:
         against, true_pose = _truth(subject.source, bench)
         starts = experiments.poses_of(bench, plan.nees, plan.rotation_deg, plan.translation_m)
-        apart = experiments.in_windows(bench, subject.model, cut, starts, true_pose, stages)
-        done.normalised[against] = normalised_errors.normalise(normalised_errors.of_outcomes(apart), len(apart))
+        outcomes = experiments.in_windows(bench, subject.model, cut, starts, true_pose, stages)
+        done.normalised[against] = normalised_errors.normalise(normalised_errors.of_outcomes(outcomes), len(outcomes))
         # Every split sees the same frames: they count as one.
         done.normalised[OTHER_HALF] = normalised_errors.normalise(
             normalised_errors.of_differences(halved), independent=1
@@ -283,8 +286,85 @@ def report_of(
         halves=None if done.halves is None else halves_of(done.halves),
         detection=done.detection,
         steps=done.steps,
-        normalised=tuple(normalised_of(against, found) for against, found in done.normalised.items()),
+        normalised=tuple(normalised_of(against, errors) for against, errors in done.normalised.items()),
         depth_identity=solved.depth_identity,
         config_hash=solved.config_hash,
         elapsed_s=elapsed_s,
     )
+
+
+class CallbackStages(Stages):
+    """The stages of an evaluation, reported to a function instead of shown."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        super().__init__(Bars(disable=True))
+        self._progress = CallbackProgress(progress)
+
+    def begin(self, stage: str, total: int | None) -> Callable[[int, str], None]:
+        """See `Stages.begin`."""
+        advance = super().begin(stage, total)
+
+        def both(done: int, note: str = "") -> None:
+            advance(done, note)
+            self._progress.step(stage, done, total or 0)
+
+        return both
+
+
+def evaluate(
+    window: PublicWindow | Recording,
+    *,
+    rotation_deg: float,
+    translation_m: float = 0.0,
+    directions: int = 200,
+    halves: int = 0,
+    detection: int = 0,
+    **options: Unpack[SolverOptions],
+) -> EvaluationReport:
+    """Solves from many starts all around the recording's own calibration. The report says how often that calibration is
+    recovered, how exactly, and how good the verdicts are. `coec evaluate` prints the same report and has further
+    experiments.
+
+    Args:
+        window: the frames to solve with; a recording stands for its window of `frames` (25) camera frames.
+        rotation_deg: radius of the sphere of starts, degrees.
+        translation_m: the same for the translation, metres. Above 0, six degrees of freedom are searched unless `dof`
+            says otherwise.
+        directions: number of starts, spread evenly (a Fibonacci sphere).
+        halves: also compare the results of disjoint halves of the frames, over this many random splits; 0: do not.
+        detection: also measure how well checks detect a moved extrinsic, over this many splits of the frames; 0: do
+            not.
+        options: see `SolverOptions`.
+
+    Returns:
+        A pydantic model: `hit_rate`, `rotation_deg` and `translation_m` (median, p95, max), `bias`, `std`,
+        `classified_correctly` and more, each explained in `schemas/v1/EvaluationReport.json`.
+
+    Raises:
+        UsageError: a value that does not exist, or starts farther away than any search box reaches.
+        CalibrationError: there is no result even when the search starts from the recording's calibration.
+        SourceError, WindowError, ModelError: as `calibrate`.
+        KeyboardInterrupt: on Ctrl-C.
+    """
+    for name, value, least in (
+        ("rotation_deg", rotation_deg, 0.0),
+        ("translation_m", translation_m, 0.0),
+        ("directions", directions, 1),
+        ("halves", halves, 0),
+        ("detection", detection, 0),
+    ):
+        if not value >= least:
+            raise UsageError(f"{name}={value!r}: must be at least {least:g}")
+    checked(options)
+    progress, frames = options.get("progress"), options.get("frames")
+    if isinstance(window, PublicWindow) and frames is not None:
+        raise UsageError("frames: a window has its frames already; give the number to `Recording.window`")
+    stages = CallbackStages(progress)
+    cut = window.window(frames=frames, progress=progress) if isinstance(window, Recording) else window
+    plan = Plan(rotation_deg, translation_m, directions, halves=halves, detection=detection)
+    subject = subject_of(cut.source, cut.frames, cut.loaded, plan, options, options.get("camera_model"), stages)
+    bench = bench_of(subject, plan, options)
+    done = tried(subject, plan, bench, stages)
+    if done.interrupted:
+        raise KeyboardInterrupt
+    return report_of(subject, plan, bench, done, stages.elapsed_s())

@@ -44,10 +44,10 @@ def assess(
     from coec.adapters.images.codec import GreyImages
     from coec.calibration.estimators import sight_of
     from coec.calibration.ports import Silence
+    from coec.calibration_options import SolverOptions, configuration_of
     from coec.config import LimitsConfig, WindowConfig
     from coec.evaluation import depth_quality
     from coec.evaluation.experiments import Stages
-    from coec.library.choices import Choices, configuration_of
     from coec.reports import console
     from coec.schemas.base import to_json
     from coec.sources import windows
@@ -59,7 +59,7 @@ def assess(
         load = stages.begin("load", None)
         loaded = windows.load(source, frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         window = loaded.window
-        configuration = configuration_of(Choices(depth=model, objective="mi", dof=3), loaded.configuration)
+        configuration = configuration_of(SolverOptions(depth=model, objective="mi", dof=3), loaded.configuration)
         depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
         inference_ms = _infer(window, depth, stages)
         data = sight_of(window, depth, GreyImages(LimitsConfig()), configuration, Silence())

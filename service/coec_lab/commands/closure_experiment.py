@@ -12,12 +12,12 @@ import numpy as np
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.types import Matrix4
+from coec.calibration_options import SolverOptions
 from coec.config import LimitsConfig, WindowConfig
 from coec.evaluation import experiments
 from coec.evaluation.closure import Between, Closure, Solve, between, close
 from coec.evaluation.experiments import Bench, Stages
 from coec.geometry import se3
-from coec.library.choices import Choices
 from coec.library.evaluating import Plan, configuration_of
 from coec.reports import console, evaluation_tables
 from coec.reports.evaluation_documents import closure_of, in_degrees
@@ -36,7 +36,7 @@ class ClosureRequest:
     relative: str | None
     frames: int | None
     plan: Plan
-    choices: Choices
+    choices: SolverOptions
 
 
 def run(request: ClosureRequest, folder: Path | None, *, as_json: bool) -> int:

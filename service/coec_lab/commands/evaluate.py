@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import typer
 
-from coec.cli.options import SOURCE_HELP, CameraModel, DegreesOfFreedom, Depth, Frames, Json, NoMotionCompensation
+from coec.calibration_options import SolverOptions
+from coec.cli.options import SOURCE_HELP, DegreesOfFreedom, Json, with_calibration_options
 from coec.errors import UsageError
 
 ALL = "all"
@@ -87,6 +88,7 @@ Steps = Annotated[
 ]
 
 
+@with_calibration_options(SolverOptions)
 def evaluate(
     rotation_deg: Radius,
     source: OptionalSource = "",
@@ -94,12 +96,8 @@ def evaluate(
     relative: Relative = None,
     directions: Annotated[int, typer.Option(help="Number of starts.", metavar="N", min=1)] = 200,
     translation_m: RadiusMetres = 0.0,
-    depth: Depth = None,
     objective: Objective = None,
     dof: Dof = None,
-    camera_model: CameraModel = None,
-    frames: Frames = None,
-    no_motion_compensation: NoMotionCompensation = False,
     against_frames: AgainstFrames = False,
     against_slice: AgainstSlice = False,
     halves: Halves = 0,
@@ -110,28 +108,25 @@ def evaluate(
         Path | None, typer.Option(help="Write plots, overlays, starts.csv and report.json.", metavar="DIR")
     ] = None,
     as_json: Json = False,
+    **options: Any,
 ) -> int:
     """Solve from starts all around the source's calibration: hit rate, bias, spread, and reliability of verdicts."""
     if bool(source) == (closure is not None):
         raise UsageError("coec evaluate: give a SOURCE, or --closure A B, and not both")
     if closure is None and relative is not None:
         raise UsageError("--relative is the pose between two sources: it needs --closure A B")
-    others = (against_frames, against_slice, halves, nees, detection, steps, camera_model)
+    others = (against_frames, against_slice, halves, nees, detection, steps, options.get("camera_model"))
     if closure is not None and (objective == ALL or any(others)):
         raise UsageError(
             "--closure is an experiment of its own: leave out --objective all, --against-frames, --against-slice, "
             "--halves, --nees, --detection, --steps and --camera-model"
         )
-    from coec.library.choices import Choices
     from coec.library.evaluating import Plan
     from coec_lab.commands import closure_experiment, starts_experiment
 
-    choices = Choices(
-        depth=depth,
-        objective=objective,
-        dof=None if dof is None else int(dof),
-        motion_compensation=False if no_motion_compensation else None,
-    )
+    given = {**options, "objective": objective, "dof": None if dof is None else int(dof)}
+    choices = cast("SolverOptions", given)
+    frames, camera_model = options.get("frames"), options.get("camera_model")
     plan = Plan(
         rotation_deg=rotation_deg,
         translation_m=translation_m,

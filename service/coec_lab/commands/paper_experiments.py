@@ -15,13 +15,13 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.estimators import depth_features, sight_of
 from coec.calibration.ports import Silence
+from coec.calibration_options import SolverOptions, configuration_of
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import SourceError
 from coec.evaluation import paper, paper_published, starts, statistics
 from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
 from coec.evaluation.paper_speed import run_times
 from coec.evaluation.statistics import Outcome
-from coec.library.choices import Choices, configuration_of
 from coec.reports import console, page, paper_charts, paper_plots, plots, provenance
 from coec.reports.bullseye import bullseye
 from coec.reports.page import Block
@@ -70,7 +70,7 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
         stages = Stages(bars)
         load = stages.begin("load", None)
         loaded = windows.load(request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
-        choices = Choices(depth=request.depth, objective=request.objective)
+        choices = SolverOptions(depth=request.depth, objective=request.objective)
         configuration = configuration_of(choices, loaded.configuration)
         window = loaded.window
         depth = inferred(

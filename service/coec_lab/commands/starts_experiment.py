@@ -9,13 +9,13 @@ from pathlib import Path
 from rich.progress import Progress
 
 from coec.adapters.files import output
-from coec.cli.lens_refusal import drawn_if_refused
+from coec.calibration_options import SolverOptions
+from coec.cli.calibrate import picture_of_lens_error
 from coec.config import WindowConfig
 from coec.errors import CalibrationError
 from coec.evaluation.experiments import Stages
 from coec.evaluation.statistics import Outcome
 from coec.exit_codes import ExitCode
-from coec.library.choices import Choices
 from coec.library.evaluating import Plan, Subject, bench_of, report_of, subject_of, tried
 from coec.reports import console, evaluation_tables, page, provenance
 from coec.reports.evaluation_page import comparison_page, evaluation_page
@@ -38,7 +38,7 @@ class EvaluationRequest:
     frames: int | None
     camera_model: str | None
     plan: Plan
-    choices: Choices
+    choices: SolverOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +56,7 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
     Raises:
         CoecError: there is nothing to evaluate.
     """
+    is_comparison = request.choices.get("objective") == ALL
     if folder is not None:
         output.try_folder(folder)
     with console.progress() as bars:
@@ -63,13 +64,15 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
         load = stages.begin("load", None)
         loaded = windows.load(request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         # What all methods share is loaded with the first.
-        choices = with_objective(request.choices, METHODS[0]) if request.choices.objective == ALL else request.choices
-        with drawn_if_refused(folder, loaded.window.rig.camera):
+        choices = (
+            with_objective(request.choices, METHODS[0]) if request.choices.get("objective") == ALL else request.choices
+        )
+        with picture_of_lens_error(folder, loaded.window.rig.camera):
             subject = subject_of(
                 request.source, request.frames, loaded, request.plan, choices, request.camera_model, stages
             )
         document: EvaluationReport | ComparisonReport
-        if request.choices.objective == ALL:
+        if is_comparison:
             document, make_page = _compare(request, subject, folder, bars, stages)
         else:
             of_method = _evaluate(request.plan, choices, subject, folder, stages)
@@ -89,9 +92,9 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
     return ExitCode.INTERRUPTED if document.interrupted else 0
 
 
-def with_objective(choices: Choices, objective: str) -> Choices:
+def with_objective(choices: SolverOptions, objective: str) -> SolverOptions:
     """The same choices with another objective."""
-    return replace(choices, objective=objective)
+    return {**choices, "objective": objective}
 
 
 def _compare(
@@ -145,7 +148,7 @@ def _compare(
     return report, lambda: comparison_page(report, ends, provenance.here())
 
 
-def _evaluate(plan: Plan, choices: Choices, subject: Subject, folder: Path | None, stages: Stages) -> Evaluated:
+def _evaluate(plan: Plan, choices: SolverOptions, subject: Subject, folder: Path | None, stages: Stages) -> Evaluated:
     """Evaluates one method: runs its experiments, and writes everything but the report into the folder.
 
     Raises:

@@ -1,0 +1,348 @@
+"""Findings of `coec doctor` on the way to the router and the service: whether the router answers, certificates, Zenoh,
+access rules, and what a running service reports about itself.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import UTC, datetime
+from typing import Literal
+
+import zenoh
+
+from coec import __version__
+from coec.adapters.zenoh.bus import closed, is_connected, open_session
+from coec.adapters.zenoh.client import ask, ask_one
+from coec.adapters.zenoh.endpoints import CERTIFIED, WITH_PORT, Endpoint, redacted
+from coec.adapters.zenoh.opening import open_client
+from coec.adapters.zenoh.settings import beside as as_separate_client
+from coec.adapters.zenoh.settings import connected_of, finds_peers, listened_of, mode_of, settings_of
+from coec.adapters.zenoh.tls import (
+    Certificate,
+    CertificateError,
+    host_and_port,
+    material_of,
+    read_certificate,
+    shake_hands,
+)
+from coec.cli.doctor_computer import fail, ok, warn
+from coec.config import Config
+from coec.errors import CoecError, NotFoundError, UnavailableError
+from coec.runtime.api.configuration import shown
+from coec.runtime.api.troubles import TROUBLES
+from coec.runtime.reload import differing
+from coec.schemas.base import from_json, json_value
+from coec.schemas.doctor import Finding, Level
+from coec.schemas.keys import Keys
+from coec.schemas.replies import HealthReply, StatusReply
+
+CONNECT_S = 3.0
+"""Timeout of each step; a router on the same network answers in milliseconds."""
+
+CLOSE_S = 3.0
+
+QUERY_PERIOD_S = 0.05
+"""Time between two queries for a token that the router may not have forwarded yet; nothing announces a refusal."""
+
+SEEN_S = 3.0
+"""Timeout for our own liveliness token to come back from the router."""
+
+EXPIRES_SOON_DAYS = 30.0
+
+OVER_TCP = frozenset({"tcp", "tls", "ws"})
+
+DAY_S = 86_400.0
+
+TIMEOUT_S = 3.0
+
+OF_THE_COMMAND_LINE = frozenset({"zenoh.embedded_router", "state.directory"})
+"""Configuration values that options of `coec run` override."""
+
+PLACES_NAMED = 5
+
+LEVELS: dict[int, Level] = {0: "ok", 1: "warn", 2: "fail", 3: "warn"}
+"""Level of a finding by ROS level; STALE, when nothing was checked yet, is no failure."""
+
+
+def certificate_findings(config: Config) -> Iterator[Finding]:
+    """Findings on the certificates that the service shows, read from the disk."""
+    settings = settings_of(config.zenoh, config.limits)
+    seen: set[str] = set()
+    roles: tuple[tuple[Literal["connect", "listen"], tuple[str, ...]], ...] = (
+        ("connect", connected_of(settings)),
+        ("listen", listened_of(settings)),
+    )
+    for role, endpoints in roles:
+        for endpoint in (Endpoint.parse(text) for text in endpoints):
+            material = material_of(settings, endpoint, role)
+            where = str(material.certificate)
+            if endpoint.protocol not in CERTIFIED or material.certificate is None or where in seen:
+                continue
+            seen.add(where)
+            try:
+                yield _dated("certificate", where, read_certificate(material, role))
+            except CertificateError as error:
+                advice = "have the authority that the router trusts issue a new one; see `deploy/`"
+                yield fail("certificate", where, str(error), advice)
+
+
+def router_findings(config: Config) -> Iterator[Finding]:
+    """Findings on every endpoint of the router, each as far as it answers."""
+    settings = settings_of(config.zenoh, config.limits)
+    for text in _endpoints(settings, config):
+        endpoint = Endpoint.parse(text)
+        if endpoint.protocol in WITH_PORT and endpoint.protocol in OVER_TCP:
+            yield from _reached(settings, endpoint, redacted(text))
+        else:
+            yield ok("router", redacted(text), "only Zenoh can check whether this endpoint answers")
+
+
+def session_of_client(config: Config) -> zenoh.Session | None:
+    """A client session with the router that uses the certificate of the service; None when none comes about."""
+    zenoh.init_log_from_env_or("off")
+    settings = settings_of(config.zenoh, config.limits)
+    endpoints = _endpoints(settings, config)
+    settings = as_separate_client(settings)
+    settings.insert_json5("connect/endpoints", json.dumps(endpoints))
+    try:
+        return open_client(settings, CONNECT_S)
+    except zenoh.ZError:
+        return None
+
+
+def session_as_of_service(config: Config) -> zenoh.Session | None:
+    """A session as the service opens it, which therefore receives what the service receives; None when none comes
+    about. Where the service is the router itself: a client of it."""
+    if mode_of(settings_of(config.zenoh, config.limits)) == "router":
+        return session_of_client(config)
+    zenoh.init_log_from_env_or("off")
+    try:
+        session = open_session(config.zenoh, config.limits, again=True)
+    except UnavailableError:
+        return None
+    deadline_s = time.monotonic() + CONNECT_S
+    while not is_connected(session):
+        if time.monotonic() > deadline_s:
+            closed(session, CLOSE_S)
+            return None
+        time.sleep(QUERY_PERIOD_S)
+    return session
+
+
+def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
+    """Whether what answers is a Zenoh router that accepts this session."""
+    where = ", ".join(redacted(text) for text in _endpoints(settings_of(config.zenoh, config.limits), config))
+    if session is None:
+        return fail(
+            "session",
+            where,
+            "no Zenoh session can be opened",
+            "start the router; if something answers, it is another program (a wrong port?), or the "
+            "router accepts no more sessions (`max_sessions`)",
+        )
+    routers = [str(one) for one in session.info.routers_zid()]
+    return ok("session", where, f"a session with router {', '.join(routers) or 'none, but a peer'}")
+
+
+def mode_finding(config: Config) -> Finding:
+    """How the service takes part, and from whom it therefore receives."""
+    settings = settings_of(config.zenoh, config.limits)
+    mode = mode_of(settings)
+    where = "zenoh" if config.zenoh.file is None else str(config.zenoh.file)
+    if mode == "router":
+        return ok("mode", where, "the service is the router itself: it receives from clients and from peers")
+    if mode == "client":
+        return ok("mode", where, "the service is a client: it receives from clients and peers of its router")
+    if finds_peers(settings):
+        text = "the service is a peer: it receives from clients of its router, and from peers that gossip makes known"
+        return ok("mode", where, text)
+    cause, advice = cause_of_silence(config)
+    return warn("mode", where, cause, advice)
+
+
+def cause_of_silence(config: Config) -> tuple[str, str]:
+    """Why the service does not receive what a client of the same router receives, and what to do about it."""
+    settings = settings_of(config.zenoh, config.limits)
+    if mode_of(settings) != "peer":
+        advice = "check the router's rules for this certificate (docs/security.md)"
+        return "the router forwards it to others", advice
+    client = "leave `mode`, `listen` and `scouting` out of zenoh.file, so that the service is a client"
+    if finds_peers(settings):
+        cause = (
+            "the service is a peer: a router forwards nothing to it from other peers, and it is not connected to them"
+        )
+        advice = f"{client}; or enable gossip at the router, and have peers listen where others can reach them"
+        return cause, advice
+    cause = (
+        "the service is a peer without gossip: a router forwards nothing between two peers, so that it exchanges "
+        "nothing with nodes of rmw_zenoh, which are peers"
+    )
+    return cause, f'{client}; or enable gossip there, and listen at "tcp/localhost:0"'
+
+
+def rules_finding(config: Config, session: zenoh.Session, other: zenoh.Session) -> Finding:
+    """Whether the router lets a session with the service's certificate publish what the service must. To test that,
+    a liveliness token that nobody else reads has to arrive at the other session."""
+    keys = Keys(config.prefix, config.vehicle)
+    token_key = f"{keys.root}/alive/doctor/{session.info.zid()}/{time.time_ns()}"
+    token = session.liveliness().declare_token(token_key)
+    deadline_s = time.monotonic() + SEEN_S
+    try:
+        while time.monotonic() < deadline_s:
+            if any(reply.ok is not None for reply in other.liveliness().get(token_key, timeout=1.0)):
+                return ok("rules", keys.root, "the router forwards what is published there")
+            time.sleep(QUERY_PERIOD_S)
+    finally:
+        token.undeclare()
+    return fail(
+        "rules",
+        keys.root,
+        "the router accepts the session, but forwards nothing: its access control refuses",
+        "compare prefix and vehicle with its rules, and the certificate's name with its subjects: the service needs "
+        "`liveliness_token`, `liveliness_query` and `declare_queryable` below its keys, `declare_subscriber` on frames",
+    )
+
+
+def _endpoints(settings: zenoh.Config, config: Config) -> tuple[str, ...]:
+    """Endpoints of the router that the service uses, or that it is itself."""
+    if mode_of(settings) != "router":
+        return connected_of(settings)
+    return tuple(text.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for text in config.zenoh.router)
+
+
+def _reached(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Iterator[Finding]:
+    host, port = host_and_port(endpoint)
+    try:
+        with closing(socket.create_connection((host, port), CONNECT_S)):
+            pass
+    except socket.gaierror as error:
+        yield fail("router", where, f"unknown host {host}: {error.strerror}", "check its name, and DNS")
+        return
+    except TimeoutError:
+        text = f"no answer within {CONNECT_S:g} s: the computer is off, or a firewall drops the connection"
+        yield fail("router", where, text, "check the network in between")
+        return
+    except ConnectionRefusedError:
+        advice = "start the router (or `coec run --embedded-router`), or correct the port in zenoh.connect"
+        yield fail("router", where, "connection refused: nothing listens at this port", advice)
+        return
+    except OSError as error:
+        yield fail("router", where, f"cannot be reached: {error.strerror or error}", "check the network")
+        return
+    yield ok("router", where, "accepts connections")
+    if endpoint.protocol in CERTIFIED:
+        yield _handshake(settings, endpoint, where)
+
+
+def _handshake(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Finding:
+    try:
+        seen = shake_hands(endpoint, material_of(settings, endpoint, "connect"), CONNECT_S)
+    except CertificateError as error:
+        advice = (
+            "compare the authority here (root_ca_certificate) with who signed the router's certificate, the host with "
+            "its names, and the other way round"
+        )
+        return fail("tls", where, str(error), advice)
+    except OSError as error:
+        return fail("tls", where, f"the link broke: {error.strerror or error}", "check the files of transport/link/tls")
+    return _dated("tls", where, seen)
+
+
+def _dated(check: str, where: str, seen: Certificate) -> Finding:
+    """Whether a certificate is valid today, and for how long."""
+    now_s = time.time()
+    text = f"{seen.name!r}, valid until {_day(seen.not_after_s)}"
+    if seen.names:
+        text += f", for {', '.join(seen.names)}"
+    renew = "have the authority make a new one"
+    if seen.not_after_s < now_s:
+        return fail(check, where, f"{seen.name!r} has expired on {_day(seen.not_after_s)}", renew)
+    if seen.not_before_s > now_s:
+        advice = "check the clock of this computer"
+        return fail(check, where, f"{seen.name!r} is not valid before {_day(seen.not_before_s)}", advice)
+    if seen.not_after_s < now_s + EXPIRES_SOON_DAYS * DAY_S:
+        return warn(check, where, text, f"{renew}, soon")
+    return ok(check, where, text)
+
+
+def _day(seconds: float) -> str:
+    return "for ever" if seconds == float("inf") else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")
+
+
+def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding]:
+    """Findings from the answers of the vehicle's service; a single one if no service answers."""
+    keys = Keys(config.prefix, config.vehicle)
+    try:
+        status = from_json(StatusReply, ask_one(session, f"{keys.status}?format=json", TIMEOUT_S).payload)
+    except NotFoundError:
+        yield ok("service", keys.root, "no service of the vehicle answers here; its status is not known")
+        return
+    except CoecError as error:
+        yield fail("service", keys.root, f"invalid reply: {error}", "check its log")
+        return
+    yield from _status(status, keys)
+    yield _compared(session, config, keys)
+    try:
+        replies = ask(session, f"{keys.health('*')}?format=json", TIMEOUT_S)
+        healths = [from_json(HealthReply, reply.payload) for reply in replies]
+    except CoecError as error:
+        yield fail("health", keys.health("*"), f"invalid reply: {error}", "check its log")
+        return
+    for health in healths:
+        yield from _health(health, keys)
+
+
+def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:
+    """Whether the service runs with this file."""
+    try:
+        served = json_value(ask_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
+        places = [place for place in differing(served, shown(config)) if place not in OF_THE_COMMAND_LINE]
+    except (CoecError, ValueError, KeyError, TypeError) as error:
+        text = f"the service does not report its configuration: {error}"
+        return warn("file", keys.config, text, "check its version and the rules of the router")
+    if not places:
+        return ok("file", keys.config, "the service runs with this file")
+    more = f" and {len(places) - PLACES_NAMED} more" if len(places) > PLACES_NAMED else ""
+    text = f"this file differs from the configuration of the service in {', '.join(places[:PLACES_NAMED])}{more}"
+    return warn(
+        "file", keys.config, text, "reload or restart the service, or name the file that it runs with (--config)"
+    )
+
+
+def _status(status: StatusReply, keys: Keys) -> Iterator[Finding]:
+    runs = f"version {status.version}, {status.state} for {status.uptime_s:.0f} s"
+    if status.state in ("failing", "stopping"):
+        yield fail("service", keys.root, runs, "check its log, and whether the service manager starts it again")
+    elif status.version != __version__:
+        advice = "restart the service with the version that is installed, or query it with its own version"
+        yield warn("service", keys.root, f"{runs}; this is version {__version__}", advice)
+    else:
+        yield ok("service", keys.root, runs)
+    loaded = status.configuration
+    if loaded is not None and loaded.refused is not None:
+        advice = "correct the file (`coec check-config`) and reload"
+        yield fail("reload", keys.root, f"the file on the disk was refused: {loaded.refused}", advice)
+    elif loaded is not None and loaded.waiting:
+        waits = ", ".join(loaded.waiting)
+        yield warn("reload", keys.root, f"waits for a restart: {waits}", "restart the service at a suitable time")
+    for reason in status.reasons:
+        problem = TROUBLES.get(reason.code)
+        advice = f"reason {reason.code}: check its log" if problem is None else problem.advice
+        yield warn("service", keys.root, reason.text, advice)
+
+
+def _health(health: HealthReply, keys: Keys) -> Iterator[Finding]:
+    where = keys.health(health.pair)
+    why = " ".join(reason.text for reason in health.reasons)
+    level = LEVELS[health.level]
+    text = f"{health.state}{f': {why}' if why else ''}"
+    advice = None if level == "ok" else "see `coec query health`, and docs/health.md for what it means"
+    yield Finding(check="health", level=level, where=where, text=text, advice=advice)
+    if health.needs:
+        yield ok("next_window", where, f"still needed for the next window: {'; '.join(health.needs)}")
+    else:
+        yield ok("next_window", where, "nothing is missing")

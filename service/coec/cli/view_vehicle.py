@@ -1,0 +1,443 @@
+"""Shows a running vehicle to viewers: its sensors while there is a viewer, and what its service replies."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TypeVar
+
+import zenoh
+
+from coec.adapters.files.conversions import matrix_of
+from coec.adapters.foxglove.server import Screen
+from coec.adapters.foxglove.shown import Extrinsic, Picture, picture_of
+from coec.adapters.foxglove.timeline import NOT_SERVED, SILENT, Ages, Missed, Moment
+from coec.adapters.foxglove.topics import PICTURES, Pose
+from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.inputs import Input, input_of
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.types import FramePair, Matrix4, Rig
+from coec.cli.view_recording import EXPLANATIONS, STALE, axes_of, figures_of
+from coec.config import Config, PairConfig
+from coec.errors import DecodeError
+from coec.geometry.se3 import is_rigid
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
+from coec.runtime.ingest.inbox import Inbox, Parcel
+from coec.schemas.base import from_msgpack
+from coec.schemas.keys import Keys
+from coec.schemas.replies import AxisReply, ExtrinsicReply, HealthReply, Transform
+
+REPEAT_S = 1.0
+"""Time between two lines of the timeline while nothing changes."""
+
+WAIT_S = 0.05
+"""How long to wait for frames before everything else is updated."""
+
+MUTE = (
+    "Nothing comes on {}: see that somebody publishes it, and that the router's rules let this session subscribe to it."
+)
+
+SERVICE = "service"
+"""Name under which refused documents of the service are counted."""
+
+SILENT_S = 10.0
+"""A service without an answer for so long, five queries, counts as silent."""
+
+QUERY_S = 2.0
+"""Time between two queries, and the timeout of an answer."""
+
+MAX_BYTES = 2**20
+"""Most bytes of a document of the service; they have some 10 kB."""
+
+WAITING = 64
+"""Documents that may wait to be read, of at most `MAX_BYTES` each; the oldest are dropped."""
+
+HEALTH, EXTRINSIC = "health", "extrinsic"
+
+DEPTHS = {CAMERA: 4, LIDAR: 4, EGO: 512}
+"""Samples that may wait; the oldest are dropped. A pair needs its neighbours in time, and two seconds of ego-motion."""
+
+PATIENCE_S = 5.0
+"""Time after which a stream without samples is reported."""
+
+BUSY_S = 0.2
+"""Time after which the newest pair so far is shown, even if more samples wait."""
+
+T = TypeVar("T")
+
+_SILENT = logging.Logger("view")
+_SILENT.addHandler(logging.NullHandler())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VehiclePair:
+    """Which pair of which vehicle."""
+
+    keys: Keys
+    pair: PairConfig
+    rig: Rig
+    config: Config
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceState:
+    """The last replies of a service about a pair.
+
+    Attributes:
+        alive: whether its liveliness token is there.
+        answer_age_s: time since its last reply; None: there was none.
+        served, candidate: (4, 4) T_camera_lidar of `extrinsic`, checked to be rigid.
+    """
+
+    alive: bool = False
+    answer_age_s: float | None = None
+    health: HealthReply | None = None
+    extrinsic: ExtrinsicReply | None = None
+    served: Matrix4 | None = None
+    candidate: Matrix4 | None = None
+
+    @property
+    def state(self) -> str:
+        """State of the pair: that of its health, as long as the service is there and answers."""
+        if not self.alive:
+            return NOT_SERVED
+        if self.health is None or self.answer_age_s is None or self.answer_age_s > SILENT_S:
+            return SILENT
+        return self.health.state
+
+
+def show_live(session: zenoh.Session, vehicle: VehiclePair, screen: Screen, stop: threading.Event) -> None:
+    """Shows the pair until a signal."""
+    name = vehicle.pair.name
+    streams = SensorStreams(session, vehicle.pair, vehicle.config)
+    service = ServiceWatch(session, vehicle.keys, name, lambda cause: streams.refused(SERVICE, cause))
+    timeline = _Timeline(screen, name)
+    try:
+        with service.listening():
+            while not stop.is_set():
+                requested = screen.wanted
+                streams.listen(enabled=bool(requested & PICTURES))
+                pair = streams.newest(WAIT_S)
+                state = service.update()
+                timeline.update(moment_of_service(name, state, streams.ages_s, streams.not_shown), streams.mute)
+                if pair is not None:
+                    try:
+                        screen.show(_picture(pair, vehicle, state, requested))
+                    except DecodeError as error:
+                        streams.refused(CAMERA, error.reason)
+    finally:
+        streams.close()
+
+
+class _Timeline:
+    """Writes the timeline and the log: changes at once, and an unchanged state once a second."""
+
+    def __init__(self, screen: Screen, pair: str) -> None:
+        self._screen = screen
+        self._pair = pair
+        self._shown: Moment | None = None
+        self._shown_s = -math.inf
+        self._mute: tuple[str, ...] = ()
+
+    def update(self, moment: Moment, mute: tuple[str, ...]) -> None:
+        """Update the present state; `mute` are subscribed keys on which nothing is received."""
+        changed = self._shown is None or _essence(self._shown) != _essence(moment)
+        if changed or time.monotonic() - self._shown_s >= REPEAT_S:
+            self._screen.tell(moment)
+            self._shown, self._shown_s = moment, time.monotonic()
+        if changed:
+            self._screen.remark(moment.level, f"{moment.state}: {moment.why}", self._pair)
+        if mute and mute != self._mute:
+            self._screen.remark(1, MUTE.format(", ".join(mute)), self._pair)
+        self._mute = mute
+
+
+def _picture(pair: FramePair, vehicle: VehiclePair, service: ServiceState, requested: frozenset[str]) -> Picture:
+    compensated = vehicle.pair.calibration.motion_compensation
+    extrinsics = extrinsics_of_service(vehicle.rig, service)
+    return picture_of(pair, vehicle.rig, extrinsics, requested, vehicle.config.limits, compensated=compensated)
+
+
+def _essence(moment: Moment) -> tuple[object, ...]:
+    """The part of a moment whose change is worth a line in the log."""
+    return moment.state, moment.reasons, moment.provenance, moment.candidate
+
+
+def moment_of_service(
+    pair: str, service: ServiceState, ages_s: Mapping[str, float | None], not_shown: Counter[tuple[str, str]]
+) -> Moment:
+    """The line for a service and its sensors. `ages_s` is the time since a frame was received, by stream; `not_shown`
+    counts frames by stream and cause. Figures are the last known ones, whatever the state; `answer_s` is their age."""
+    health, extrinsic = service.health, service.extrinsic
+    current = health is not None and service.state == health.state
+    return Moment(
+        pair=pair,
+        state=service.state,
+        level=health.level if health is not None and current else STALE,
+        why=" ".join(one.text for one in health.reasons) if health and current else EXPLANATIONS[service.state],
+        reasons=tuple(one.code for one in health.reasons) if health and current else (service.state,),
+        needs=health.needs if health else (),
+        provenance=extrinsic.provenance if extrinsic else None,
+        status=extrinsic.status if extrinsic else None,
+        percent_complete=extrinsic.percent_complete if extrinsic else None,
+        candidate=service.candidate is not None,
+        ages=Ages(
+            camera_s=ages_s.get("camera"),
+            lidar_s=ages_s.get("lidar"),
+            ego_s=ages_s.get("ego"),
+            answer_s=service.answer_age_s,
+        ),
+        pair_rate_hz=health.data_quality.pair_rate_hz if health else None,
+        sync_error_s=health.data_quality.sync_error_s if health else None,
+        correction=axes_of([one.correction for one in _axis_replies(extrinsic)]),
+        sigma=axes_of([one.sigma for one in _axis_replies(extrinsic)]),
+        step=axes_of(extrinsic.pending.step or () if extrinsic and extrinsic.pending else ()),
+        figures=figures_of(health.metrics if health else {}),
+        not_shown=tuple(
+            Missed(stream=stream, cause=cause, count=count) for (stream, cause), count in sorted(not_shown.items())
+        ),
+    )
+
+
+def extrinsics_of_service(rig: Rig, service: ServiceState) -> dict[Pose, Extrinsic]:
+    """The extrinsics that are drawn while a service is watched."""
+    provenance = service.extrinsic.provenance if service.extrinsic else "not known"
+    pending = service.extrinsic.pending if service.extrinsic else None
+    waits = pending.waits.code if pending and pending.waits else "waits for apply"
+    return {
+        Pose.SERVED: Extrinsic(service.served, f"served: {provenance}, {service.state}"),
+        Pose.NOMINAL: Extrinsic(rig.T_camera_lidar_nominal, "nominal: of the configuration"),
+        Pose.CANDIDATE: Extrinsic(
+            service.candidate, f"candidate: {'none' if service.candidate is None else waits}"
+        ),
+    }  # fmt: skip
+
+
+def _axis_replies(extrinsic: ExtrinsicReply | None) -> Iterable[AxisReply]:
+    if extrinsic is None:
+        return ()
+    axes = extrinsic.axes
+    return (axes.rx, axes.ry, axes.rz, axes.tx, axes.ty, axes.tz)
+
+
+@dataclass(frozen=True, slots=True)
+class _Document:
+    """A received document: its kind, when it was requested (steady clock; None: it was published) and received, and its
+    bytes (None: it is larger than any of ours)."""
+
+    kind: str
+    requested_s: float | None
+    received_s: float
+    payload: bytes | None
+
+
+class ServiceWatch:
+    """The state of one pair. One thread uses it; Zenoh's threads only store received documents."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, pair: str, refused: Callable[[str], None]) -> None:
+        """`refused` is called with the cause for each document that cannot be read."""
+        self._session = session
+        self._keys = {HEALTH: keys.health(pair), EXTRINSIC: keys.extrinsic(pair)}
+        self._alive_key = keys.alive(pair)
+        self._refused = refused
+        self._received: deque[_Document] = deque(maxlen=WAITING)
+        self._alive = False
+        self._requested_s = float("-inf")
+        self._published_s = dict.fromkeys(self._keys, float("-inf"))
+        self._answered_s: float | None = None
+        self._health: HealthReply | None = None
+        self._extrinsic: ExtrinsicReply | None = None
+        self._served: Matrix4 | None = None
+        self._candidate: Matrix4 | None = None
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Subscribe to changes, and to whether a service serves the pair."""
+        subscribers = [
+            self._session.declare_subscriber(key, _directly(self._listener(kind, None)))
+            for kind, key in self._keys.items()
+        ]
+        token = self._session.liveliness().declare_subscriber(
+            self._alive_key, _directly(self._on_liveliness), history=True
+        )
+        try:
+            yield
+        finally:
+            for subscriber in subscribers:
+                subscriber.undeclare()
+            token.undeclare()
+
+    def update(self) -> ServiceState:
+        """The last replies of the service; queries it again when it is time to."""
+        now_s = time.monotonic()
+        if now_s - self._requested_s >= QUERY_S:
+            self._requested_s = now_s
+            for kind, key in self._keys.items():
+                handler = _directly(self._on_reply(self._listener(kind, now_s)))
+                # Any other mode of consolidation keeps the answers in Zenoh until the query ends.
+                self._session.get(key, handler, consolidation=zenoh.ConsolidationMode.NONE, timeout=QUERY_S)
+        while self._received:
+            self._decode(self._received.popleft())
+        return ServiceState(
+            alive=self._alive,
+            answer_age_s=None if self._answered_s is None else now_s - min(self._answered_s, now_s),
+            health=self._health,
+            extrinsic=self._extrinsic,
+            served=self._served,
+            candidate=self._candidate,
+        )
+
+    def _decode(self, document: _Document) -> None:
+        if document.requested_s is None:
+            self._published_s[document.kind] = document.received_s
+        elif document.requested_s <= self._published_s[document.kind]:
+            return  # what was published in the meantime is newer than this answer, or the same
+        try:
+            if document.payload is None:
+                raise DecodeError("message_too_large", f"more than {MAX_BYTES} bytes")
+            if document.kind == HEALTH:
+                self._health = from_msgpack(HealthReply, document.payload)
+            else:
+                reply = from_msgpack(ExtrinsicReply, document.payload)
+                served = _rigid(reply.camera_from_lidar)
+                candidate = None if reply.pending is None else _rigid(reply.pending.camera_from_lidar)
+                self._extrinsic, self._served, self._candidate = reply, served, candidate
+        except DecodeError as error:
+            self._refused(error.reason)
+            return
+        self._answered_s = document.received_s
+
+    def _listener(self, kind: str, requested_s: float | None) -> Callable[[zenoh.Sample], None]:
+        def on_sample(sample: zenoh.Sample) -> None:
+            fits = len(sample.payload) <= MAX_BYTES
+            payload = sample.payload.to_bytes() if fits else None
+            self._received.append(_Document(kind, requested_s, time.monotonic(), payload))
+
+        return on_sample
+
+    @staticmethod
+    def _on_reply(on_sample: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Reply], None]:
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                on_sample(reply.ok)
+
+        return on_reply
+
+    def _on_liveliness(self, sample: zenoh.Sample) -> None:
+        self._alive = sample.kind == zenoh.SampleKind.PUT
+
+
+def _directly(callback: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
+    return zenoh.handlers.Callback(callback, indirect=False)
+
+
+def _rigid(transform: Transform) -> Matrix4:
+    T_camera_lidar = matrix_of(transform)
+    if not is_rigid(T_camera_lidar):
+        raise DecodeError("message_fields", "a matrix that is no rotation and translation")
+    return T_camera_lidar
+
+
+class SensorStreams:
+    """The sensors of one pair. Subscriptions exist only while there is a viewer, so that an unwatched viewer costs the
+    vehicle nothing. A slow viewer loses frames here, not on the vehicle."""
+
+    def __init__(self, session: zenoh.Session, pair: PairConfig, config: Config) -> None:
+        self._session = session
+        self._pair = pair
+        self._limits = config.limits
+        self._losses = LossCounter(_SILENT, pair.name)
+        self._inputs = {name: input_of(stream, config) for name, stream in pair.streams.items()}
+        self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._begin()
+
+    def _begin(self) -> None:
+        self._decoders = {
+            name: Decoder(name, stream, self._limits, self._losses) for name, stream in self._pair.streams.items()
+        }
+        self._pairer = Pairer(self._pair.pairing, expects_motion=self._pair.ego is not None)
+        self._since_s = time.monotonic()
+        self._inbox = Inbox(DEPTHS, self._limits.max_waiting_bytes, self._overrun)
+
+    @property
+    def not_shown(self) -> Counter[tuple[str, str]]:
+        """Frames that were received and not shown, by stream and cause: refused, or without a partner since there is a
+        viewer. Gaps in sequence numbers do not count, because most frames are skipped here anyway."""
+        counts = {cause: count for cause, count in self._losses.snapshot().items() if cause[1] != "sequence_gap"}
+        for name, count in self._pairer.losses.items():
+            stream, _, cause = name.partition("_")
+            counts[stream, cause] = count
+        return Counter(counts)
+
+    @property
+    def ages_s(self) -> dict[str, float | None]:
+        """Time since a sample was received, by stream; None: none since there is a viewer. Empty without a viewer."""
+        if not self._subscribers:
+            return {}
+        arrivals = self._inbox.arrivals(time.monotonic())
+        return {stream: arrivals[stream].age_s for stream in self._inputs}
+
+    @property
+    def mute(self) -> tuple[str, ...]:
+        """Keys and topics on which nothing has been received although there has been a viewer for `PATIENCE_S`."""
+        if time.monotonic() - self._since_s < PATIENCE_S:
+            return ()
+        return tuple(self._pair.streams[stream].place for stream, age_s in self.ages_s.items() if age_s is None)
+
+    def listen(self, *, enabled: bool) -> None:
+        """Subscribe if frames are requested, else unsubscribe."""
+        if enabled and not self._subscribers:
+            self._begin()
+            self._subscribers = [
+                self._subscribe(name, key, source)
+                for name, source in self._inputs.items()
+                for key in source.expressions
+            ]
+        elif not enabled:
+            self.close()
+
+    def newest(self, wait_s: float) -> FramePair | None:
+        """The newest pair of the received samples; older pairs are skipped. None: nothing was received within `wait_s`,
+        or it made no pair."""
+        pair = None
+        parcel = self._inbox.take(wait_s)
+        end_s = time.monotonic() + BUSY_S
+        while isinstance(parcel, Parcel):
+            frame = self._decoders[parcel.stream].frame(parcel.sample)
+            formed = [] if frame is None else self._pairer.push(frame)
+            pair = formed[-1] if formed else pair
+            parcel = self._inbox.take(0.0) if time.monotonic() < end_s else None
+        return pair
+
+    def refused(self, stream: str, cause: str) -> None:
+        """Count something that could not be shown or understood."""
+        self._losses.add(stream, cause)
+
+    def _overrun(self, parcel: Parcel) -> None:
+        self._decoders[parcel.stream].overrun(parcel.sample)
+
+    def close(self) -> None:
+        """Withdraw the subscriptions."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._subscribers = []
+
+    def _subscribe(self, stream: str, key: str, source: Input) -> zenoh.Subscriber[None]:
+        inbox = self._inbox
+
+        def receive(sample: zenoh.Sample) -> None:
+            if sample.kind != zenoh.SampleKind.PUT:
+                return
+            if len(sample.payload) > self._limits.max_message_bytes:
+                self._losses.add(stream, "message_too_large")
+                return
+            inbox.put(stream, source.read(sample))
+
+        handler: Callable[[zenoh.Sample], None] = receive
+        return self._session.declare_subscriber(key, zenoh.handlers.Callback(handler, indirect=False))

@@ -1,0 +1,612 @@
+"""Recordings, their windows, and the results of calibrating them.
+
+A `Recording` gives `Window`s; `solve` calibrates a window, and `Result` shows a program what came out. The command line
+calls `solve` too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from math import inf
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Literal, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.exports import FORMATS
+from coec.adapters.exports.extrinsic import Extrinsic
+from coec.adapters.exports.told import Frames, of_result
+from coec.adapters.files import output
+from coec.adapters.files.conversions import matrix_of, result_of
+from coec.adapters.files.rig import intrinsics_config
+from coec.adapters.images.codec import GreyImages
+from coec.calibration import calibrator, ports
+from coec.calibration import types as calibration
+from coec.calibration.confidence.lens_limit import require_fit
+from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
+from coec.calibration_options import CalibrationOptions, Progress, checked, configuration_of
+from coec.config import CalibrationConfig, LimitsConfig, VerdictConfig, WindowConfig
+from coec.errors import NotAcceptedError, SourceError, UsageError
+from coec.evaluation.fitness import Cadence, cadence
+from coec.geometry.cameras import intrinsics_of, name_of
+from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
+from coec.reports.overlay import titled
+from coec.reports.page.words import count
+from coec.schemas.base import to_json
+from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Verdict
+from coec.sources import Recording as Source
+from coec.sources import windows
+from coec.sources.reading import read_bytes
+from coec.sources.recording import KnowsTruth
+from coec.sources.windows import Loaded, NoPairsError
+from coec.untrusted import Untrusted, printable
+
+NS_PER_S = 1e9
+
+MAX_EXPORT_BYTES = 64 * 2**20
+"""Largest file that is read or changed by an export, bytes. A robot's URDF has less than one million."""
+
+FITTABLE = "double_sphere"
+"""The only model that can be fitted to another one."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFit:
+    """How far the fitted camera model `model` is off the original `of`, pixels. `coverage`: share of the original's
+    pixels that the fit covers."""
+
+    model: str
+    of: str
+    residual_rms_px: float
+    residual_max_px: float
+    coverage: float
+
+
+def fit_camera(window: calibration.Window, model: str) -> tuple[calibration.Window, CameraFit]:
+    """The window with another camera model, which is fitted to the window's own.
+
+    Raises:
+        UsageError: `model` cannot be fitted.
+        LensError: the model does not fit the lens.
+    """
+    if model != FITTABLE:
+        raise UsageError(f"camera model {model}: only {FITTABLE} can be fitted")
+    rig: calibration.Rig = window.rig
+    fit = fit_double_sphere(rig.camera)
+    require_fit(rig.camera, fit, VerdictConfig().max_sigma_deg)
+    quality = CameraFit(FITTABLE, name_of(rig.camera), fit.residual_rms_px, fit.residual_max_px, fit.coverage)
+    fitted = replace(rig, camera=fit.camera, camera_residual_px=fit.residual_max_px)
+    return replace(window, rig=fitted), quality
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The solution of a window, and what it rests on.
+
+    Attributes:
+        window: the window as it was solved: with its start moved and its camera fitted where an option requests it.
+        estimate: see `calibration.types`.
+        result: the estimate as a document of the wire contract.
+        configuration: the settings that decided the result.
+        fit: how well the fitted camera model fits; None where the recording's own model was used.
+        offset: offset of the camera's clock; None where it was not requested.
+    """
+
+    window: calibration.Window
+    estimate: calibration.Estimate
+    result: CalibrationResult
+    configuration: CalibrationConfig
+    fit: CameraFit | None
+    offset: TimeOffset | None
+
+
+def solve(loaded: Loaded, options: CalibrationOptions, progress: ports.Progress) -> Solution:
+    """Calibrates a loaded window.
+
+    Args:
+        loaded: the window, with the configuration that was recorded with it.
+        options: see `calibration_options`.
+        progress: is called for the stages `prepare`, those of the calibration, and `time offset`.
+
+    Raises:
+        UsageError: a value that does not exist.
+        ModelError: the depth network cannot be opened.
+        CalibrationError: there is no result.
+    """
+    configuration = configuration_of(options, options.get("configuration") or loaded.configuration)
+    window, perturb, model = loaded.window, options.get("perturb"), options.get("camera_model")
+    if perturb is not None:
+        window = windows.started_at(window, perturbation_of(perturb))
+    window, fit = (window, None) if model is None else fit_camera(window, model)
+    depth = open_depth(configuration.depth, LimitsConfig())
+    progress.step("prepare", 1, 1)
+    images = GreyImages(LimitsConfig())
+    estimate = calibrator.calibrate(window, depth, images, configuration, progress)
+    offset = None
+    if options.get("time_offset"):
+        offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
+        progress.step("time offset", 1, 1)
+    result = result_of(estimate, window.rig, loaded.vehicle)
+    return Solution(window, estimate, result, configuration, fit, offset)
+
+
+def perturbation_of(perturb: str | Sequence[float]) -> NDArray[np.float64]:
+    """ξ (6,), radians and metres, of the option `perturb`: the text of the command line, or numbers.
+
+    Raises:
+        UsageError: these are not three or six finite numbers, or too large.
+    """
+    if isinstance(perturb, str):
+        return windows.vector_of("--perturb", perturb)
+    return windows.xi_of(f"perturb={perturb!r}", perturb)
+
+
+@dataclass(frozen=True, slots=True)
+class CallbackProgress:
+    """`calibration.ports.Progress` that calls a function; None: no function."""
+
+    callback: Progress | None
+
+    def step(self, stage: str, done: int, total: int) -> None:
+        """See `calibration.ports.Progress`."""
+        if self.callback is not None:
+            self.callback(stage, done, total)
+
+
+def require_accepted(extrinsic: Extrinsic, name: str, override: str, *, force: bool) -> None:
+    """Returns if the extrinsic may be written. `name` (of the calibration) and `override` (the option that forces
+    the export) appear in the error message.
+
+    Raises:
+        NotAcceptedError: its verdict is negative, and `force` is False.
+    """
+    if extrinsic.origin.objections and not force:
+        raise NotAcceptedError(
+            f"{name}: not accepted: {' '.join(extrinsic.origin.objections)} "
+            f"`{override}` exports it all the same, and says so in the file."
+        )
+
+
+def export_text(extrinsic: Extrinsic, form: str, path: Path | None) -> str:
+    """The new text of the file `path` (None: there is none). Its present content stays where the format has room for
+    it.
+
+    Raises:
+        UsageError: no such format.
+        SourceError: the present file cannot be read, or is not text.
+        OutputError: the present content cannot be changed.
+    """
+    require_format(form)
+    return FORMATS[form].text(extrinsic, None if path is None else _present_text(path))
+
+
+def require_format(form: str) -> None:
+    """Returns if the format exists.
+
+    Raises:
+        UsageError: there is no such format; the message lists those that exist.
+    """
+    if form not in FORMATS:
+        raise UsageError(f"format {form}: known are {', '.join(FORMATS)}")
+
+
+def _present_text(path: Path) -> str | None:
+    """Text of the file that is to be changed; None where there is no file."""
+    if not path.exists():
+        return None
+    try:
+        return read_bytes(path, MAX_EXPORT_BYTES).decode()
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{path} is no text in UTF-8: it cannot be changed") from error
+
+
+Pose = Literal["result", "start", "nominal"]
+"""The poses at which the points of a window can be projected."""
+
+
+class Result:
+    """Where the camera is, according to one window. Arrays are copies, so changing one does not change the result."""
+
+    def __init__(self, solution: Solution) -> None:
+        self._solution = solution
+        self._document = solution.result
+
+    def __repr__(self) -> str:
+        reasons = "".join(f", {reason.code}" for reason in self.reasons)
+        return f"<coec.Result {self.document.window_id}: {self.verdict.decision}{reasons}>"
+
+    @property
+    def document(self) -> CalibrationResult:
+        """The whole result as a pydantic model: what `coec calibrate --json` prints, except how long it took."""
+        return self._document
+
+    @property
+    def T_camera_lidar(self) -> NDArray[np.float64]:
+        """(4, 4) float64: maps LiDAR coordinates (x forward, y left, z up) to camera coordinates (x right, y down,
+        z forward), metres. Use it only if `accepted`."""
+        return matrix_of(self.document.camera_from_lidar)
+
+    @property
+    def quaternion_xyzw(self) -> NDArray[np.float64]:
+        """(4,) rotation of `T_camera_lidar`: unit quaternion, w last and not negative."""
+        return np.array(self.document.camera_from_lidar.quaternion_xyzw)
+
+    @property
+    def translation_m(self) -> NDArray[np.float64]:
+        """(3,) last column of `T_camera_lidar`, metres."""
+        return np.array(self.document.camera_from_lidar.translation_m)
+
+    @property
+    def correction(self) -> NDArray[np.float64]:
+        """(6,) rx ry rz (degrees) and tx ty tz (metres), about and along the camera axes, by which the result differs
+        from the recording's own calibration: T_camera_lidar = exp(correction)·T_nominal."""
+        return np.array(self.document.correction)
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """(6,) standard deviations of `correction`, degrees and metres; NaN where an axis was not estimated."""
+        return np.array([np.nan if value is None else value for value in self.document.sigma])
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(6, 6) covariance of the error about and along the camera axes, radians and metres: the true transform is
+        exp(error)·T_camera_lidar. NaN where an axis was not estimated."""
+        return self._solution.estimate.uncertainty.covariance.copy()
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the self-diagnosis accepts the result."""
+        return self.document.verdict.decision == "accepted"
+
+    @property
+    def verdict(self) -> Verdict:
+        """The decision (`accepted` or `failed`) and its reasons."""
+        return self.document.verdict
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Why the result is not accepted: machine-readable codes with a sentence each. Empty if it is accepted."""
+        return self.document.verdict.reasons
+
+    @property
+    def figures(self) -> dict[str, MetricReply]:
+        """The figures of the self-diagnosis by name, each with its limit and whether it is within it."""
+        return dict(self.document.metrics)
+
+    @property
+    def configuration(self) -> CalibrationConfig:
+        """The settings that decided the result. Pass it to another `calibrate` to repeat them."""
+        return self._solution.configuration
+
+    @property
+    def camera_fit(self) -> CameraFit | None:
+        """How well the chosen `camera_model` fits the recording's camera; None if none was chosen."""
+        return self._solution.fit
+
+    @property
+    def time_offset(self) -> TimeOffset | None:
+        """Offset of the camera's clock, s; None unless `time_offset=True`."""
+        return self._solution.offset
+
+    def to_json(self) -> str:
+        """Canonical JSON of `document`: equal results give equal bytes. `coec export` reads it. Its schema is
+        `schemas/v1/CalibrationResult.json`."""
+        return to_json(self.document).decode()
+
+    def export(
+        self,
+        path: str | PathLike[str],
+        *,
+        format: str,
+        parent: str | None = None,
+        child: str | None = None,
+        T_parent_lidar: NDArray[np.float64] | None = None,
+        force: bool = False,
+    ) -> Path:
+        """Writes the result into a file of another program's format, completely or not at all. If the file exists and
+        holds other transforms (URDF, Autoware's YAML and the like), only this transform is changed.
+
+        Args:
+            path: the file; its folder is made if it does not exist.
+            format: `tf`, `urdf`, `autoware`, `kalibr`, `kitti`, `kitti360`, `nuscenes`, `openlabel`, `colmap`,
+                `opencv` or `json`. The file states the direction of its transform.
+            parent: name of the parent frame; None: the LiDAR's.
+            child: name of the child frame; None: the camera's.
+            T_parent_lidar: (4, 4) pose of the LiDAR in `parent`, metres; None: the LiDAR is the parent.
+            force: also write a result that is not accepted; the file says that it is not.
+
+        Returns:
+            The path of the file.
+
+        Raises:
+            NotAcceptedError: the verdict is negative, and `force` was not given.
+            UsageError: no such format, or `T_parent_lidar` is no (4, 4) array of finite numbers.
+            OutputError: the file cannot be written, or its present content cannot be changed.
+            SourceError: the existing file cannot be read.
+        """
+        pose = None if T_parent_lidar is None else np.array(T_parent_lidar, dtype=np.float64)
+        if pose is not None and (pose.shape != (4, 4) or not np.isfinite(pose).all()):
+            raise UsageError(f"T_parent_lidar: (4, 4) finite numbers are expected, not {pose.shape}")
+        camera = intrinsics_config(self._solution.window.rig.camera)
+        extrinsic = of_result(self.document, camera, Frames(parent, child, pose))
+        require_accepted(extrinsic, self.document.window_id, "force=True", force=force)
+        file = Path(fspath(path))
+        output.replace(file, export_text(extrinsic, format, file).encode())
+        return file
+
+    def overlay(self, at: Pose = "result") -> NDArray[np.uint8]:
+        """Draws the points of the sweep, coloured by range, over the middle camera frame of the window.
+
+        Args:
+            at: the pose at which the points are drawn: `result`, `start` (where the search began), or `nominal` (the
+                recording's own calibration).
+
+        Returns:
+            (height, width, 3) uint8, RGB, as matplotlib's `imshow` and Pillow take it. It is somewhat higher than the
+            image, and a small image is enlarged by a whole factor.
+
+        Raises:
+            DecodeError: the image cannot be decoded.
+        """
+        # matplotlib takes a second to import.
+        from coec.reports import pictures
+
+        window = self._solution.window
+        poses = {
+            "result": self.T_camera_lidar,
+            "start": window.T_camera_lidar_start,
+            "nominal": window.rig.T_camera_lidar_nominal,
+        }
+        if at not in poses:
+            raise UsageError(f"at={at!r}: known are {', '.join(poses)}")
+        title = f"{self.document.window_id}: {self.verdict.decision if at == 'result' else at}"
+        compensated = self.configuration.motion_compensation
+        (image,) = pictures.overlays(window, [poses[at]], compensated)
+        return np.ascontiguousarray(titled(image, title)[:, :, ::-1])
+
+
+class Window:
+    """Pairs of a camera frame and a LiDAR sweep from one slice of a drive: the input of one calibration. Made by
+    `Recording.window` and `Recording.windows`."""
+
+    def __init__(self, source: str, frames: int | None, loaded: Loaded) -> None:
+        self._source = source
+        self._frames = frames
+        self._loaded = loaded
+
+    def __repr__(self) -> str:
+        return f"<coec.Window {self.window_id}, {count(self.pairs, 'pair')}>"
+
+    @property
+    def window_id(self) -> str:
+        """`<pair>-<stamp of the first camera frame, ns>`, or the recorded id."""
+        return self._loaded.window.window_id
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs."""
+        return len(self._loaded.window.pairs)
+
+    @property
+    def stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the camera frames, ascending, nanoseconds."""
+        return tuple(pair.stamp_ns for pair in self._loaded.window.pairs)
+
+    @property
+    def unpaired(self) -> dict[str, int]:
+        """Number of frames without a partner, by cause."""
+        return dict(self._loaded.unpaired)
+
+    @property
+    def source(self) -> str:
+        """The recording, as it was given to `coec.open`."""
+        return self._source
+
+    @property
+    def frames(self) -> int | None:
+        """The requested largest number of camera frames; None: the usual number."""
+        return self._frames
+
+    @property
+    def loaded(self) -> Loaded:
+        """The window as the package itself passes it on. Not part of the stable interface."""
+        return self._loaded
+
+    @property
+    def T_camera_lidar_start(self) -> NDArray[np.float64]:
+        """(4, 4) pose at which a search starts, metres."""
+        return self._loaded.window.T_camera_lidar_start.copy()
+
+    def calibrate(self, **options: Unpack[CalibrationOptions]) -> Result:
+        """Calibrates the window. The same window, network and configuration give the same result, to the byte.
+
+        Args:
+            options: as `coec.calibrate`, except `frames`: the window has its frames already.
+
+        Raises:
+            CoecError: as `coec.calibrate`.
+        """
+        checked(options)
+        if options.get("frames") is not None:
+            raise UsageError("frames: a window has its frames already; give the number to `Recording.window`")
+        return Result(solve(self._loaded, options, CallbackProgress(options.get("progress"))))
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What a recording holds, as far as it is known without loading its frames. `str()` makes lines to print of it.
+
+    Attributes:
+        name: layout, drive, camera.
+        pair: name of the camera-LiDAR pair.
+        seconds: from the first camera frame to the last.
+        camera, lidar, motion: number of frames, rate (Hz, of the median interval) and longest gap (s) of each stream.
+            `motion` is None where the recording has no ego-motion; its sweeps are then not compensated.
+        camera_model: one of `pinhole, radtan, rational, kannala_brandt, mei, eucm, double_sphere`.
+        intrinsics: its parameters by name, with `width` and `height`; pixels where they have a unit.
+        camera_frame, lidar_frame: names of the coordinate frames.
+    """
+
+    name: str
+    pair: str
+    seconds: float
+    camera: Cadence
+    lidar: Cadence
+    motion: Cadence | None
+    camera_model: str
+    intrinsics: dict[str, float]
+    camera_frame: str
+    lidar_frame: str
+
+    def __str__(self) -> str:
+        width, height = self.intrinsics["width"], self.intrinsics["height"]
+        motion = (
+            "none" if self.motion is None else f"{count(self.motion.frames, 'sample')}, {self.motion.rate_hz:.2f} Hz"
+        )
+        # Names and frames are as the recording has them, and whoever prints this has a terminal that would obey them.
+        return "\n".join(
+            printable(line, None)
+            for line in (
+                f"{self.name}: {self.seconds:.1f} s of the pair {self.pair}",
+                f"  camera  {count(self.camera.frames, 'frame')}, {self.camera.rate_hz:.2f} Hz  {self.camera_model}, "
+                f"{width:.0f} x {height:.0f} px, frame {self.camera_frame}",
+                f"  LiDAR   {count(self.lidar.frames, 'sweep')}, {self.lidar.rate_hz:.2f} Hz  frame {self.lidar_frame}",
+                f"  motion  {motion}",
+            )
+        )
+
+
+class Recording:
+    """A recorded drive of one camera-LiDAR pair, made by `coec.open`."""
+
+    def __init__(self, source: str, opened: Source) -> None:
+        self._source = source
+        self._opened = opened
+
+    def __repr__(self) -> str:
+        return f"<coec.Recording {Untrusted(self._opened.name)}>"
+
+    @property
+    def source(self) -> str:
+        """The recording, as it was given to `coec.open`."""
+        return self._source
+
+    @property
+    def name(self) -> str:
+        """Layout, drive and camera, for people to read."""
+        return self._opened.name
+
+    @property
+    def T_camera_lidar(self) -> NDArray[np.float64]:
+        """(4, 4) the calibration that came with the recording, metres: maps LiDAR coordinates (x forward, y left, z up)
+        to camera coordinates (x right, y down, z forward). A `correction` is relative to it."""
+        return self._opened.rig.T_camera_lidar_nominal.copy()
+
+    @property
+    def camera_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the camera frames, ascending, nanoseconds."""
+        return self._opened.camera_stamps_ns
+
+    @property
+    def seconds(self) -> float:
+        """From the first camera frame to the last."""
+        stamps_ns = self.camera_stamps_ns
+        return (stamps_ns[-1] - stamps_ns[0]) / NS_PER_S if stamps_ns else 0.0
+
+    @property
+    def configuration(self) -> CalibrationConfig | None:
+        """Configuration that a recorded window carries; None for every other recording."""
+        return self._opened.configuration
+
+    def describe(self) -> Description:
+        """Streams, rates, camera and frames. Print it."""
+        opened, rig = self._opened, self._opened.rig
+        return Description(
+            name=opened.name,
+            pair=rig.pair,
+            seconds=self.seconds,
+            camera=cadence(opened.camera_stamps_ns),
+            lidar=cadence(opened.sweep_stamps_ns),
+            motion=cadence(opened.motion_stamps_ns) if opened.motion_stamps_ns else None,
+            camera_model=name_of(rig.camera),
+            intrinsics=dict(intrinsics_of(rig.camera)),
+            camera_frame=rig.camera_frame,
+            lidar_frame=rig.lidar_frame,
+        )
+
+    def truth(self, stamp_ns: int) -> NDArray[np.float64] | None:
+        """(4, 4) true T_camera_lidar at a time, if the drive was simulated; else None."""
+        return self._opened.truth(stamp_ns) if isinstance(self._opened, KnowsTruth) else None
+
+    def window(
+        self,
+        *,
+        frames: int | None = None,
+        between_s: tuple[float, float] | None = None,
+        progress: Progress | None = None,
+    ) -> Window:
+        """Cuts one window: evenly spaced camera frames, each with the sweep nearest to it in time.
+
+        Args:
+            frames: how many camera frames at most; None: 25, or all that a recorded window has.
+            between_s: (begin, end), seconds after the first frame of the recording; only frames between them are used,
+                both ends included. None: the whole recording.
+            progress: is called for the stage `load`.
+
+        Raises:
+            UsageError: `frames` is below 1, or `between_s` is no interval.
+            SourceError: a file cannot be read, or no camera frame has a sweep near enough.
+            WindowError: a recorded window is damaged.
+        """
+        if frames is not None and frames < 1:
+            raise UsageError(f"frames={frames}: a window has at least one")
+        begin_s, end_s = windows.WHOLE if between_s is None else between_s
+        if not 0.0 <= begin_s <= end_s:
+            raise UsageError(f"between_s=({begin_s:g}, {end_s:g}): give seconds after the first frame, begin and end")
+        stages = CallbackProgress(progress)
+
+        def report(done: int, total: int) -> None:
+            stages.step("load", done, total)
+
+        usual = WindowConfig().pairs
+        if self.configuration is None:
+            loaded = windows.chosen_from(self._opened, frames or usual, report, (begin_s, end_s))
+        else:  # a recorded window keeps its pairs
+            loaded = windows.load(self._source, frames, usual, report, (begin_s, end_s))
+        return Window(self._source, frames, loaded)
+
+    def windows(self, *, seconds: float = 60.0, frames: int | None = None) -> Iterator[Window]:
+        """Cuts the recording into consecutive windows of `seconds` each. The last one takes the rest, which is half to
+        one and a half times as long. A window is loaded when the loop comes to it. A slice in which no camera frame has
+        a sweep is left out.
+
+        Raises:
+            UsageError: `seconds` is not above 0, or `frames` is below 1.
+            SourceError, WindowError: as `window`.
+        """
+        if not 0.0 < seconds < inf:
+            raise UsageError(f"seconds={seconds:g}: give a finite length above 0")
+        count = max(1, round(self.seconds / seconds))
+        for index in range(count):
+            # `window` includes both ends; a frame on the border belongs to the window that begins there.
+            end_s = inf if index == count - 1 else float(np.nextafter((index + 1) * seconds, 0.0))
+            with suppress(NoPairsError):
+                yield self.window(frames=frames, between_s=(index * seconds, end_s))
+
+    def calibrate(self, **options: Unpack[CalibrationOptions]) -> Result:
+        """Calibrates the recording's window of at most `frames` camera frames (None: 25).
+
+        Args:
+            options: as `coec.calibrate`.
+
+        Raises:
+            CoecError: as `window` and `coec.calibrate`.
+        """
+        checked(options)
+        frames = options.pop("frames", None)
+        return self.window(frames=frames, progress=options.get("progress")).calibrate(**options)
