@@ -22,7 +22,17 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 TESTS = REPOSITORY / "tests"
 BENCHMARKS = TESTS / "bench"
 
-LONGEST_FIRST = ("test_readme.py", "e2e", "cli/test_demo.py", "cli", "peers", "campaign", "deploy", "calibration")
+LONGEST_FIRST = (
+    "test_readme.py",
+    "e2e",
+    "lab/test_demo.py",
+    "lab",
+    "cli",
+    "peers",
+    "campaign",
+    "deploy",
+    "calibration",
+)
 """Files and folders whose tests start processes, and those that calibrate. A parallel run hands out one file after the
 other: a long one that comes last is waited for by a core that has nothing to do."""
 

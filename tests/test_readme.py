@@ -104,16 +104,16 @@ CHECK = f'coec check "kitti360:{SAMPLES}/kitti360?camera=image_00" --depth stere
 NETWORK = f"{SAMPLES}/depth/tcsmallnet_dyn.onnx"
 
 FORMS = {
-    # These set up a virtual environment, and run what is tested here: the demonstration by tests/cli/test_demo.py.
+    # These set up a virtual environment, and run what is tested here: the demonstration by tests/lab/test_demo.py.
     "deploy/demo": Form("bash -n $REPOSITORY/deploy/demo", always=True),
     "tests/run": Form("bash -n $REPOSITORY/tests/run", always=True),
     DIRECTIONS: Form(f"{DIRECTIONS} --frames 5".replace("200", "2")),
     SIM_DRIVE: Form(f"{SIM_DRIVE} --camera fisheye200".replace("60", "0.5").replace("step:30", "step:0.2")),
     RIG_DRIVE: Form(RIG_DRIVE.replace("fisheye350", "fisheye100").replace("4", "0.3").replace("step:2", "step:0.1")),
     RIG_LIDARS: Form("coec lidars --help > help.txt"),
-    # What it shows is tested in tests/cli/test_demo_rig.py.
+    # What it shows is tested in tests/lab/test_demo_rig.py.
     RIG_DEMO: Form("coec demo --help > help.txt && grep -q -e --rig help.txt"),
-    # What it draws is tested in tests/cli/test_sim_rig_moves.py.
+    # What it draws is tested in tests/lab/test_sim_rig_moves.py.
     RIG_MOVES: Form(
         "COLUMNS=200 coec sim rig-moves --help > help.txt && grep -q -e --drives help.txt && grep -q -e --rigs help.txt"
     ),

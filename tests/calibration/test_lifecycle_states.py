@@ -3,9 +3,9 @@
 import pytest
 
 from coec.calibration.lifecycle import MEANING, TRANSITIONS, Event, HealthState, markdown
-from coec.calibration.lifecycle.page import page
 from coec.calibration.lifecycle.states import STATES
 from conftest import REPOSITORY
+from generate.service import health_page
 
 U, H, S, M, D, A = HealthState
 
@@ -77,6 +77,6 @@ def test_every_state_can_be_reached_and_left() -> None:
 
 def test_the_page_of_the_documentation_is_that_of_the_code() -> None:
     committed = (REPOSITORY / "docs" / "health.md").read_text(encoding="utf-8")
-    assert committed == page(), "run: PYTHONPATH=service python -m coec.calibration.lifecycle > docs/health.md"
+    assert committed == health_page(), "run: PYTHONPATH=docs:service python -m generate docs"
     assert markdown() in committed
     assert all(f"`{state.value}`: {STATES[state]}" in committed for state in HealthState)

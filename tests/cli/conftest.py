@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from coec.cli import sim  # noqa: F401  it draws for itself, whichever test loads it first; so do these
 from coec.cli.main import main
-from coec.evaluation import check_run, matrix_run  # noqa: F401
+from coec.evaluation import check_run, matrix_run  # noqa: F401  they render themselves, whichever test loads them first
+from coec_lab.commands import drive_bags  # noqa: F401  so does this
 from drives import drawn
 
 SMALL = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 from cli.conftest import Coec
 from coec import __version__, api
-from coec.cli.main import BUILT_IN, LABORATORY, application
+from coec.cli.main import BUILT_IN, GROUP, application
 from coec.errors import UsageError
 
 COMMANDS = ("calibrate", "run", "check-config", "play", "query", "replay", "convert", "models", "demo")
@@ -72,7 +73,7 @@ def test_a_command_is_declared_without_the_others() -> None:
     everything = application(["--help", "check-config"])
     names = {each.name for each in everything.registered_commands}
     names |= {each.name for each in everything.registered_groups}
-    assert names == {*BUILT_IN, *(name for name in LABORATORY if "." not in name)}
+    assert names == {*BUILT_IN, *(point.name for point in entry_points(group=GROUP) if "." not in point.name)}
 
 
 def test_a_mistyped_command_is_told_which_is_meant(coec: Coec) -> None:

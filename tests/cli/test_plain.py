@@ -7,11 +7,12 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
+from importlib.metadata import entry_points
 
 import pytest
 from rich.text import Text
 
-from coec.cli.main import BUILT_IN, LABORATORY, application
+from coec.cli.main import BUILT_IN, GROUP, application
 from coec.reports import console, plain_text
 
 SIGNS = "185° ± 0.3 ≥ 1 ✓ −2 σ²"
@@ -81,7 +82,8 @@ def test_help_of_everything_is_plain_where_the_locale_is_ascii() -> None:
         "    sys.argv = ['coec', *words, '--help']\n"
         "    main()\n"
     )
-    words = [[], *([name] for name in (*BUILT_IN, *LABORATORY) if "." not in name), ["sim", "drive"], ["sim", "matrix"]]
+    names = (*BUILT_IN, *(point.name for point in entry_points(group=GROUP)))
+    words = [[], *(name.split(".") for name in names), ["sim", "drive"], ["sim", "matrix"]]
     environment = {"PYTHONPATH": ":".join(sys.path), "PYTHONIOENCODING": "ascii", "TERM": "dumb", "PATH": os.defpath}
     done = subprocess.run([sys.executable, "-c", code, repr(words)], capture_output=True, env=environment)
     assert done.returncode == 0, done.stderr.decode()

@@ -26,7 +26,7 @@ OTHER_VERSIONS = ("-W", "ignore::DeprecationWarning", "-W", "ignore::PendingDepr
 """For pytest with other versions than those of the lock files: what an old package uses of a new one is not ours."""
 
 OF_THE_LOCK_FILES = (
-    "tests/cli/test_pages.py::test_the_page_is_the_one_that_the_code_would_write",
+    "tests/docs/test_pages.py::test_the_page_is_the_one_that_the_code_would_write",
     "tests/cli/test_sbom.py::test_every_package_is_there_with_the_hashes_it_was_pinned_by",
     "tests/cli/test_sbom.py::test_the_committed_table_is_that_of_the_lock_file",
 )
@@ -78,7 +78,7 @@ def copied_checkout(folder: Path) -> Path:
 
 
 def environment(folder: Path, python: str, checkout: Path, *resolution: str) -> Path:
-    """The interpreter of a new environment with coec, the extras and the tools of the tests.
+    """The interpreter of a new environment with coec, its laboratory, the extras and the tools of the tests.
 
     Args:
         python: the interpreter that it is made with.
@@ -89,7 +89,7 @@ def environment(folder: Path, python: str, checkout: Path, *resolution: str) -> 
     interpreter = folder / "bin" / "python"
     completed(
         uv(), "pip", "install", "--quiet", "--python", interpreter, *resolution,
-        "--editable", f".[{','.join(EXTRAS)}]", "--group", "checks", cwd=checkout,
+        "--editable", f".[{','.join(EXTRAS)}]", "--editable", "./service/coec_lab", "--group", "checks", cwd=checkout,
     )  # fmt: skip
     return interpreter
 

@@ -28,13 +28,6 @@ from coec.calibration.types import (
     Reason,
     Window,
 )
-from coec.cli.demo.outcome import outcome_of
-from coec.cli.demo.page import demo_page
-from coec.cli.demo.rig import report as rig_report
-from coec.cli.demo.rig import story as rig_story
-from coec.cli.demo.rig.outcome import outcome_of as rig_outcome_of
-from coec.cli.demo.rig.told import SensorTold, Told
-from coec.cli.demo.watch import Moment
 from coec.evaluation import paper_published
 from coec.evaluation.paper import MOVES_DEG, Figures
 from coec.evaluation.profiles import Scan, Views
@@ -75,6 +68,10 @@ from coec.schemas.replies import (
     MetricsPoint,
 )
 from coec.schemas.replies import Reason as Said
+from coec_lab.demo import rig as rig_of_demo
+from coec_lab.demo import rig_drive
+from coec_lab.demo.pair_client import Moment, outcome_of
+from coec_lab.demo.pair_report import demo_page
 from estimates import RIG, estimate
 
 EVIL = "<script>alert(1)</script>'\"><img src=http://evil/x onerror=alert(2)>"
@@ -380,14 +377,15 @@ def demo(folder: Path) -> Page:
 
 def rig_demo(folder: Path) -> Page:
     """Of `coec demo --rig`."""
-    act = rig_story.ACTS[0]
-    names = {rig_story.LIDAR: "lidar", "front": "camera", "left": "camera", "rear": "camera", "right": "camera"}
-    heard = [
-        Told(
+    scenario = rig_drive.SCENARIO
+    act = scenario.acts[0]
+    names = {scenario.lidar: "lidar", "front": "camera", "left": "camera", "rear": "camera", "right": "camera"}
+    snapshots = [
+        rig_drive.RigSnapshot(
             second=second,
-            looked_at="roof_front",
+            checked="roof_front",
             sensors={
-                name: SensorTold(
+                name: rig_drive.SensorCondition(
                     name, kind, "lidar_moved" if moved and kind == "lidar" else "calibrated",
                     1.0 if moved and kind == "lidar" else 0.0, None, f"{name} is as it was",
                 )
@@ -395,9 +393,10 @@ def rig_demo(folder: Path) -> Page:
             },
             edges={},
         )
-        for second, moved in ((4.0, False), (rig_story.KNOCK_S + 9.0, True))
+        for second, moved in ((4.0, False), (scenario.knock_s + 9.0, True))
     ]  # fmt: skip
-    return rig_report.page(files(folder, "lidar_knocked"), [(rig_outcome_of(act, heard), heard)], MADE)
+    outcome = rig_drive.outcome_of(act, snapshots, scenario.knock_s)
+    return rig_of_demo.page(files(folder, "lidar_knocked"), [(outcome, snapshots)], MADE, scenario)
 
 
 KINDS: Mapping[str, Callable[[Path], Page]] = MappingProxyType(

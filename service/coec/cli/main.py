@@ -55,18 +55,6 @@ BUILT_IN = {
 }
 """Commands of this package in the order of the help text: a function, or a `typer.Typer` with subcommands."""
 
-# To be removed when these commands are entry points of the laboratory's package: name -> `module:function` with one
-# dataclass as parameter, as `declaring.taking` has it, or a `typer.Typer`.
-LABORATORY = {
-    "evaluate": "coec.cli.commands.evaluate:run",
-    "alarms": "coec.cli.commands.alarms:run",
-    "paper": "coec.cli.commands.paper:run",
-    "bench": "coec.cli.commands.bench:run",
-    "demo": "coec.cli.commands.demo:run",
-    "sim": "coec.cli.commands.sim:app",
-    "models.assess": "coec.cli.commands.models_assess:run",
-}
-
 GROUP = "coec.commands"
 """Group of entry points by which another package adds commands: the name, with a dot before that of a subcommand
 (`models.assess`), and `module:function` or, for a group of commands, `module:app`."""
@@ -121,17 +109,7 @@ def _added_commands() -> dict[str, Callable[[], Any]]:
     """What other packages add, by name: functions that load the commands."""
     from importlib.metadata import entry_points
 
-    from coec.cli.declaring import taking
-
-    def load(target: str) -> Any:
-        loaded = _load(target)
-        return loaded if isinstance(loaded, typer.Typer) else taking(loaded)
-
-    laboratory: dict[str, Callable[[], Any]] = {
-        name: lambda target=target: load(target)  # type: ignore[misc]
-        for name, target in LABORATORY.items()
-    }
-    return laboratory | {point.name: point.load for point in entry_points(group=GROUP)}
+    return {point.name: point.load for point in entry_points(group=GROUP)}
 
 
 def _add(app: typer.Typer, name: str, command: Any, panel: str | None) -> typer.Typer | None:

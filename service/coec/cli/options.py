@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from coec.calibration_options import Entry, SolverOptions, entries
+from coec.calibration_options import Entry, entries
 from coec.errors import UsageError
 
 if TYPE_CHECKING:
@@ -137,30 +137,6 @@ def _value(entry: Entry, given: Any) -> Any:
     if given is None or given is False:
         return None
     return given if entry.flag.value is None else entry.flag.value(given)
-
-
-# Until `evaluate` takes `with_calibration_options(SolverOptions)`.
-class Chosen(Protocol):
-    """Options that several commands share; None = not given."""
-
-    @property
-    def depth(self) -> str | None: ...
-    @property
-    def objective(self) -> str | None: ...
-    @property
-    def dof(self) -> str | None: ...
-    @property
-    def no_motion_compensation(self) -> bool: ...
-
-
-def choices_of(options: Chosen) -> SolverOptions:
-    """The options of a calibration that were given on the command line."""
-    return SolverOptions(
-        depth=options.depth,
-        objective=options.objective,
-        dof=None if options.dof is None else int(options.dof),
-        motion_compensation=False if options.no_motion_compensation else None,
-    )
 
 
 # Options about a running service.

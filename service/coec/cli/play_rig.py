@@ -8,7 +8,7 @@ from typing import Any
 from coec.adapters.ros.sensor_topics import SensorTopics
 from coec.adapters.ros.topics import TopicInfo, TopicMessage
 from coec.adapters.zenoh.player import SensorKeys
-from coec.cli.sim_rig import vehicle_of
+from coec.cli.rig_configuration import vehicle_of
 from coec.simulation.rig_drive import RigDrive
 from coec.simulation.source import open_rig
 from coec.sources.spec import SourceSpec

@@ -1,4 +1,4 @@
-"""The configuration of a service for all sensors of a simulated rig, each described once."""
+"""All sensors of a simulated rig, each described once: as the configuration of a service, and as topics of ROS."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from coec.adapters.files.output import write
 from coec.adapters.files.rig import intrinsics_config, mask_to_png, matrix_rows
+from coec.adapters.ros.outgoing import Placed
+from coec.adapters.ros.sensor_topics import Vehicle
 from coec.adapters.zenoh.player import SensorKeys
 from coec.geometry.se3 import inverse
 
@@ -41,3 +43,11 @@ def document_of(drive: RigDrive, lidars: Sequence[str], folder: Path) -> dict[st
         "ego": {"key": keys["ego"]},
         "pairs": "all",
     }
+
+
+def vehicle_of(drive: RigDrive) -> Vehicle:
+    """Description of the vehicle for ROS, with the poses that the workshop assumes."""
+    lidar = drive.lidars[0]
+    cameras = {camera: drive.pair(camera, lidar).rig for camera in drive.cameras}
+    sensors = (*drive.lidars, *drive.cameras)
+    return Vehicle(cameras, [Placed("ego", name, inverse(drive.T_sensor_ego_nominal(name))) for name in sensors])

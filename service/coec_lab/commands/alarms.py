@@ -1,0 +1,48 @@
+"""`coec alarms`: false-alarm rate and detection delay of the monitor, on simulated checks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coec.cli.options import Json
+
+
+def alarms(
+    hours: Annotated[float, typer.Option(help="Hours of driving with a correct extrinsic.", min=0.1)] = 100.0,
+    steps: Annotated[int, typer.Option(help="Number of simulated steps of each size.", min=1)] = 20,
+    period_s: Annotated[float, typer.Option("--period", help="Seconds between checks.")] = 5.0,
+    between_h: Annotated[float, typer.Option("--between", help="Configured hours between false alarms.")] = 100.0,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for alarms.json and delay.png.", metavar="DIR", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Estimate false-alarm rate and detection delay of the monitor from simulated checks."""
+    from pydantic import ValidationError
+
+    from coec.adapters.files import output as files
+    from coec.config import MonitorConfig, describe
+    from coec.errors import UsageError
+    from coec.evaluation.alarms import measured
+    from coec.reports import alarm_reports, console
+    from coec.schemas.base import to_json
+
+    try:
+        config = MonitorConfig(period_s=period_s, hours_between_false_alarms=between_h)
+    except ValidationError as error:
+        raise UsageError(describe(error)) from error
+    with console.progress() as bars:
+        task = bars.add_task("streams of checks", total=None, note="")
+        figures = measured(config, hours, steps, lambda done, total: bars.update(task, completed=done, total=total))
+    report = alarm_reports.document_of(figures)
+    if output is not None:
+        files.write(output / "alarms.json", to_json(report))
+        files.write(output / "delay.png", alarm_reports.delay_curve(report))
+    if as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        alarm_reports.show(report)
+    return 0

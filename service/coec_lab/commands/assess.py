@@ -1,0 +1,200 @@
+"""`coec models assess`: how good a depth network is for calibration, before it goes on a vehicle."""
+
+from __future__ import annotations
+
+import time
+from math import degrees
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from coec.cli.options import Frames, Json, Source
+
+if TYPE_CHECKING:
+    from coec.calibration.estimators import Sight
+    from coec.calibration.ports import DepthModel
+    from coec.calibration.types import Window
+    from coec.evaluation.depth_quality import DepthQuality
+    from coec.evaluation.experiments import Stages
+    from coec.schemas.evaluation import Maybe3, ModelAssessment
+    from coec.schemas.replies import Vector3
+
+STAGES = 3
+"""Steps that an assessment reports."""
+
+STYLES = {"good": "bold green", "usable_in_fused": "bold yellow", "do_not_use": "bold red"}
+
+
+def assess(
+    model: Annotated[
+        str,
+        typer.Argument(help="An ONNX file, a built-in name, or `stereo`.", metavar="MODEL", show_default=False),
+    ],
+    source: Source,
+    frames: Frames = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Write curves.png, joint.png, frame.png and report.json.", metavar="DIR")
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Compare a depth network with the LiDAR of a calibrated recording: exit 1 if it is of no use there."""
+    from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
+    from coec.adapters.files import output as files
+    from coec.adapters.images.codec import GreyImages
+    from coec.calibration.estimators import sight_of
+    from coec.calibration.ports import Silence
+    from coec.calibration_options import SolverOptions, configuration_of
+    from coec.config import LimitsConfig, WindowConfig
+    from coec.evaluation import depth_quality
+    from coec.evaluation.experiments import Stages
+    from coec.reports import console
+    from coec.schemas.base import to_json
+    from coec.sources import windows
+
+    if output is not None:
+        files.try_folder(output)
+    with console.progress() as bars:
+        stages = Stages(bars)
+        load = stages.begin("load", None)
+        loaded = windows.load(source, frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        window = loaded.window
+        configuration = configuration_of(SolverOptions(depth=model, objective="mi", dof=3), loaded.configuration)
+        depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
+        inference_ms = _infer(window, depth, stages)
+        data = sight_of(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
+        quality = depth_quality.assess(data, configuration, stages.begin("compare", STAGES))
+        if output is not None:
+            on_plotted = stages.begin("draw", None)
+            _write_pictures(output, model, data, quality)
+            on_plotted(1, "")
+        elapsed_s = stages.elapsed_s()
+    timed_ms: list[float | None] = inference_ms if model != STEREO else [None] * len(inference_ms)
+    report = _report((model, source), window, depth.identity, quality, timed_ms, elapsed_s)
+    if output is not None:
+        files.write(output / "report.json", to_json(report))
+    if as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        _show(report)
+    return 1 if report.suitability == "do_not_use" else 0
+
+
+def _infer(window: Window, depth: DepthModel, stages: Stages) -> list[float | None]:
+    """Infers the depth of every frame; returns the milliseconds of each, decoding included.
+
+    Raises:
+        CalibrationError: a frame has no depth.
+    """
+    from coec.errors import CalibrationError, DecodeError
+
+    on_done = stages.begin("depth", len(window.pairs))
+    times_ms: list[float | None] = []
+    for done, pair in enumerate(window.pairs, start=1):
+        began_s = time.perf_counter()
+        try:
+            depth.infer(pair.camera)
+        except DecodeError as error:
+            raise CalibrationError(f"no depth for the camera frame at {pair.stamp_ns} ns: {error}") from error
+        times_ms.append(1e3 * (time.perf_counter() - began_s))
+        on_done(done, "")
+    return times_ms
+
+
+def _write_pictures(folder: Path, model: str, data: Sight, quality: DepthQuality) -> None:
+    from coec.adapters.files import output as files
+    from coec.adapters.images.codec import decode_bgr
+    from coec.config import LimitsConfig
+    from coec.evaluation import depth_quality
+    from coec.reports import depth_plots
+
+    name = f"{Path(model).name} on {data.window.window_id}"
+    _, sentence = depth_quality.suitability(quality)
+    files.write(folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames"))
+    files.write(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
+    index = len(data.window.pairs) // 2
+    frame, pairing = data.window.pairs[index].camera, quality.pairings[index]
+    title = f"{name}, frame at {frame.stamp_ns} ns: rank correlation {pairing.rank_correlation:+.2f}"
+    picture = depth_plots.frame(decode_bgr(frame.image, LimitsConfig()), data.depth.infer(frame).values, pairing, title)
+    files.write(folder / "frame.png", picture)
+
+
+def _report(
+    names: tuple[str, str],
+    window: Window,
+    identity: str,
+    quality: DepthQuality,
+    times_ms: list[float | None],
+    elapsed_s: dict[str, float],
+) -> ModelAssessment:
+    """The report of a network and a source, by their `names`."""
+    import numpy as np
+
+    from coec.evaluation import depth_quality
+    from coec.reports.evaluation_documents import number
+    from coec.schemas.evaluation import DepthFrame, ModelAssessment
+
+    suitability, sentence = depth_quality.suitability(quality)
+    timed = [value for value in times_ms if value is not None]
+    return ModelAssessment(
+        model=names[0],
+        source=names[1],
+        window_id=window.window_id,
+        pairs=len(window.pairs),
+        depth_identity=identity,
+        suitability=suitability.value,
+        verdict=sentence,
+        rank_correlation=number(quality.rank_correlation),
+        covered=quality.covered,
+        inference_ms=float(np.median(timed)) if timed else None,
+        mi=quality.mi,
+        mi_of_unrelated=quality.mi_of_unrelated,
+        mi_over_unrelated=quality.mi_over_unrelated,
+        bias_deg=cast("Vector3", tuple(np.degrees(quality.bias).tolist())),
+        half_width_deg=cast("Maybe3", tuple(number(degrees(width)) for width in quality.half_width)),
+        # Per square degree.
+        peakedness_per_deg2=cast("Vector3", tuple((quality.peakedness / degrees(1.0) ** 2).tolist())),
+        search_deg=depth_quality.SEARCH_DEG,
+        frames=tuple(
+            DepthFrame(
+                stamp_ns=pair.stamp_ns,
+                points=len(pairing.value),
+                covered=pairing.covered,
+                rank_correlation=number(pairing.rank_correlation),
+                inference_ms=elapsed_ms,
+            )
+            for pair, pairing, elapsed_ms in zip(window.pairs, quality.pairings, times_ms, strict=True)
+        ),
+        elapsed_s=elapsed_s,
+    )
+
+
+def _show(report: ModelAssessment) -> None:
+    from coec.reports import console
+    from coec.reports.page.words import count
+
+    console.show(f"{Path(report.model).name} on {report.window_id}: {count(report.pairs, 'pair')}")
+    console.show(report.verdict, STYLES[report.suitability])
+    figures = console.table("figure", "value", "unit", right=(1,))
+    figures.add_row("rank correlation with inverse range", console.figure(report.rank_correlation, 2, sign=True), "")
+    figures.add_row("points in view with a value", console.figure(100 * report.covered, 1), "%")
+    figures.add_row("MI at the calibration", console.figure(report.mi), "nats")
+    figures.add_row("MI with other frames' maps", console.figure(report.mi_of_unrelated), "nats")
+    figures.add_row("ratio of the two", console.figure(report.mi_over_unrelated, 2), "")
+    figures.add_row("inference of one frame", console.figure(report.inference_ms, 1), "ms")
+    console.out.print(figures)
+    axes = console.table("MI about", "optimum", "half-width of the peak", "f''/f per deg²", "unit", right=(1, 2, 3))
+    for axis in range(3):
+        axes.add_row(
+            console.AXIS_NAMES[axis],
+            console.figure(report.bias_deg[axis], 2, sign=True),
+            console.figure(report.half_width_deg[axis], 1),
+            console.figure(report.peakedness_per_deg2[axis], 4),
+            "deg",
+        )
+    console.out.print(axes)
+    worst = min(report.frames, key=lambda frame: abs(frame.rank_correlation or 0.0))
+    console.show(
+        f"worst frame: {worst.stamp_ns} ns, rank correlation {console.figure(worst.rank_correlation, 2, sign=True)}"
+    )
+    console.show("  ".join(f"{stage} {seconds:.1f} s" for stage, seconds in report.elapsed_s.items()))

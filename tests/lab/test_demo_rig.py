@@ -1,0 +1,224 @@
+"""The demonstration of a rig: what counts as told apart, what it leaves, and its last hop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+from dataclasses import replace
+
+from cli.conftest import Coec
+from coec.reports.rig_plot import EdgeSeen
+from coec.simulation import drawing
+from coec.simulation.journey import START_NS
+from coec.simulation.rig_drive import RigConfig, RigDrive
+from coec_lab.demo import rig
+from coec_lab.demo.pair_drive import NS_PER_S
+from coec_lab.demo.rig_drive import (
+    AHEAD,
+    SCENARIO,
+    ActOutcome,
+    InstantFrames,
+    RigSnapshot,
+    RigVehicle,
+    Scenario,
+    SensorCondition,
+    is_over,
+    outcome_of,
+    snapshot_of,
+)
+from rig_replies import knocked, untold
+from runtime.api.test_metrics import a_health
+
+LIDAR, CAMERA = SCENARIO.acts
+SENSORS = ("front", "left", "rear", "right", "roof")
+KNOCK_S = SCENARIO.knock_s
+
+
+def told(second: float, *moved: str) -> RigSnapshot:
+    def sensor(name: str) -> SensorCondition:
+        kind = "lidar" if name == "roof" else "camera"
+        state = f"{kind}_moved" if name in moved else "calibrated"
+        return SensorCondition(
+            name, kind, state, 0.99 if name in moved else 0.001, 1.0 if name in moved else None, "<why>"
+        )
+
+    edges = {f"{name}-roof": EdgeSeen(name, "roof", 0.1, 0.1) for name in SENSORS[:-1]}
+    return RigSnapshot(second, "front-roof", {name: sensor(name) for name in SENSORS}, edges)
+
+
+class AtOnce(Executor):
+    """In this process, when it is asked."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.asked += 1
+        done: Future[Any] = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
+
+
+def vehicle_of(executor: Executor, scenario: Scenario) -> RigVehicle:
+    drawing.begin(tuple(scenario.drive_config(act) for act in (None, *scenario.acts)))
+    return RigVehicle(drawing.Drawers(executor), scenario)
+
+
+QUIET, NAMED = told(KNOCK_S - 9.0), told(KNOCK_S + 14.0, "left")
+
+
+def test_the_sensor_that_was_knocked_has_to_be_named_and_to_stay_so() -> None:
+    correct = outcome_of(CAMERA, [QUIET, told(KNOCK_S + 4.0), NAMED, told(KNOCK_S + 20.0, "left")], KNOCK_S)
+    assert correct == ActOutcome(CAMERA, KNOCK_S + 14.0, ())
+    assert correct.passed
+    assert not is_over(correct, NAMED, SCENARIO.rest_s)
+    assert is_over(correct, told(KNOCK_S + 14.0 + SCENARIO.rest_s, "left"), SCENARIO.rest_s)
+    assert outcome_of(CAMERA, [QUIET, NAMED, told(KNOCK_S + 20.0)], KNOCK_S).named_s is None
+
+
+@pytest.mark.parametrize(
+    ("heard", "complaint"),
+    [
+        ((QUIET,), "left was displaced, and is not identified"),
+        ((QUIET, told(KNOCK_S + 9.0, "left", "roof")), "left was displaced, and is not identified"),
+        ((QUIET, told(KNOCK_S + 9.0, "left", "roof"), NAMED), "roof was reported as moved, and had not moved"),
+        ((told(KNOCK_S - 1.0, "left"), NAMED), "left was reported as moved, and had not moved"),
+    ],
+)
+def test_an_act_that_did_not_come_true(heard: tuple[RigSnapshot, ...], complaint: str) -> None:
+    outcome = outcome_of(CAMERA, heard, KNOCK_S)
+    assert not outcome.passed
+    assert complaint in " ".join(outcome.failures())
+    assert complaint in rig.summary(outcome, SCENARIO)
+
+
+def test_only_what_is_new_is_told(tmp_path: Path) -> None:
+    heard = [QUIET, told(KNOCK_S - 4.0), NAMED, replace(NAMED, second=KNOCK_S + 16.0)]
+    assert rig.changes(heard) == [QUIET, NAMED]
+    performances = [(outcome_of(LIDAR, [QUIET], KNOCK_S), [QUIET]), (outcome_of(CAMERA, heard, KNOCK_S), heard)]
+    files = rig.write(tmp_path, RigDrive(RigConfig(seconds=1.0, camera="fisheye64")), performances, SCENARIO)
+    assert [path.name for path in files] == ["lidar_knocked.png", "camera_knocked.png", "report.html"]
+    page = files[-1].read_text()
+    assert page.count('src="data:image/png;base64,') == page.count("src=") == 2
+    assert "roof was displaced, and is not identified at the end" in page
+    assert "identified 14 s later, it alone" in page
+    assert "&lt;why&gt;" in page, "what others say is text"
+    document = rig.document(performances, files, 1.0, SCENARIO)
+    assert document["passed"] is False
+
+
+def test_acts_share_the_frames_of_what_stands_still() -> None:
+    vehicle = vehicle_of(AtOnce(), Scenario(camera_px=64, knock_s=1.0, longest_s=2.0))
+    first, second = (list(vehicle.frames(act)) for act in vehicle.scenario.acts)
+    assert len(first) == len(second) == len(vehicle.plan)
+    assert first[0].second < 1.0 < first[-1].second
+    for before, after in zip(first, second, strict=True):
+        moved = before.sweep.stamp_ns - START_NS >= 1_000_000_000
+        assert (before.sweep is after.sweep) is not moved
+        for camera, picture in before.pictures.items():
+            turned = camera == CAMERA.sensor and picture.stamp_ns - START_NS >= 1_000_000_000
+            assert (picture is after.pictures[camera]) is not turned
+
+
+def test_frames_are_drawn_ahead_of_the_one_that_is_sent_and_not_to_the_end() -> None:
+    drawers = AtOnce()
+    frames = vehicle_of(drawers, Scenario(camera_px=64, longest_s=20.0)).frames(LIDAR)
+    assert drawers.asked == 5 * (AHEAD - 1), "all but the first, which compiles what the others then find compiled"
+    next(frames)
+    assert drawers.asked == 5 * AHEAD
+
+
+def test_what_the_service_says_is_told_as_it_is() -> None:
+    offset = (0.3, 0.4, None, 0.0, 0.0, None)
+    taken = a_health().check
+    assert taken is not None
+    check = taken.model_copy(update={"offset": offset, "sigma": (0.1, 0.1, None, 0.01, 0.01, None)})
+    blind = taken.model_copy(update={"offset": (None,) * 6, "sigma": (None,) * 6})
+    sensors_of = {"front": ("front", "roof"), "left": ("left", "roof")}
+    reply = knocked()
+    said = snapshot_of(reply, START_NS + 9 * NS_PER_S, ["front", "left"], {"front": check, "left": blind}, sensors_of)
+    assert said.second == 9.0
+    assert said.checked == "front, left"
+    assert said.named == {"roof"}
+    roof = said.sensors["roof"]
+    assert (roof.state, roof.probability, roof.moved_deg) == ("lidar_moved", 0.998, 1.0)
+    assert roof.reason.startswith("It moved by 1.00°")
+    assert said.edges["front"].deg == pytest.approx(0.5)
+    assert said.edges["front"].sigmas == pytest.approx(5.0)
+    assert said.edges["left"].sigmas == 0.0, "a pair that cannot tell is no evidence"
+    unknown = snapshot_of(untold(), START_NS, [], {}, sensors_of)
+    assert (unknown.sensors["roof"].state, unknown.sensors["roof"].probability, unknown.edges) == ("unknown", 0.0, {})
+
+
+SMALL = Scenario(camera_px=64, longest_s=2.0)
+
+
+def without_a_service(monkeypatch: pytest.MonkeyPatch, client: type) -> None:
+    """`coec demo --rig` plays small drives, and what a client of this class receives."""
+    monkeypatch.setattr(rig, "RigClient", client)
+    monkeypatch.setattr(rig, "serving", lambda *_: nullcontext(SimpleNamespace(until_ready=lambda: None)))
+    monkeypatch.setattr(rig, "driving", lambda _: nullcontext(vehicle_of(AtOnce(), SMALL)))
+
+
+def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Silent:
+        """Tells of nothing but calm."""
+
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def send(self, frames: InstantFrames) -> list[RigSnapshot]:
+            return [told(frames.second)]
+
+        def finish(self) -> list[RigSnapshot]:
+            return [told(SMALL.longest_s)]
+
+    without_a_service(monkeypatch, Silent)
+    outcome = coec("demo", "--rig", "--json", "--output", tmp_path)
+    assert outcome.status == 1
+    assert [act["knocked"] for act in outcome.document["acts"]] == ["roof", "left"]
+    assert not outcome.document["passed"]
+    assert all(Path(path).stat().st_size > 0 for path in outcome.document["files"])
+
+
+@pytest.mark.fault("a service that checks nothing", "said in a sentence, and no page is written")
+def test_a_service_that_tells_nothing_is_an_error(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mute:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def send(self, _: InstantFrames) -> list[RigSnapshot]:
+            return []
+
+        def finish(self) -> list[RigSnapshot]:
+            return []
+
+    without_a_service(monkeypatch, Mute)
+    outcome = coec("demo", "--rig", "--output", tmp_path / "demo")
+    assert outcome.status != 0
+    assert "checked none of its pairs" in outcome.err
+    assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.fault(
+    "a LiDAR, and on another drive a camera, is knocked by 1°", "that sensor alone is named, within a minute"
+)
+def test_a_knocked_lidar_and_a_knocked_camera_are_told_apart(
+    coec: Coec, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    outcome = coec("demo", "--rig", "--json", "--output", tmp_path / "demo")
+    document = outcome.document
+    assert outcome.status == 0, [act["objections"] for act in document["acts"]]
+    delays_s = [act["named_s"] - act["knock_s"] for act in document["acts"]]
+    assert all(0.0 < delay_s <= 60.0 for delay_s in delays_s)
+    record_property("figure", " and ".join(f"{delay_s:.0f} s" for delay_s in delays_s) + " of driving")
