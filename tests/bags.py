@@ -26,47 +26,49 @@ T_BASE_MOUNT = se3.transform_from(np.eye(3), np.array([1.5, 0.2, 1.4]))
 T_MOUNT_OPTICAL = se3.transform_from(R_OPTICAL.T, np.array([0.01, 0.02, 0.03]))
 
 
-def header(stamp_ns: int, frame_id: str) -> Any:
+def ros_header(stamp_ns: int, frame_id: str) -> Any:
     return ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(stamp_ns, 10**9)), frame_id)
 
 
-def an_image(stamp_ns: int, frame_id: str = "optical") -> Any:
+def compressed_image_message(stamp_ns: int, frame_id: str = "optical") -> Any:
     data = np.frombuffer(cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), 99, np.uint8))[1].tobytes(), np.uint8)
-    return ros.sensor_msgs__msg__CompressedImage(header(stamp_ns, frame_id), "jpeg", data)
+    return ros.sensor_msgs__msg__CompressedImage(ros_header(stamp_ns, frame_id), "jpeg", data)
 
 
-def a_raw_image(stamp_ns: int) -> Any:
+def raw_image_message(stamp_ns: int) -> Any:
     data = np.zeros(HEIGHT * WIDTH, np.uint8)
-    return ros.sensor_msgs__msg__Image(header(stamp_ns, "optical"), HEIGHT, WIDTH, "mono8", 0, WIDTH, data)
+    return ros.sensor_msgs__msg__Image(ros_header(stamp_ns, "optical"), HEIGHT, WIDTH, "mono8", 0, WIDTH, data)
 
 
-def a_cloud(stamp_ns: int, value: float = 1.0) -> Any:
+def cloud_message(stamp_ns: int, value: float = 1.0) -> Any:
     fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, FLOAT32, 1) for i, name in enumerate("xyz")]
     data = np.frombuffer(np.full((4, 3), value, "<f4").tobytes(), np.uint8)
-    return ros.sensor_msgs__msg__PointCloud2(header(stamp_ns, "lidar"), 1, 4, fields, False, 12, 48, data, True)
+    return ros.sensor_msgs__msg__PointCloud2(ros_header(stamp_ns, "lidar"), 1, 4, fields, False, 12, 48, data, True)
 
 
-def an_odometry(stamp_ns: int, forward_mps: float) -> Any:
+def odometry_message(stamp_ns: int, forward_mps: float) -> Any:
     zero, unit = ros.geometry_msgs__msg__Point(0.0, 0.0, 0.0), ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0)
     twist = ros.geometry_msgs__msg__Twist(
         ros.geometry_msgs__msg__Vector3(forward_mps, 0.0, 0.0), ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.1)
     )
     return ros.nav_msgs__msg__Odometry(
-        header(stamp_ns, "odom"),
+        ros_header(stamp_ns, "odom"),
         "base",
         ros.geometry_msgs__msg__PoseWithCovariance(ros.geometry_msgs__msg__Pose(zero, unit), np.zeros(36)),
         ros.geometry_msgs__msg__TwistWithCovariance(twist, np.zeros(36)),
     )
 
 
-def an_imu(stamp_ns: int, turn_radps: float) -> Any:
+def imu_message(stamp_ns: int, turn_radps: float) -> Any:
     zero = ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0)
     turn = ros.geometry_msgs__msg__Vector3(0.0, 0.0, turn_radps)
     level = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0)
-    return ros.sensor_msgs__msg__Imu(header(stamp_ns, "base"), level, np.zeros(9), turn, np.zeros(9), zero, np.zeros(9))
+    return ros.sensor_msgs__msg__Imu(
+        ros_header(stamp_ns, "base"), level, np.zeros(9), turn, np.zeros(9), zero, np.zeros(9)
+    )
 
 
-def a_timed_cloud(stamp_ns: int, name: str, times: list[float]) -> Any:
+def timed_cloud_message(stamp_ns: int, name: str, times: list[float]) -> Any:
     """Points of x y z, and a time as float64."""
     fields = [ros.sensor_msgs__msg__PointField(axis, 4 * i, FLOAT32, 1) for i, axis in enumerate("xyz")]
     fields.append(ros.sensor_msgs__msg__PointField(name, 12, FLOAT64, 1))
@@ -74,13 +76,13 @@ def a_timed_cloud(stamp_ns: int, name: str, times: list[float]) -> Any:
     rows["time"] = times
     data, step = np.frombuffer(rows.tobytes(), np.uint8), rows.itemsize
     return ros.sensor_msgs__msg__PointCloud2(
-        header(stamp_ns, "lidar"), 1, len(times), fields, False, step, len(data), data, True
+        ros_header(stamp_ns, "lidar"), 1, len(times), fields, False, step, len(data), data, True
     )
 
 
-def an_info(model: str, d: list[float], frame_id: str = "optical", width: int = WIDTH) -> Any:
+def camera_info_message(model: str, d: list[float], frame_id: str = "optical", width: int = WIDTH) -> Any:
     return ros.sensor_msgs__msg__CameraInfo(
-        header(0, frame_id),
+        ros_header(0, frame_id),
         HEIGHT,
         width,
         model,
@@ -94,9 +96,9 @@ def an_info(model: str, d: list[float], frame_id: str = "optical", width: int = 
     )
 
 
-def a_joint(parent: str, child: str, T: NDArray[np.float64], stamp_ns: int = 0) -> Any:
+def transform_message(parent: str, child: str, T: NDArray[np.float64], stamp_ns: int = 0) -> Any:
     return ros.geometry_msgs__msg__TransformStamped(
-        header(stamp_ns, parent),
+        ros_header(stamp_ns, parent),
         child,
         ros.geometry_msgs__msg__Transform(
             ros.geometry_msgs__msg__Vector3(*T[:3, 3].tolist()),
@@ -106,9 +108,9 @@ def a_joint(parent: str, child: str, T: NDArray[np.float64], stamp_ns: int = 0) 
 
 
 TREE = [
-    a_joint("base", "lidar", T_BASE_LIDAR),
-    a_joint("base", "mount", T_BASE_MOUNT),
-    a_joint("mount", "optical", T_MOUNT_OPTICAL),
+    transform_message("base", "lidar", T_BASE_LIDAR),
+    transform_message("base", "mount", T_BASE_MOUNT),
+    transform_message("mount", "optical", T_MOUNT_OPTICAL),
 ]
 
 
@@ -152,14 +154,16 @@ def converted(bag: Path, folder: Path, plugin: StoragePlugin, mode: CompressionM
     return folder
 
 
-def a_drive(*, info: Any = None, tree: list[Any] | None = None, image: Any = an_image) -> list[tuple[str, Any]]:
+def drive_messages(
+    *, info: Any = None, tree: list[Any] | None = None, image: Any = compressed_image_message
+) -> list[tuple[str, Any]]:
     """Camera at 10 Hz, LiDAR at 20 Hz and 4 ms later, odometry at 50 Hz; the recorder got them out of order."""
     second = 10**9
     images = [("/front/image", image(second + k * 100_000_000)) for k in range(4)]
-    clouds = [("/points", a_cloud(second + 4_000_000 + k * 50_000_000, float(k + 1))) for k in range(8)]
-    motions = [("/odom", an_odometry(second + k * 20_000_000, float(k))) for k in range(20)]
+    clouds = [("/points", cloud_message(second + 4_000_000 + k * 50_000_000, float(k + 1))) for k in range(8)]
+    motions = [("/odom", odometry_message(second + k * 20_000_000, float(k))) for k in range(20)]
     head = [
         ("/tf_static", ros.tf2_msgs__msg__TFMessage(TREE if tree is None else tree)),
-        ("/front/camera_info", info or an_info("plumb_bob", [0.0] * 5)),
+        ("/front/camera_info", info or camera_info_message("plumb_bob", [0.0] * 5)),
     ]
     return [*head, *motions[::-1], *clouds[::-1], *images]

@@ -12,12 +12,12 @@ from coec.adapters.tls.conversation import Credentials
 from coec.config import AuthorityConfig, SenderConfig
 from conftest import REPOSITORY
 
-MAKE = REPOSITORY / "deploy" / "make-test-ca"
-NAMES = ("router", "vehicle", "sensors", "ros", "operator", "viewer")
-USES = "basicConstraints=critical,CA:FALSE\nextendedKeyUsage=clientAuth\nsubjectAltName=DNS:{name}\n"
+MAKE_TEST_CA = REPOSITORY / "deploy" / "make-test-ca"
+CERTIFICATE_NAMES = ("router", "vehicle", "sensors", "ros", "operator", "viewer")
+CLIENT_EXTENSIONS = "basicConstraints=critical,CA:FALSE\nextendedKeyUsage=clientAuth\nsubjectAltName=DNS:{name}\n"
 
 
-BRIEF = """
+SHORT_LIVED_CA = """
 [ca]
 default_ca = here
 [here]
@@ -52,7 +52,7 @@ class TestAuthority:
         """Of somebody, who trusts this authority."""
         return Credentials(self.folder / f"{name}.pem", self.folder / f"{name}-key.pem", self.root)
 
-    def sign(self, common_name: str, file: str, *, days: int = 1, uses: str = USES) -> str:
+    def sign(self, common_name: str, file: str, *, days: int = 1, uses: str = CLIENT_EXTENSIONS) -> str:
         """Have a certificate made that `make-test-ca` does not make; the name of its files. With days = -1 it has
         expired."""
         extensions, request = self.folder / f"{file}.ext", self.folder / f"{file}.csr"
@@ -70,7 +70,7 @@ class TestAuthority:
         self.sign(common_name, file)
         database, settings = self.folder / f"{file}.index", self.folder / f"{file}.cnf"
         database.touch()
-        settings.write_text(BRIEF.format(database=database, folder=self.folder))
+        settings.write_text(SHORT_LIVED_CA.format(database=database, folder=self.folder))
         end = (datetime.now(UTC) + timedelta(seconds=seconds)).strftime("%y%m%d%H%M%SZ")
         ours = ("-cert", self.root, "-keyfile", self.folder / "ca-key.pem", "-config", settings)
         files = ("-in", self.folder / f"{file}.csr", "-out", self.folder / f"{file}.pem")
@@ -113,7 +113,7 @@ class TestAuthority:
 
 def make_authority(folder: Path, *hosts: str) -> TestAuthority:
     """A new authority with the certificates of `NAMES`."""
-    subprocess.run([MAKE, folder, *hosts], check=True, capture_output=True)
+    subprocess.run([MAKE_TEST_CA, folder, *hosts], check=True, capture_output=True)
     return TestAuthority(folder)
 
 

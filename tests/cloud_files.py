@@ -15,7 +15,7 @@ def npy(array: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def with_header(header: str, body: bytes = b"") -> bytes:
+def npy_with_header(header: str, body: bytes = b"") -> bytes:
     text = header.encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + body
 

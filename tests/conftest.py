@@ -62,14 +62,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     What a test is marked to hold travels with its report, from whatever process it runs in.
     """
-    items.sort(key=lambda item: _turn(item.path))
+    items.sort(key=lambda item: _file_order(item.path))
     for item in items:
         if item.path.is_relative_to(BENCHMARKS):
             item.add_marker("slow")
         item.user_properties.extend(("fault", json.dumps(row)) for row in rows_of_item(item))
 
 
-def _turn(path: Path) -> int:
+def _file_order(path: Path) -> int:
     """When a file comes; files of one turn stay in their order."""
     turns = (turn for turn, name in enumerate(LONGEST_FIRST) if path.is_relative_to(TESTS / name))
     return next(turns, len(LONGEST_FIRST))
@@ -103,5 +103,5 @@ def router() -> Iterator[Router]:
     """The router of all services that a run starts, which come one after the other."""
     from e2e.processes import routing  # Zenoh and more, which most tests do without
 
-    with routing() as found:
-        yield found
+    with routing() as session_router:
+        yield session_router

@@ -18,19 +18,19 @@ from typing import Any
 
 import pytest
 
-EVERYTHING = range(sys.maxsize)
+EVERY_OPERATION = range(sys.maxsize)
 """For `Disk.refuses`."""
 
 
 @dataclass(frozen=True)
-class Cut:
+class PowerCut:
     """What a restart finds: files by their path, folders, and what had been acknowledged when the power went."""
 
     files: tuple[tuple[str, bytes], ...]
     folders: tuple[str, ...]
     acknowledged: tuple[int, ...]
 
-    def put(self, folder: Path) -> Path:
+    def restore(self, folder: Path) -> Path:
         """Lay it out in a new folder."""
         folder.mkdir()
         for name in self.folders:
@@ -102,9 +102,9 @@ class Disk:
         """Something is safe, as the code under test says."""
         self._journal.append(("acknowledge", number))
 
-    def power_cuts(self) -> Iterator[Cut]:
+    def power_cuts(self) -> Iterator[PowerCut]:
         """Everything that a power cut at any moment may have left, each once: at every byte of every write."""
-        seen: set[Cut] = set()
+        seen: set[PowerCut] = set()
         for cut in self._cuts():
             if cut not in seen:
                 seen.add(cut)
@@ -187,7 +187,7 @@ class Disk:
 
     # --- what is left ---------------------------------------------------------------------------------------------
 
-    def _cuts(self) -> Iterator[Cut]:
+    def _cuts(self) -> Iterator[PowerCut]:
         files: dict[int, _File] = {}
         safe, pending = _Names(), list[tuple[str, str, Any]]()
         acknowledged: tuple[int, ...] = ()
@@ -223,16 +223,16 @@ def _states(
     pending: list[tuple[str, str, Any]],
     acknowledged: tuple[int, ...],
     versions: tuple[str, ...],
-) -> Iterator[Cut]:
+) -> Iterator[PowerCut]:
     names = safe.copy()
     for change in (None, *pending):
         if change is not None:
             names.change(*change)
         folders = tuple(sorted(names.folders))
         for version in versions:
-            found = {path: getattr(files[file], version) for path, file in names.files.items()}
-            inside = {path: data for path, data in found.items() if str(Path(path).parent) in (".", *folders)}
-            yield Cut(tuple(sorted(inside.items())), folders, acknowledged)
+            content = {path: getattr(files[file], version) for path, file in names.files.items()}
+            inside = {path: data for path, data in content.items() if str(Path(path).parent) in (".", *folders)}
+            yield PowerCut(tuple(sorted(inside.items())), folders, acknowledged)
 
 
 class FullDisk:
@@ -299,9 +299,9 @@ class FullDisk:
             reads = real.__name__ == "open" and not rest[0] & (os.O_WRONLY | os.O_RDWR)
             if below and not reads:
                 self._count()
-            found = real(path, *rest, **options)
+            result = real(path, *rest, **options)
             if below and real.__name__ == "open":
-                self._opened.add(found)
-            return found
+                self._opened.add(result)
+            return result
 
         return changed

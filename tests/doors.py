@@ -10,15 +10,15 @@ from pathlib import Path
 import zenoh
 
 from certificates import TestAuthority
-from coec.adapters.zenoh.client import Way
+from coec.adapters.zenoh.client import RouterAddress
 from conftest import REPOSITORY
 from ports import free_port
 
-RULES = REPOSITORY / "deploy" / "router.json5"
+ROUTER_RULES = REPOSITORY / "deploy" / "router.json5"
 
 
 @dataclass(frozen=True)
-class Door:
+class ShippedRouter:
     """Its two: for programs on its computer, and by certificate."""
 
     authority: TestAuthority
@@ -29,16 +29,16 @@ class Door:
         """A Zenoh configuration for the session of somebody on another computer."""
         return self.authority.session(name, self.certified)
 
-    def way(self, name: str) -> Way:
+    def connection(self, name: str) -> RouterAddress:
         """His way in."""
-        return Way((self.certified,), self.file(name))
+        return RouterAddress((self.certified,), self.file(name))
 
 
 @contextmanager
-def opened(authority: TestAuthority, folder: Path) -> Iterator[Door]:
+def shipped_router(authority: TestAuthority, folder: Path) -> Iterator[ShippedRouter]:
     """Until the end of the block."""
     ports = free_port(), free_port()
-    rules = RULES.read_text()
+    rules = ROUTER_RULES.read_text()
     for shipped, here in (
         ("/etc/zenoh/tls", str(authority.folder)),
         ("tls/[::]:7448", f"tls/127.0.0.1:{ports[1]}"),
@@ -49,4 +49,4 @@ def opened(authority: TestAuthority, folder: Path) -> Iterator[Door]:
     file = folder / "router.json5"
     file.write_text(rules)
     with zenoh.open(zenoh.Config.from_file(file)):
-        yield Door(authority, f"tcp/127.0.0.1:{ports[0]}", f"tls/localhost:{ports[1]}")
+        yield ShippedRouter(authority, f"tcp/127.0.0.1:{ports[0]}", f"tls/localhost:{ports[1]}")

@@ -22,7 +22,7 @@ from typing import TypeVar
 
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.simulation.source import open_sim
-from coec.sources.recording import FramewiseRecording, Message, RecordedFrame
+from coec.sources.recording import FramewiseRecording, RecordedFrame, SensorMessage
 from coec.sources.spec import parse_spec
 from conftest import REPOSITORY
 
@@ -37,7 +37,7 @@ ROOTS = ("drive.py", "rig_drive.py")
 LIBRARIES = ("embreex", "numba", "numpy", "opencv-python-headless")
 
 
-def drawn(query: dict[str, str], cameras: tuple[int, ...] | None = None) -> FramewiseRecording:
+def rendered_drive(query: dict[str, str], cameras: tuple[int, ...] | None = None) -> FramewiseRecording:
     """The recording that `coec.simulation.source.open_sim` opens, its frames drawn once.
 
     Args:
@@ -47,18 +47,18 @@ def drawn(query: dict[str, str], cameras: tuple[int, ...] | None = None) -> Fram
     Raises:
         ValueError: pictures and sweeps do not come in pairs: such a drive has other uses than this.
     """
-    return _drawn(tuple(sorted(query.items())), cameras)
+    return _rendered(tuple(sorted(query.items())), cameras)
 
 
-def drawn_source(source: str, cameras: tuple[int, ...] | None = None) -> FramewiseRecording:
+def rendered_source(source: str, cameras: tuple[int, ...] | None = None) -> FramewiseRecording:
     """The recording of a SOURCE argument `sim:...`, as `drawn`."""
-    return drawn(parse_spec(source).query, cameras)
+    return rendered_drive(parse_spec(source).query, cameras)
 
 
 @functools.lru_cache(maxsize=8)
-def _drawn(query: tuple[tuple[str, str], ...], cameras: tuple[int, ...] | None) -> FramewiseRecording:
+def _rendered(query: tuple[tuple[str, str], ...], cameras: tuple[int, ...] | None) -> FramewiseRecording:
     drive = open_sim(dict(query))
-    messages = kept((query, cameras), lambda: list(drive.messages(cameras)))
+    messages = cached_messages((query, cameras), lambda: list(drive.messages(cameras)))
     pictures = [message for message in messages if isinstance(message, CameraFrame)]
     sweeps = [message for message in messages if isinstance(message, LidarFrame)]
     frames = tuple(
@@ -73,22 +73,22 @@ def _same(frame: F) -> F:
     return frame
 
 
-def kept(what: object, draw: Callable[[], list[Message]]) -> list[Message]:
+def cached_messages(identity: object, render: Callable[[], list[SensorMessage]]) -> list[SensorMessage]:
     """Messages that were drawn before and kept under what they are (by its `repr`), or that are drawn now. Processes
     that want the same wait for the one that draws it."""
-    path = CACHE / _fingerprint() / f"{hashlib.sha256(repr(what).encode()).hexdigest()[:16]}.pickle"
+    path = CACHE / _fingerprint() / f"{hashlib.sha256(repr(identity).encode()).hexdigest()[:16]}.pickle"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if path.is_file():
-            found: list[Message] = pickle.loads(path.read_bytes())
-            return found
-        messages = draw()
-        _keep(path, messages)
+            cached: list[SensorMessage] = pickle.loads(path.read_bytes())
+            return cached
+        messages = render()
+        _store(path, messages)
     return messages
 
 
-def _keep(path: Path, messages: list[Message]) -> None:
+def _store(path: Path, messages: list[SensorMessage]) -> None:
     for folder in CACHE.iterdir():
         if folder != path.parent:
             shutil.rmtree(folder, ignore_errors=True)  # the other half of the run may do the same
@@ -110,13 +110,13 @@ def _fingerprint() -> str:
 
 def modules_behind(path: Path) -> set[Path]:
     """The files of coec that a module reaches by its imports, wherever in them an import stands; itself among them."""
-    found: set[Path] = set()
+    reached: set[Path] = set()
     waiting = [path]
     while waiting:
         now = waiting.pop()
-        if now in found:
+        if now in reached:
             continue
-        found.add(now)
+        reached.add(now)
         for node in ast.walk(ast.parse(now.read_bytes())):
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
@@ -127,6 +127,8 @@ def modules_behind(path: Path) -> set[Path]:
             for name in names:
                 chunks = name.split(".")
                 for depth in range(1, len(chunks) + 1):
-                    place = SERVICE.joinpath(*chunks[:depth])
-                    waiting += [file for file in (place / "__init__.py", place.with_suffix(".py")) if file.is_file()]
-    return found
+                    location = SERVICE.joinpath(*chunks[:depth])
+                    waiting += [
+                        file for file in (location / "__init__.py", location.with_suffix(".py")) if file.is_file()
+                    ]
+    return reached

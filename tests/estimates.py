@@ -8,7 +8,7 @@ from coec.calibration.types import Decision, Estimate, Metric, Optimum, Rig, Sto
 from coec.geometry import se3
 from coec.geometry.cameras import build
 
-RIG = Rig(
+ESTIMATE_RIG = Rig(
     "front",
     build("pinhole", width=4, height=3, fx=2.0, fy=2.0, cx=1.5, cy=1.0),
     "camera",

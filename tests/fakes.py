@@ -15,13 +15,13 @@ import msgpack
 
 from coec.runtime.worker.link import Link
 
-RESULT = "result.msgpack"
+RESULT_FILE = "result.msgpack"
 """File in the fake worker's folder: a `CalibrationResult`, the answer to every window but for the window's id."""
 
-SETTINGS = "settings"
+SETTINGS_FILE = "settings"
 """File in the fake worker's folder: a line for each configuration that it was told, behind the id of its process."""
 
-LET_GO = "let-go"
+RELEASE_FILE = "let-go"
 """File in the fake worker's folder: a worker that is `late`, or compiles, waits for it."""
 
 
@@ -50,31 +50,31 @@ def fake_worker_command(fault: str, folder: Path, at: str = "solve") -> list[str
     return [sys.executable, __file__, fault, at, str(folder)]
 
 
-def _answer(folder: Path, question: dict[str, Any]) -> Any:
+def _answer(folder: Path, request: dict[str, Any]) -> Any:
     """Packed by hand, after what `coec.runtime.worker.answers` documents. A commissioning takes a slice for each of its
     windows, and one more."""
-    match question["kind"]:
+    match request["kind"]:
         case "prefetch":
             result: Any = None
         case "solve":
-            estimate = msgpack.unpackb((folder / RESULT).read_bytes())
-            estimate["window_id"] = Path(question["path"]).stem
+            estimate = msgpack.unpackb((folder / RESULT_FILE).read_bytes())
+            estimate["window_id"] = Path(request["path"]).stem
             result = {"result": msgpack.packb(estimate), "note": None, "written": None}
         case "check":
-            result = {"observation": _OBSERVATION, "baseline_not_used": f"{len(question['frames'])} pairs"}
+            result = {"observation": _OBSERVATION, "baseline_not_used": f"{len(request['frames'])} pairs"}
         case "overlay":
-            result = {"jpeg": question["title"].encode()}
-        case "commission" if (done := _SLICES.get(question["run"], 0)) < len(question["paths"]):
-            _SLICES[question["run"]] = done + 1
-            underway = {"stage": "windows", "done": done + 1, "total": len(question["paths"])}
-            return {"id": question["id"], "underway": underway}
+            result = {"jpeg": request["title"].encode()}
+        case "commission" if (done := _SLICES_DONE.get(request["run"], 0)) < len(request["paths"]):
+            _SLICES_DONE[request["run"]] = done + 1
+            underway = {"stage": "windows", "done": done + 1, "total": len(request["paths"])}
+            return {"id": request["id"], "underway": underway}
         case _:
-            pose = _array([4, 4], [float(value) for row in question["pose"] for value in row])
-            result = {"pose": pose, "baseline_hash": "b" * 16, "windows": len(question["paths"]), "pairs": 7}
-    return {"id": question["id"], "result": result}
+            pose = _array([4, 4], [float(value) for row in request["pose"] for value in row])
+            result = {"pose": pose, "baseline_hash": "b" * 16, "windows": len(request["paths"]), "pairs": 7}
+    return {"id": request["id"], "result": result}
 
 
-_SLICES: dict[int, int] = {}
+_SLICES_DONE: dict[int, int] = {}
 """Slices that were done, by the number of the commissioning."""
 
 
@@ -124,7 +124,7 @@ def _grow(*_: object) -> None:
 
 def _compile(link: Link, right: dict[str, Any], folder: Path) -> None:
     link.send({"kind": "compiling", "done": 0, "total": 3})
-    wait_until((folder / LET_GO).exists, "the word to go on", 60.0)
+    wait_until((folder / RELEASE_FILE).exists, "the word to go on", 60.0)
     link.send({"kind": "compiled"})
     link.send(right)
 
@@ -161,7 +161,7 @@ def _leave(link: Link, right: dict[str, Any], folder: Path) -> None:
 
 
 def _late(link: Link, right: dict[str, Any], folder: Path) -> None:
-    wait_until((folder / LET_GO).exists, "the word to go on", 60.0)
+    wait_until((folder / RELEASE_FILE).exists, "the word to go on", 60.0)
     link.send(right)
 
 
@@ -196,7 +196,7 @@ FAULTS: dict[str, Callable[[Link, dict[str, Any], Path], None]] = {
 
 
 def _note_settings(folder: Path, start: dict[str, Any]) -> None:
-    with (folder / SETTINGS).open("a") as stream:
+    with (folder / SETTINGS_FILE).open("a") as stream:
         stream.write(f"{os.getpid()} {start['settings']}\n")
 
 
@@ -214,7 +214,7 @@ def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
         case "compiling" if at_fault():
             for done in range(3):
                 link.send({"kind": "compiling", "done": done, "total": 3})
-                wait_until((folder / LET_GO).exists, "the word to go on", 60.0)
+                wait_until((folder / RELEASE_FILE).exists, "the word to go on", 60.0)
                 link.send({"kind": "compiled"})
         case "compiling-stuck" if at_fault():
             link.send({"kind": "compiling", "done": 1, "total": 3})
@@ -233,19 +233,19 @@ def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
     if fault == "deaf" and at_fault():
         signal.pause()
     while True:
-        question = link.receive()
-        if question["kind"] == "start":
-            _note_settings(folder, question)
+        request = link.receive()
+        if request["kind"] == "start":
+            _note_settings(folder, request)
             link.send({"kind": "ready"})
             continue
-        if question["kind"] == "warm_up":
+        if request["kind"] == "warm_up":
             link.send({"kind": "compiling", "done": 2, "total": 3})
-            wait_until((folder / LET_GO).exists, "the word to go on", 60.0)
+            wait_until((folder / RELEASE_FILE).exists, "the word to go on", 60.0)
             link.send({"kind": "compiled"})
             link.send({"kind": "warmed", "more": False})
             continue
-        right = _answer(folder, question)
-        if fault in FAULTS and question["kind"] == at and at_fault():
+        right = _answer(folder, request)
+        if fault in FAULTS and request["kind"] == at and at_fault():
             FAULTS[fault](link, right, folder)
         else:
             link.send(right)

@@ -64,7 +64,7 @@ def _rows_of(path: Path, tests: Path) -> Iterator[Row]:
                     raise ValueError(f"{path}:{mark.lineno}: a fault is marked with two literal texts: fault, promise")
 
 
-def figures_told(table: Path = TABLE) -> dict[Row, str]:
+def recorded_figures(table: Path = TABLE) -> dict[Row, str]:
     """The last figure of every row of a table that was written before; none where there is no table."""
     if not table.exists():
         return {}
@@ -90,13 +90,13 @@ class FaultTable:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Take in a test's figures when it has run, or that it failed (also in its fixtures)."""
-        told = [value for name, value in report.user_properties if name == "fault" and isinstance(value, str)]
+        marked = [value for name, value in report.user_properties if name == "fault" and isinstance(value, str)]
         if report.when != "call" and not report.failed:
             return
         figures = [str(value) for name, value in report.user_properties if name == "figure"]
-        for row in (Row(*json.loads(text)) for text in told):
+        for row in (Row(*json.loads(text)) for text in marked):
             self._figures.setdefault(row, []).extend(["FAILED"] if report.failed else figures)
-        if told:
+        if marked:
             self._write()
 
     def pytest_sessionfinish(self) -> None:
@@ -105,7 +105,7 @@ class FaultTable:
 
     def _write(self) -> None:
         """Rows of this run with their figures, all others with the last that is told."""
-        figures = figures_told(self._table)
+        figures = recorded_figures(self._table)
         for row, measured in self._figures.items():
             figures[row] = "; ".join(dict.fromkeys(measured)) or HELD
         self._table.write_text(table_of(self._rows, figures), encoding="utf-8")

@@ -16,13 +16,13 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import Silence
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig
 from coec.sources import windows
-from drives import drawn
+from drives import rendered_drive
 
-SMALL = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"
+SMALL_DRIVE = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"
 """Six frames, two seconds apart, with exact depth."""
 
 LIMITS = LimitsConfig()
-CONFIGURATION = CalibrationConfig(
+WINDOW_CONFIGURATION = CalibrationConfig(
     depth=DepthConfig(model="stereo"), objective=ObjectiveConfig(kind="mi", depth_bins=24, range_bins=20)
 )
 """Quick, and not the defaults: what a file says must be used."""
@@ -34,15 +34,15 @@ STARTS_RAD = {"one": (0.02, -0.01, 0.01), "two": (0.0, 0.015, -0.01)}
 def recorded_windows(folder: Path) -> Path:
     """The folder, with two windows in it, as the services of two vehicles leave them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("coec.simulation.source.open_sim", drawn)
-        loaded = windows.load(SMALL, None, 25, lambda *_: None)
+        patch.setattr("coec.simulation.source.open_sim", rendered_drive)
+        loaded = windows.load_window(SMALL_DRIVE, None, 25, lambda *_: None)
     for vehicle, start in STARTS_RAD.items():
-        window = windows.started_at(loaded.window, np.array([*start, 0, 0, 0]))
+        window = windows.with_perturbed_start(loaded.window, np.array([*start, 0, 0, 0]))
         window = replace(window, window_id=f"{vehicle}-1")
         path = folder / vehicle / f"{window.window_id}.mcap"
         path.parent.mkdir()
         writer = WindowWriter(
-            path, window.rig, window.T_camera_lidar_start, window.window_id, CONFIGURATION, {"vehicle": vehicle}
+            path, window.rig, window.T_camera_lidar_start, window.window_id, WINDOW_CONFIGURATION, {"vehicle": vehicle}
         )
         for pair in window.pairs:
             writer.add(pair)

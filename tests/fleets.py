@@ -8,21 +8,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from coec.fleet.places import Job
-from coec.fleet.trouble import begun, lost
+from coec.fleet.trouble import empty_row, lost_row
 from coec.schemas.fleet import WindowRow
 from coec.schemas.replies import CalibrationResult, Reason, Verdict
 
 BEGIN_NS = 1_700_000_000_000_000_000
 HOUR_NS = 3_600_000_000_000
 
-SIGMA = np.array([0.03, 0.02, 0.03, 0.01, 0.01, 0.01])
+WINDOW_SIGMA = np.array([0.03, 0.02, 0.03, 0.01, 0.01, 0.01])
 """deg and m, of a window."""
 
-REFUSED, FAILED = 0.05, 0.01
+REFUSED_SHARE, FAILED_SHARE = 0.05, 0.01
 """Shares."""
 
 
-def fleet(
+def fleet_rows(
     pattern: CalibrationResult, vehicles: int, windows: int, drifts: dict[int, tuple[int, float]], seed: int
 ) -> Iterator[WindowRow]:
     """The rows of a fleet, vehicle by vehicle, a window every 2.4 hours.
@@ -37,19 +37,19 @@ def fleet(
     rng = np.random.default_rng(seed)
     for vehicle in range(vehicles):
         name = f"v{vehicle:03}"
-        mount = rng.normal(0.0, 0.3, 6) * (SIGMA / SIGMA[0])
+        mount = rng.normal(0.0, 0.3, 6) * (WINDOW_SIGMA / WINDOW_SIGMA[0])
         axis, drift = drifts.get(vehicle, (0, 0.0))
         for window in range(windows):
             stamp_ns = BEGIN_NS + round(2.4 * HOUR_NS) * window
             url = f"{name}/front-{stamp_ns}.mcap"
             sha256 = hashlib.sha256(url.encode()).hexdigest()
             chance = rng.random()
-            if chance < FAILED:
-                yield lost(Job(url), "bad_window", "it is cut off").model_copy(update={"sha256": sha256})
+            if chance < FAILED_SHARE:
+                yield lost_row(Job(url), "bad_window", "it is cut off").model_copy(update={"sha256": sha256})
                 continue
-            correction = mount + rng.normal(0.0, SIGMA)
+            correction = mount + rng.normal(0.0, WINDOW_SIGMA)
             correction[axis] += drift * window / max(windows - 1, 1)
-            refused = chance < FAILED + REFUSED
+            refused = chance < FAILED_SHARE + REFUSED_SHARE
             result = pattern.model_copy(
                 update={
                     "vehicle": name,
@@ -65,6 +65,6 @@ def fleet(
                     ),
                 }
             )
-            yield begun(Job(url), {"coec": "0.1.0"}).model_copy(
+            yield empty_row(Job(url), {"coec": "0.1.0"}).model_copy(
                 update={"sha256": sha256, "vehicle": name, "result": result, "decided": sha256, "seconds": 1.0}
             )

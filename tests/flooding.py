@@ -20,7 +20,7 @@ from pathlib import Path
 
 import zenoh
 
-ATTACKER, OPERATOR = "127.0.0.2", "127.0.0.3"
+ATTACKER_ADDRESS, OPERATOR_ADDRESS = "127.0.0.2", "127.0.0.3"
 PORT = 7448
 PER_S = 20.0
 WAIT_S = 3.0
@@ -47,14 +47,14 @@ class Flood:
     def _connect(self) -> None:
         while not self._stop.wait(8 / PER_S):
             try:
-                self.held.append(socket.create_connection(("127.0.0.1", PORT), 1.0, (ATTACKER, 0)))
+                self.held.append(socket.create_connection(("127.0.0.1", PORT), 1.0, (ATTACKER_ADDRESS, 0)))
             except OSError:
                 continue
 
     def _open(self) -> None:
         while not self._stop.is_set():
             try:
-                self.held.append(session(self._file, ATTACKER))
+                self.held.append(session(self._file, ATTACKER_ADDRESS))
             except zenoh.ZError:
                 continue
 
@@ -75,7 +75,7 @@ def main(rules: str, router: str, attacker: str, operator: str, kind: str, secon
         while time.monotonic() < end_s:
             began_s = time.monotonic()
             try:
-                session(operator, OPERATOR).close()
+                session(operator, OPERATOR_ADDRESS).close()
                 opened.append(time.monotonic() - began_s)
             except zenoh.ZError:
                 opened.append(None)

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 SUBPROTOCOL = "foxglove.sdk.v1"
-PATIENCE_S = 60.0
+VIEWER_TIMEOUT_S = 60.0
 TEXT, BINARY, CLOSE, PING, PONG = 0x1, 0x2, 0x8, 0x9, 0xA
 MESSAGE_DATA = 1
 """First byte of a binary message that carries data: then subscription (u32), time (u64), payload; little endian."""
@@ -34,10 +34,10 @@ class Viewer:
     _topics: dict[int, str] = field(default_factory=dict)
 
     def __enter__(self) -> Viewer:
-        place = urlsplit(self.url)
-        assert place.hostname is not None
-        self._socket = socket.create_connection((place.hostname, place.port or 80), PATIENCE_S)
-        self._handshake(place.netloc)
+        address = urlsplit(self.url)
+        assert address.hostname is not None
+        self._socket = socket.create_connection((address.hostname, address.port or 80), VIEWER_TIMEOUT_S)
+        self._handshake(address.netloc)
         return self
 
     def __exit__(
@@ -47,15 +47,17 @@ class Viewer:
 
     def subscribe(self, topics: Iterable[str]) -> None:
         """To topics, as soon as all of them are advertised."""
-        wanted = list(topics)
-        while not set(wanted) <= set(self.channels):
+        requested = list(topics)
+        while not set(requested) <= set(self.channels):
             self._control(*self._message())
         begin = len(self._topics)
-        self._topics |= {begin + at: topic for at, topic in enumerate(wanted)}
-        subscriptions = [{"id": begin + at, "channelId": self.channels[topic]["id"]} for at, topic in enumerate(wanted)]
-        self.say(json.dumps({"op": "subscribe", "subscriptions": subscriptions}).encode())
+        self._topics |= {begin + at: topic for at, topic in enumerate(requested)}
+        subscriptions = [
+            {"id": begin + at, "channelId": self.channels[topic]["id"]} for at, topic in enumerate(requested)
+        ]
+        self.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}).encode())
 
-    def say(self, data: bytes, code: int = TEXT) -> None:
+    def send(self, data: bytes, code: int = TEXT) -> None:
         """Send a message, whatever it is. Clients mask what they send; a mask of zeros leaves it as it is."""
         size = len(data)
         length = struct.pack("!B", 0x80 | size) if size < 126 else struct.pack("!BQ", 0x80 | 127, size)
@@ -74,8 +76,8 @@ class Viewer:
     def next_on(self, topic: str) -> Any:
         """The next message on one topic."""
         while True:
-            came, message = self.next()
-            if came == topic:
+            received, message = self.next()
+            if received == topic:
                 return message
 
     # --- messages ---------------------------------------------------------------------------------------------------
@@ -116,14 +118,14 @@ class Viewer:
         """The next whole message; pings are answered on the way."""
         whole, kind = b"", 0
         while True:
-            first, second = self._take(2)
+            first, second = self._read(2)
             length = second & 0x7F
             if length >= 126:
-                length = int.from_bytes(self._take(2 if length == 126 else 8), "big")
-            data = self._take(length)
+                length = int.from_bytes(self._read(2 if length == 126 else 8), "big")
+            data = self._read(length)
             code = first & 0x0F
             if code == PING:
-                self.say(data, PONG)
+                self.send(data, PONG)
             elif code == CLOSE:
                 raise EOFError("the server has closed the connection")
             elif code != PONG:
@@ -131,7 +133,7 @@ class Viewer:
                 if first & 0x80:
                     return kind, whole
 
-    def _take(self, count: int) -> bytes:
+    def _read(self, count: int) -> bytes:
         while len(self._waiting) < count:
             self._receive()
         taken = bytes(self._waiting[:count])

@@ -20,26 +20,26 @@ HOSTILE = (
 """Colours, an erased screen, the clipboard, a line that overwrites another, text in the other direction, characters
 without a shape, a second line, markup of rich and of HTML."""
 
-SHORT = "\x1b[35;45m\x9b\r\u202e\n"
+HOSTILE_SHORT = "\x1b[35;45m\x9b\r\u202e\n"
 """The worst of it, for fields of a few characters."""
 
-OBEYED = frozenset({"Cc", "Cf", "Cs", "Co", "Zl", "Zp"})
+OBEYED_CATEGORIES = frozenset({"Cc", "Cf", "Cs", "Co", "Zl", "Zp"})
 """Categories of characters that a terminal obeys or does not show."""
 
-OF_RICH = re.compile(r"\x1b\[[0-9;]*m|\x1b\[\?25[hl]|\x1b\[\?1049[hl]|\x1b\[[0-9;]*[AHJK]|\x1b\[2K|\r")
+RICH_SEQUENCES = re.compile(r"\x1b\[[0-9;]*m|\x1b\[\?25[hl]|\x1b\[\?1049[hl]|\x1b\[[0-9;]*[AHJK]|\x1b\[2K|\r")
 """What rich sends to a terminal by itself: styles, and the moves of a live display."""
 
 
-def obeyed(text: str, *, styled: bool = False) -> str:
+def obeyed_characters(text: str, *, styled: bool = False) -> str:
     """The characters of an output that a terminal would obey, apart from line breaks and, if `styled`, what rich makes;
     empty for a harmless output."""
     assert "\x1b[35;45m" not in text, "colours of the text itself"
     assert "\ufe0f" not in text
-    left = OF_RICH.sub("", text) if styled else text
-    return "".join(sign for sign in left if sign != "\n" and unicodedata.category(sign) in OBEYED)
+    rest = RICH_SEQUENCES.sub("", text) if styled else text
+    return "".join(sign for sign in rest if sign != "\n" and unicodedata.category(sign) in OBEYED_CATEGORIES)
 
 
-def hostile(model: type[M], choice: int = 0, text: str = HOSTILE, **known: Any) -> M:
+def hostile_message(model: type[M], choice: int = 0, text: str = HOSTILE, **known: Any) -> M:
     """A message in which every text, and every name in a map, is `text`; optional fields are there. `choice` selects
     among fixed words, and of yes and no. `known` are fields whose values are not chosen here."""
     given = {
@@ -49,14 +49,14 @@ def hostile(model: type[M], choice: int = 0, text: str = HOSTILE, **known: Any) 
     return model.model_validate(given)
 
 
-def texts(value: object) -> list[str]:
+def message_texts(value: object) -> list[str]:
     """Every text in a message."""
     if isinstance(value, BaseModel):
         value = [getattr(value, name) for name in type(value).model_fields if not _is_fixed(type(value), name)]
     if isinstance(value, dict):
-        return [found for item in (*value.keys(), *value.values()) for found in texts(item)]
+        return [text for item in (*value.keys(), *value.values()) for text in message_texts(item)]
     if isinstance(value, list | tuple):
-        return [found for item in value for found in texts(item)]
+        return [text for item in value for text in message_texts(item)]
     return [value] if isinstance(value, str) and not isinstance(value, enum.Enum) else []
 
 
@@ -89,7 +89,7 @@ def _value(kind: Any, limits: tuple[Any, ...], choice: int, text: str) -> Any:
         return choice == 0
     if issubclass(kind, str):
         longest = min((limit.max_length for limit in limits if isinstance(limit, MaxLen)), default=len(text))
-        return (text if longest >= len(text) else SHORT)[:longest]
+        return (text if longest >= len(text) else HOSTILE_SHORT)[:longest]
     least = max((_number(limit) for limit in limits if isinstance(limit, Ge | Gt)), default=0)
     most = min((_number(limit) for limit in limits if isinstance(limit, Le)), default=least + 1)
     return kind(min(least + 1, most))

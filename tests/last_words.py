@@ -9,16 +9,16 @@ import msgpack
 from coec.schemas.base import to_msgpack
 from coec.schemas.last_word import LastWord
 
-SAID_NS = 1_700_000_000_000_000_000
+SENT_NS = 1_700_000_000_000_000_000
 
 
-def a_word(vehicle: str = "vehicle", pair: str = "front", **told: Any) -> LastWord:
+def heartbeat(vehicle: str = "vehicle", pair: str = "front", **fields: Any) -> LastWord:
     """Of a healthy pair of a vehicle that runs; `told` is what is otherwise."""
     return LastWord(
         **{
             "vehicle": vehicle,
             "pair": pair,
-            "said_ns": SAID_NS,
+            "said_ns": SENT_NS,
             "period_s": 60.0,
             "service": "running",
             "version": "1.0",
@@ -26,7 +26,7 @@ def a_word(vehicle: str = "vehicle", pair: str = "front", **told: Any) -> LastWo
             "state": "healthy",
             "level": 0,
             "reasons": (),
-            "since_ns": SAID_NS - 10**12,
+            "since_ns": SENT_NS - 10**12,
             "age_s": 4.0,
             "drift": (0.01, -0.02, 0.03, 0.001, 0.002, -0.003),
             "drift_sigma": (0.01, 0.01, 0.02, 0.004, 0.004, 0.005),
@@ -37,13 +37,13 @@ def a_word(vehicle: str = "vehicle", pair: str = "front", **told: Any) -> LastWo
             "held": False,
             "windows": 12,
             "event": None,
-            **told,
+            **fields,
         }
     )
 
 
-def packed(word: LastWord, **wrong: Any) -> bytes:
+def packed_heartbeat(message: LastWord, **wrong: Any) -> bytes:
     """As it travels; `wrong` is written over it, whatever the model says of that."""
-    document = msgpack.unpackb(to_msgpack(word))
+    document = msgpack.unpackb(to_msgpack(message))
     data: bytes = msgpack.packb({**document, **wrong})
     return data

@@ -13,10 +13,10 @@ import pytest
 
 from coec.adapters.files.conversions import result_of
 from coec.adapters.files.rig import rig_of
-from coec.adapters.files.scribe import Book, Scribe
+from coec.adapters.files.scribe import DiskWriter, Persistable
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.ros_topics import Topics
-from coec.calibration.frames.window import SliceEnded
+from coec.adapters.zenoh.ros_topics import RosTopicList
+from coec.calibration.frames.window import SliceClosed
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import (
@@ -43,26 +43,26 @@ from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.inbox import Call
 from coec.runtime.ingest.intake import Intake
-from coec.runtime.outside import Outside
+from coec.runtime.outside import VehicleContext
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import RecordingPlan
 from coec.runtime.recording.snippets import SnippetRecorder
 from coec.runtime.recording.window_store import WindowStore
-from coec.runtime.rig.keeper import RigKeeper
+from coec.runtime.rig.keeper import RigEstimatorThread
 from coec.runtime.worker.costs import Cost, cost_of
-from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutcome, Kind, Solved
+from coec.runtime.worker.jobs import Answer, Checked, Fate, JobOutcome, Kind, RenderedImage, Solved, WorkerJob
 from coec.runtime.worker.messages import unpack_pairs
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.keys import Keys
 from coec.schemas.replies import Acknowledgement, HistoryEntry
 from estimates import estimate
 
-S = 1_000_000_000
+NS_PER_S = 1_000_000_000
 BEGIN_S = 1_000_000
 STEP_S = BEGIN_S + 100
 """When the mount moves."""
 
-END_S = STEP_S + 100
+DRIVE_END_S = STEP_S + 100
 
 NOMINAL = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 BEFORE = se3.perturb(NOMINAL, np.radians([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -72,11 +72,11 @@ NOISE = 8e-4
 """Of a check, rad or m."""
 
 
-def truth(stamp_ns: int) -> Matrix4:
-    return BEFORE if stamp_ns < STEP_S * S else AFTER
+def true_pose(stamp_ns: int) -> Matrix4:
+    return BEFORE if stamp_ns < STEP_S * NS_PER_S else AFTER
 
 
-def configuration(folder: Path, apply: str = "within_limits", vehicle: str = "test") -> Config:
+def pair_configuration(folder: Path, apply: str = "within_limits", vehicle: str = "test") -> Config:
     pair = {
         "name": "front",
         "camera": {
@@ -112,7 +112,7 @@ def configuration(folder: Path, apply: str = "within_limits", vehicle: str = "te
     )
 
 
-def pair_at(stamp_ns: int, speed_mps: float = 5.0) -> FramePair:
+def frame_pair_at(stamp_ns: int, speed_mps: float = 5.0) -> FramePair:
     rng = np.random.default_rng(stamp_ns % (2**32))
     image = EncodedImage(ImageFormat.MONO8, WIDTH, HEIGHT, rng.bytes(WIDTH * HEIGHT))
     cloud = np.array([[10.0, 0.0, 0.0], [20.0, 1.0, 0.5]], dtype=np.float32)
@@ -120,17 +120,17 @@ def pair_at(stamp_ns: int, speed_mps: float = 5.0) -> FramePair:
     return FramePair(CameraFrame(stamp_ns, "camera", image), LidarFrame(stamp_ns, "lidar", cloud), motion)
 
 
-RIG = rig_of(configuration(Path("state")).pairs[0])
+PAIR_RIG = rig_of(pair_configuration(Path("state")).pairs[0])
 
 
 @dataclass
-class KnowingWorker:
+class OracleWorker:
     """Answers at once, and rightly. `cost_s`: processor time that work of a kind takes, for which `pay` is told;
     `checked` are the stamps of the pairs of each check, `drawn` the questions for pictures, `commissionings` says how
     far those of pairs are. `truth` is the pose at a stamp; `scatter` draws the noise of the checks, None: they have
     none."""
 
-    truth: Callable[[int], Matrix4] = truth
+    truth: Callable[[int], Matrix4] = true_pose
     scatter: np.random.Generator | None = None
     cause: str | None = None
     baseline_not_used: str | None = None
@@ -141,7 +141,7 @@ class KnowingWorker:
     cost_s: dict[Kind, float] = field(default_factory=dict)
     pay: Callable[[Cost], None] = lambda _: None
     checked: list[tuple[int, ...]] = field(default_factory=list)
-    drawn: list[Job] = field(default_factory=list)
+    overlays: list[WorkerJob] = field(default_factory=list)
     commissionings: dict[str, str] = field(default_factory=dict)
     warms_up: bool = False
     compiled_s: float = 0.0
@@ -149,15 +149,15 @@ class KnowingWorker:
     def commissioning(self, pair: str) -> str | None:
         return self.commissionings.get(pair)
 
-    def ask(self, job: Job) -> None:
+    def submit(self, job: WorkerJob) -> None:
         if job.kind in self.cost_s:
             self.pay(cost_of(job, self.cost_s[job.kind]))
-        ways: dict[Kind, Callable[[Job], Answer]] = {
+        handlers: dict[Kind, Callable[[WorkerJob], Answer]] = {
             Kind.CHECK: self._check,
             Kind.SOLVE: self._solve,
-            Kind.OVERLAY: self._draw,
+            Kind.OVERLAY: self._render_overlay,
         }
-        answer = ways.get(job.kind)
+        answer = handlers.get(job.kind)
         fault = self.fault if job.kind is Kind.CHECK else self.window_fault if job.kind is Kind.SOLVE else None
         if fault is not None or answer is None:
             job.done(JobOutcome(Fate.FAILED, None, fault or Reason("no", "not here"), 0.1))
@@ -167,7 +167,7 @@ class KnowingWorker:
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Nothing is inferred."""
 
-    def _check(self, job: Job) -> Checked:
+    def _check(self, job: WorkerJob) -> Checked:
         pairs = unpack_pairs(job.body["frames"], LimitsConfig())
         self.checked.append(tuple(pair.stamp_ns for pair in pairs))
         wrong = [se3.difference(np.array(job.body["pose"]), self.truth(pair.stamp_ns)) for pair in pairs]
@@ -191,36 +191,36 @@ class KnowingWorker:
         )
         return Checked(observation, self.baseline_not_used)
 
-    def _draw(self, job: Job) -> Drawn:
-        self.drawn.append(job)
-        return Drawn(b"jpeg " + job.subject.encode())
+    def _render_overlay(self, job: WorkerJob) -> RenderedImage:
+        self.overlays.append(job)
+        return RenderedImage(b"jpeg " + job.subject.encode())
 
-    def _solve(self, job: Job) -> Solved:
-        return Solved(result_of(self.estimates[job.subject], RIG, "test"), None)
+    def _solve(self, job: WorkerJob) -> Solved:
+        return Solved(result_of(self.estimates[job.subject], PAIR_RIG, "test"), None)
 
 
 @dataclass
-class SlowWorker(KnowingWorker):
+class SlowWorker(OracleWorker):
     """Answers in its own time, and out of order: some of what waits, whenever it is let."""
 
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
-    waiting: list[Job] = field(default_factory=list)
+    waiting: list[WorkerJob] = field(default_factory=list)
 
-    def ask(self, job: Job) -> None:
+    def submit(self, job: WorkerJob) -> None:
         self.waiting.append(job)
 
     def work(self, share: float) -> None:
         """Answer this share of the questions that wait."""
         for job in [one for one in self.waiting if self.rng.random() < share]:
             self.waiting.remove(job)
-            super().ask(job)
+            super().submit(job)
 
 
 class InstantRecorder:
     """Tells the worker what is in a window, the moment it ends: the truth of its pairs, or what lies between two. A
     window has three degrees of freedom: it sees no translation."""
 
-    worker: KnowingWorker
+    worker: OracleWorker
 
     def __init__(
         self,
@@ -233,12 +233,12 @@ class InstantRecorder:
     ) -> None:
         del losses, snippets
         self.plan, self.configuration = plan, plan.configuration
-        self.trouble = None
+        self.problem = None
         self.has_room = True
         self.waiting = 0
         self.recorded = 0
         self.loses = False
-        self.sees_knocks = False
+        self.sees_moves = False
         self.stamps: dict[str, list[int]] = {}
         self.between: dict[str, list[int]] = {}
         self.latest: Path | None = None
@@ -250,7 +250,7 @@ class InstantRecorder:
     def follow(self, plan: RecordingPlan) -> None:
         self.plan = plan
 
-    def use(self, configuration: CalibrationConfig) -> None:
+    def reconfigure(self, configuration: CalibrationConfig) -> None:
         self.configuration = configuration
 
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
@@ -260,39 +260,43 @@ class InstantRecorder:
     def add_between(self, window_id: str, pair: FramePair) -> None:
         self.between.setdefault(window_id, []).append(pair.stamp_ns)
 
-    def end(self, ended: SliceEnded) -> None:
+    def end(self, slice_end: SliceClosed) -> None:
         stamps, self._stamps = self._stamps, []
-        if not ended.complete:
+        if not slice_end.complete:
             return
-        if ended.kept is not None:
-            kept = [stamp for stamp in self.stamps[ended.kept.window_id] if stamp >= ended.kept.since_ns]
-            assert len(kept) == ended.kept.pairs
-            stamps = kept + stamps
-        assert len(stamps) == ended.pairs
-        self.stamps[ended.window_id] = stamps
+        if slice_end.carried_over is not None:
+            carried_over = [
+                stamp
+                for stamp in self.stamps[slice_end.carried_over.window_id]
+                if stamp >= slice_end.carried_over.since_ns
+            ]
+            assert len(carried_over) == slice_end.carried_over.pairs
+            stamps = carried_over + stamps
+        assert len(stamps) == slice_end.pairs
+        self.stamps[slice_end.window_id] = stamps
         if self.loses:
-            self._on_lost(ended.window_id)
+            self._on_lost(slice_end.window_id)
             return
         self.recorded += 1
-        self.latest = self._folder.path(ended.window_id)
+        self.latest = self._folder.path(slice_end.window_id)
         self.latest.touch()
         moved = np.mean([se3.difference(self._seen(stamp), NOMINAL) for stamp in stamps], axis=0)
         pose = se3.perturb(NOMINAL, moved) @ self.worker.bias
         made = estimate(1)
-        self.worker.estimates[ended.window_id] = replace(
+        self.worker.estimates[slice_end.window_id] = replace(
             made,
-            window_id=ended.window_id,
+            window_id=slice_end.window_id,
             data_stamp_ns=stamps[-1],
             optimum=replace(made.optimum, T_camera_lidar=pose),
             correction=se3.difference(pose, NOMINAL),
             uncertainty=Uncertainty.independent(np.array([5e-4] * 3 + [np.nan] * 3)),
         )
-        late = [stamp for stamp in stamps if stamp >= STEP_S * S]
-        if self.sees_knocks and 0 < len(late) < len(stamps):
-            self.worker.estimates[ended.window_id] = knocked(
-                self.worker.estimates[ended.window_id], stamps, late, self._seen
+        late = [stamp for stamp in stamps if stamp >= STEP_S * NS_PER_S]
+        if self.sees_moves and 0 < len(late) < len(stamps):
+            self.worker.estimates[slice_end.window_id] = estimate_across_move(
+                self.worker.estimates[slice_end.window_id], stamps, late, self._seen
             )
-        self._on_recorded(ended.window_id, self.latest, True)
+        self._on_recorded(slice_end.window_id, self.latest, True)
 
     def _seen(self, stamp_ns: int) -> Matrix4:
         """The pose at a stamp as far as windows see it."""
@@ -301,15 +305,15 @@ class InstantRecorder:
         return pose
 
 
-class InstantScribe(Scribe):
+class InstantDiskWriter(DiskWriter):
     """Writes on the thread that asks."""
 
-    def write(self, *books: Book) -> None:
+    def write(self, *books: Persistable) -> None:
         super().write(*books)
         self.write_due()
 
 
-def knocked(of: Estimate, stamps: list[int], late: list[int], seen: Callable[[int], Matrix4]) -> Estimate:
+def estimate_across_move(of: Estimate, stamps: list[int], late: list[int], seen: Callable[[int], Matrix4]) -> Estimate:
     """The estimate of a window that was refused as it holds the step."""
     last_before = stamps[stamps.index(late[0]) - 1]
     verdict = Verdict(Decision.FAILED, (), (Reason(MOVED, "the camera moved"),))
@@ -318,20 +322,20 @@ def knocked(of: Estimate, stamps: list[int], late: list[int], seen: Callable[[in
     )
 
 
-class Bench:
+class PairBench:
     """A pair without threads, driven pair by pair; `restart` replaces it by one that reads the same folder."""
 
     def __init__(
         self,
         folder: Path,
         apply: str = "within_limits",
-        worker: type[KnowingWorker] = KnowingWorker,
+        worker: type[OracleWorker] = OracleWorker,
         vehicle: str = "test",
         authority: AuthorityConfig | None = None,
         cores: float = 0.5,
-        truth: Callable[[int], Matrix4] = truth,
+        truth: Callable[[int], Matrix4] = true_pose,
     ) -> None:
-        config = configuration(folder, apply, vehicle)
+        config = pair_configuration(folder, apply, vehicle)
         self.config = config.model_copy(
             update={"authority": authority or config.authority, "budget": BudgetConfig(cores=cores)}
         )
@@ -351,24 +355,24 @@ class Bench:
         self.intake = Intake(self.config.limits)
         self.published: list[str] = []
         self.shown: list[str] = []
-        scribe = InstantScribe(self.folder)
-        self.outside = Outside(
+        disk_writer = InstantDiskWriter(self.folder)
+        self.context = VehicleContext(
             Keys("coec", self.config.vehicle),
             self.intake,
             store,
-            scribe,
+            disk_writer,
             windows,
             cast("Worker", self.worker),
             self.budget,
-            RigKeeper(self.folder, (), scribe),
+            RigEstimatorThread(self.folder, (), disk_writer),
             lambda key, _: self.published.append(key),
             lambda: (),
-            lambda pair, _drawn, _pose: self.shown.append(pair.name),
-            Topics,
+            lambda pair, _overlay, _pose: self.shown.append(pair.name),
+            RosTopicList,
         )
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)
-            self.pair = Pair(self.config.pairs[0], self.config, self.outside)
+            self.pair = Pair(self.config.pairs[0], self.config, self.context)
         self.recorder.worker = self.worker
         self.answers = self.pair.answers
 
@@ -385,8 +389,8 @@ class Bench:
         return self.pair.stream.losses()
 
     def drive(self, begin_s: int, end_s: int, speed_mps: float = 5.0) -> None:
-        for stamp_ns in range(begin_s * S, end_s * S, S // 2):
-            self.pair.stream.take([pair_at(stamp_ns, speed_mps)])
+        for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, NS_PER_S // 2):
+            self.pair.stream.take([frame_pair_at(stamp_ns, speed_mps)])
             self.settle()
         if isinstance(self.worker, SlowWorker):
             self.worker.work(share=1.0)
@@ -401,8 +405,8 @@ class Bench:
                 item.run()
                 going = True
             going |= self.pair.stream.choose_next()
-            self.pair.stream.tell()
-            going |= self.pair.decider.work(0.0)
+            self.pair.stream.renew_report()
+            going |= self.pair.manager.work(0.0)
         if isinstance(self.worker, SlowWorker):
             self.worker.work(share=0.05)
 
@@ -411,11 +415,11 @@ class Bench:
 
     def acknowledged(self, name: str, **arguments: Any) -> Acknowledgement:
         with ThreadPoolExecutor(1) as other:
-            told = other.submit(self.pair.commands.carry_out, name, arguments, "the test")
-            while not told.done():
+            future = other.submit(self.pair.commands.carry_out, name, arguments, "the test")
+            while not future.done():
                 self.settle()
         self.settle()
-        return told.result()
+        return future.result()
 
     @property
     def pose(self) -> Matrix4:
@@ -426,7 +430,7 @@ class Bench:
         return self.store.state.health.value
 
     def entries(self, *kinds: str) -> list[HistoryEntry]:
-        return [kept.entry for kept in self.store.history.entries() if kept.entry.kind in kinds]
+        return [record.entry for record in self.store.history.entries() if record.entry.kind in kinds]
 
     def decisions(self) -> list[tuple[str, str]]:
         return [(entry.kind, entry.code) for entry in self.entries("state", "extrinsic")]

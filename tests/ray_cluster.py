@@ -16,10 +16,10 @@ import pytest
 STORE_CREDENTIALS = ("AWS_", "AZURE_", "GOOGLE_")
 """Prefixes of environment variables that the nodes do not get."""
 
-MISSING = "needs the optional extra `ray`: pip install 'coec[ray]' in an environment for tests"
+RAY_MISSING = "needs the optional extra `ray`: pip install 'coec[ray]' in an environment for tests"
 
 
-class Nodes:
+class RayNodes:
     """Two nodes. Only the first one runs the cluster's own services, so the second one may be lost."""
 
     def __init__(self, cluster: Any) -> None:
@@ -62,9 +62,9 @@ class Nodes:
 
 
 @contextmanager
-def two_nodes() -> Iterator[Nodes]:
+def two_nodes() -> Iterator[RayNodes]:
     """Two nodes that have no credentials for stores. Skips if Ray is not installed."""
-    pytest.importorskip("ray", reason=MISSING)
+    pytest.importorskip("ray", reason=RAY_MISSING)
     from ray.cluster_utils import Cluster
 
     with pytest.MonkeyPatch.context() as patch:
@@ -76,7 +76,7 @@ def two_nodes() -> Iterator[Nodes]:
             head_node_args={"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False},
         )
         try:
-            yield Nodes(cluster)
+            yield RayNodes(cluster)
         finally:
             cluster.shutdown()
 

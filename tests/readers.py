@@ -14,7 +14,7 @@ from rosbags.interfaces import ConnectionExtRosbag2, Qos, QosDurability
 
 
 @dataclass(frozen=True)
-class Opened:
+class RecordingContents:
     """What they agree on: types and numbers of messages by topic, and how each topic is compressed.
 
     Attributes:
@@ -32,7 +32,7 @@ class Opened:
     packed: set[str]
 
 
-def opened(path: Path) -> Opened:
+def read_recording(path: Path) -> RecordingContents:
     """Every message of every channel, read by rosbags and by mcap with mcap_ros2, CRCs and all; they have to agree."""
     types, counts, documents, channels = _by_mcap(path)
     with path.open("rb") as stream:
@@ -60,7 +60,7 @@ def opened(path: Path) -> Opened:
             first.setdefault(connection.topic, message)
             seen[connection.topic] = seen.get(connection.topic, 0) + 1
     assert seen == {topic: counts[topic] for topic in types}, "the two read different messages"
-    return Opened(types, counts, first, latched, documents, packed)
+    return RecordingContents(types, counts, first, latched, documents, packed)
 
 
 def _by_mcap(path: Path) -> tuple[dict[str, str], dict[str, int], dict[str, list[Any]], dict[int, str]]:

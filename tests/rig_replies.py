@@ -27,25 +27,25 @@ UNIT = Transform(
 MOVE = SensorMove(by=(0.0, 1.0, 0.0, 0.01, 0.0, 0.0), sigma=(0.05, 0.05, 0.1, 0.01, 0.01, 0.01))
 
 
-def sensor(name: str, kind: SensorKind, state: SensorState, **more: Any) -> SensorReply:
+def sensor_reply(name: str, kind: SensorKind, state: SensorState, **more: Any) -> SensorReply:
     """A sensor of the pairs `front` and `left`, or of one of them."""
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "probability": 0.01,
         "since_ns": 4 * NS,
         "moved": None,
         "pairs": ("front", "left") if kind == "lidar" else (name,),
         "reasons": (Reason(code="fits", text=f"The pairs that were looked at fit without a move of {name}."),),
     }
-    return SensorReply(name=name, kind=kind, state=state, **{**told, **more})
+    return SensorReply(name=name, kind=kind, state=state, **{**fields, **more})
 
 
-def moved_lidar() -> SensorReply:
+def moved_lidar_sensor() -> SensorReply:
     """It turned by a degree."""
     why = (Reason(code="moved", text="It moved by 1.00°: seen by front, left; all else fits (99.8 %)."),)
-    return sensor("roof", "lidar", "lidar_moved", probability=0.998, moved=MOVE, reasons=why)
+    return sensor_reply("roof", "lidar", "lidar_moved", probability=0.998, moved=MOVE, reasons=why)
 
 
-def joint(**more: Any) -> JointReply:
+def joint_reply(**more: Any) -> JointReply:
     """Of two pairs, the second put there by the first; a loop that does not close."""
     pairs = tuple(
         JointPair(
@@ -55,29 +55,33 @@ def joint(**more: Any) -> JointReply:
         for name in ("front", "left")
     )  # fmt: skip
     loop = OpenLoop(names=("front", "left", "bar"), rotation_deg=0.8, translation_m=0.05, p_value=1e-6)
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "stamp_ns": 9 * NS, "pairs": pairs, "chi2": 55.0, "freedom": 6, "p_value": 1e-6, "consistent": False,
         "left_out": None, "open_loops": (loop,), "widened": 3.0,
     }  # fmt: skip
-    return JointReply(**{**told, **more})
+    return JointReply(**{**fields, **more})
 
 
-def knocked(**more: Any) -> RigReply:
+def moved_lidar_reply(**more: Any) -> RigReply:
     """The LiDAR of two cameras moved, and was put right."""
-    sensors = (sensor("front", "camera", "calibrated"), sensor("left", "camera", "undecided"), moved_lidar())
+    sensors = (
+        sensor_reply("front", "camera", "calibrated"),
+        sensor_reply("left", "camera", "undecided"),
+        moved_lidar_sensor(),
+    )
     correction = RigCorrection(stamp_ns=9 * NS, from_ns=24 * NS, sensors=("roof",), pairs=("front", "left"))
     move = RigMove(sensors=("roof",), since_ns=8 * NS, stepped_ns=4 * NS, over_ns=9 * NS, by={"roof": MOVE})
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "vehicle": "shuttle-7", "stamp_ns": 10 * NS, "sensors": sensors, "nobody": 0.002, "disturbed": {"front": 0.0},
-        "joint": joint(), "correction": correction, "move": move,
+        "joint": joint_reply(), "correction": correction, "move": move,
         "looks": {"front": 5, "left": 4}, "losses": {"late": 2},
     }  # fmt: skip
-    return RigReply(**{**told, **more})
+    return RigReply(**{**fields, **more})
 
 
-def untold() -> RigReply:
+def reply_before_checks() -> RigReply:
     """Before anything was looked at."""
     why = (Reason(code="one_pair", text="One pair cannot tell its camera from its LiDAR."),)
-    sensors = (sensor("roof", "lidar", "unknown", probability=None, since_ns=None, reasons=why),)
+    sensors = (sensor_reply("roof", "lidar", "unknown", probability=None, since_ns=None, reasons=why),)
     nothing: dict[str, Any] = dict.fromkeys(("stamp_ns", "nobody", "joint", "correction", "move"))
-    return knocked(sensors=sensors, reasons=why, losses={}, **nothing)
+    return moved_lidar_reply(sensors=sensors, reasons=why, losses={}, **nothing)

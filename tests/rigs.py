@@ -8,9 +8,9 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.rig.attribution import RigState, after_look, begun
-from coec.calibration.rig.evidence import Look
-from coec.calibration.rig.types import Edge, Kind, Link, RigGraph, Sensor
+from coec.calibration.rig.attribution import RigState, after_edge_observation, initial
+from coec.calibration.rig.evidence import EdgeObservation
+from coec.calibration.rig.types import Edge, RigGraph, RigidLink, Sensor, SensorKind
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4, Uncertainty
 from coec.geometry import se3
@@ -32,25 +32,25 @@ POSES: Mapping[str, Matrix4] = {
 
 
 def graph(
-    pairs: Sequence[tuple[str, str]], links: Sequence[Link] = (), poses: Mapping[str, Matrix4] = POSES
+    pairs: Sequence[tuple[str, str]], links: Sequence[RigidLink] = (), poses: Mapping[str, Matrix4] = POSES
 ) -> RigGraph:
     """The sensors of some pairs, each (camera, LiDAR) or two of a kind."""
     names = dict.fromkeys(name for pair in pairs for name in pair)
-    sensors = [Sensor(name, Kind.LIDAR if name in ("roof", "bumper") else Kind.CAMERA) for name in names]
+    sensors = [Sensor(name, SensorKind.LIDAR if name in ("roof", "bumper") else SensorKind.CAMERA) for name in names]
     return RigGraph.of(sensors, [Edge(f"{a}-{b}", a, b, poses[a] @ se3.inverse(poses[b])) for a, b in pairs], links)
 
 
-def look(edge: Edge, poses: Mapping[str, Matrix4], at_s: float, error: NDArray[np.float64]) -> Look:
+def edge_check(edge: Edge, poses: Mapping[str, Matrix4], at_s: float, error: NDArray[np.float64]) -> EdgeObservation:
     """One that puts an edge where these poses have it, but for an error (6,); a pair that was moved suspects so."""
     right = poses[edge.a] @ se3.inverse(poses[edge.b])
     stamp_ns, moved = round(at_s * NS), bool(np.abs(se3.difference(right, edge.T_a_b)).max() > 1e-6)
     information = np.diag(1.0 / SIGMA**2)
-    return Look(
+    return EdgeObservation(
         edge.name, stamp_ns, se3.perturb(right, error), information, PLACE, BIAS, stepped_ns=stamp_ns if moved else None
     )
 
 
-def driven(
+def checked_rig(
     rig: RigGraph,
     before: Mapping[str, Matrix4],
     after: Mapping[str, Matrix4],
@@ -58,20 +58,22 @@ def driven(
     seed: int = 1,
 ) -> RigState:
     """Rounds of looks at every edge, 5 s apart, before and after something happened."""
-    rng, state = np.random.default_rng(seed), begun(rig)
+    rng, state = np.random.default_rng(seed), initial(rig)
     for turn in range(sum(rounds)):
         for place, edge in enumerate(rig.edges):
             poses = before if turn < rounds[0] else after
-            state = after_look(state, rig, look(edge, poses, 5.0 * turn + 0.5 * place, SIGMA * rng.normal(size=6)))
+            state = after_edge_observation(
+                state, rig, edge_check(edge, poses, 5.0 * turn + 0.5 * place, SIGMA * rng.normal(size=6))
+            )
     return state
 
 
-def with_moved(*names: str, xi: NDArray[np.float64] = TURN) -> dict[str, Matrix4]:
+def moved_poses(*names: str, xi: NDArray[np.float64] = TURN) -> dict[str, Matrix4]:
     """The poses after some sensors moved by ξ about their own axes."""
     return {name: se3.perturb(pose, xi) if name in names else pose for name, pose in POSES.items()}
 
 
-def windows(
+def edge_windows(
     rig: RigGraph, poses: Mapping[str, Matrix4], seed: int, sigma: NDArray[np.float64] = SIGMA
 ) -> dict[str, Measurement]:
     """One of each edge, off by so much."""

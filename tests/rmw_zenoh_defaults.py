@@ -28,7 +28,7 @@ _BOTH: Mapping[str, object] = {
     "adminspace/enabled": True,
 }
 
-SESSION: Mapping[str, object] = {
+RMW_SESSION: Mapping[str, object] = {
     **_BOTH,
     "mode": "peer",
     "connect/endpoints": ["tcp/localhost:7447"],
@@ -38,7 +38,7 @@ SESSION: Mapping[str, object] = {
 }
 """Of every node."""
 
-ROUTER: Mapping[str, object] = {
+RMW_ROUTER: Mapping[str, object] = {
     **_BOTH,
     "mode": "router",
     "listen/endpoints": ["tcp/[::]:7447"],
@@ -47,7 +47,7 @@ ROUTER: Mapping[str, object] = {
 """Of `rmw_zenohd`, the router of a vehicle."""
 
 
-def settings(defaults: Mapping[str, object], changed: Mapping[str, object]) -> zenoh.Config:
+def rmw_settings(defaults: Mapping[str, object], changed: Mapping[str, object]) -> zenoh.Config:
     """Settings of a session, some of them other than the file says."""
     made = zenoh.Config()
     for key, value in {**defaults, **changed}.items():
@@ -56,14 +56,14 @@ def settings(defaults: Mapping[str, object], changed: Mapping[str, object]) -> z
 
 
 @contextmanager
-def node(endpoint: str) -> Iterator[zenoh.Session]:
+def rmw_node(endpoint: str) -> Iterator[zenoh.Session]:
     """The session of a node that connects to the router at this endpoint."""
-    with zenoh.open(settings(SESSION, {"connect/endpoints": [endpoint]})) as session:
+    with zenoh.open(rmw_settings(RMW_SESSION, {"connect/endpoints": [endpoint]})) as session:
         yield session
 
 
 @contextmanager
-def router(endpoint: str) -> Iterator[zenoh.Session]:
+def rmw_router(endpoint: str) -> Iterator[zenoh.Session]:
     """The router, at this endpoint."""
-    with zenoh.open(settings(ROUTER, {"listen/endpoints": [endpoint]})) as session:
+    with zenoh.open(rmw_settings(RMW_ROUTER, {"listen/endpoints": [endpoint]})) as session:
         yield session

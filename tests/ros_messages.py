@@ -9,8 +9,8 @@ import numpy as np
 
 from coec.adapters.images.codec import encode_jpeg
 
-SEC, NSEC = 1_700_000_000, 123_456_789
-STAMP = SEC * 10**9 + NSEC
+STAMP_S, STAMP_REST_NS = 1_700_000_000, 123_456_789
+STAMP_NS = STAMP_S * 10**9 + STAMP_REST_NS
 JPEG = encode_jpeg(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8))
 
 Columns = list[tuple[str, str, list[float]]]
@@ -42,18 +42,18 @@ class Packer:
         self.body += data
         return self
 
-    def header(self, frame_id: str, sec: int = SEC, nsec: int = NSEC) -> Packer:
+    def header(self, frame_id: str, sec: int = STAMP_S, nsec: int = STAMP_REST_NS) -> Packer:
         return self.put("i", sec).put("I", nsec).text(frame_id)
 
     def done(self) -> bytes:
         return b"\x00\x01\x00\x00" + bytes(self.body)
 
 
-def compressed(data: bytes = JPEG, form: str = "jpeg", **header: Any) -> bytes:
+def compressed_image(data: bytes = JPEG, form: str = "jpeg", **header: Any) -> bytes:
     return Packer().header(**({"frame_id": "camera"} | header)).text(form).octets(data).done()
 
 
-def image(encoding: str, width: int, height: int, step: int, data: bytes, *, big: bool = False) -> bytes:
+def raw_image(encoding: str, width: int, height: int, step: int, data: bytes, *, big: bool = False) -> bytes:
     packer = Packer().header("camera").put("I", height, width).text(encoding)
     return packer.put("B", big).put("I", step).octets(data).done()
 
@@ -70,8 +70,8 @@ def cloud(
     claimed: int | None = None,
     claimed_fields: int | None = None,
     counts: int = 1,
-    sec: int = SEC,
-    nsec: int = NSEC,
+    sec: int = STAMP_S,
+    nsec: int = STAMP_REST_NS,
 ) -> bytes:
     packer = Packer().header("lidar", sec, nsec).put("I", height, width)
     packer.put("I", len(fields) if claimed_fields is None else claimed_fields)
@@ -81,7 +81,7 @@ def cloud(
     return packer.octets(data, claimed).put("?", False).done()
 
 
-def packed(columns: Columns, *, big: bool = False, **options: Any) -> bytes:
+def packed_cloud(columns: Columns, *, big: bool = False, **options: Any) -> bytes:
     """A cloud of one row, without padding, its columns in the order given."""
     fields, formats, offset = [], [], 0
     for name, form, _ in columns:
@@ -114,11 +114,11 @@ def imu(angular: tuple[float, ...] = (0.0, 0.5, 0.125), known: float = 0.0, fram
     return packer.put("d", 0.0, 0.0, 9.81).put("d", *[0.0] * 9).done()
 
 
-Pose = tuple[float, float, float, float, float, float, float]
+PoseValues = tuple[float, float, float, float, float, float, float]
 """x y z, quaternion x y z w."""
 
 
-def transforms(*joints: tuple[str, str, int, Pose], claimed: int | None = None) -> bytes:
+def transforms(*joints: tuple[str, str, int, PoseValues], claimed: int | None = None) -> bytes:
     """A `TFMessage`: parent, child, stamp in ns, pose of the child in the parent."""
     packer = Packer().put("I", len(joints) if claimed is None else claimed)
     for parent, child, stamp_ns, pose in joints:

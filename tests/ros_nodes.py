@@ -12,7 +12,7 @@ import xxhash
 import zenoh
 
 from coec.adapters.ros import outgoing
-from coec.adapters.zenoh.matching import is_heard
+from coec.adapters.zenoh.matching import has_subscribers
 from coec.adapters.zenoh.player import Frame, stream_of
 from coec.calibration.types import CameraFrame, LidarFrame
 from fakes import wait_until
@@ -29,7 +29,7 @@ PACKAGES = {"Odometry": "nav_msgs"}
 TYPES = {"camera": "CompressedImage", "lidar": "PointCloud2", "ego": "Odometry"}
 
 
-def cdr(frame: Frame) -> bytes:
+def cdr_message(frame: Frame) -> bytes:
     """The message that holds a frame."""
     match frame:
         case CameraFrame():
@@ -40,20 +40,20 @@ def cdr(frame: Frame) -> bytes:
             return outgoing.encode_motion(frame)[1]
 
 
-def described(type_name: str) -> str:
+def type_chunks(type_name: str) -> str:
     """The last two chunks of a key."""
     return f"{PACKAGES.get(type_name, 'sensor_msgs')}::msg::dds_::{type_name}_/{HASHES[type_name]}"
 
 
-class Driver:
+class RosDriver:
     """One publisher of rmw_zenoh; a node of its own. `number` tells those of a session apart."""
 
     def __init__(self, session: zenoh.Session, topic: str, type_name: str, number: int, node: str = "driver") -> None:
         zid, mangled = session.info.zid(), topic.replace("/", "%")
-        token = f"@ros2_lv/0/{zid}/{number}/{number + 1}/MP/%/%/{node}/{mangled}/{described(type_name)}/2::,5:,:,:,,"
+        token = f"@ros2_lv/0/{zid}/{number}/{number + 1}/MP/%/%/{node}/{mangled}/{type_chunks(type_name)}/2::,5:,:,:,,"
         self.gid = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
         self.publisher = session.declare_publisher(
-            f"0{topic}/{described(type_name)}", congestion_control=zenoh.CongestionControl.BLOCK
+            f"0{topic}/{type_chunks(type_name)}", congestion_control=zenoh.CongestionControl.BLOCK
         )
         self._token = session.liveliness().declare_token(token)
         self._sequence = 0
@@ -61,8 +61,8 @@ class Driver:
     def put(self, payload: bytes, number: int | None = None) -> None:
         """`number` instead of the next one."""
         self._sequence = self._sequence + 1 if number is None else number
-        beside = struct.pack("<qqB16s", self._sequence, time.time_ns(), 16, self.gid)
-        self.publisher.put(payload, attachment=beside)
+        attachment = struct.pack("<qqB16s", self._sequence, time.time_ns(), 16, self.gid)
+        self.publisher.put(payload, attachment=attachment)
 
     def sends(self, payload: bytes) -> bool:
         """Puts it; False, for a loop that waits for what comes of it."""
@@ -74,7 +74,7 @@ class Driver:
         self.publisher.undeclare()
 
 
-class Bridged:
+class BridgedTopic:
     """One topic of DDS behind a zenoh-bridge-ros2dds."""
 
     def __init__(self, session: zenoh.Session, topic: str) -> None:
@@ -87,21 +87,21 @@ class Bridged:
         self.publisher.undeclare()
 
 
-class Sensors:
+class RosSensors:
     """Camera, LiDAR and ego-motion of a pair, on these topics."""
 
     def __init__(self, session: zenoh.Session, topics: Mapping[str, str], middleware: str) -> None:
         self.sent: Counter[str] = Counter()
-        self._drivers: dict[str, Driver | Bridged] = {
-            stream: Driver(session, topic, TYPES[stream], 10 * number)
+        self._drivers: dict[str, RosDriver | BridgedTopic] = {
+            stream: RosDriver(session, topic, TYPES[stream], 10 * number)
             if middleware == "rmw_zenoh"
-            else Bridged(session, topic)
+            else BridgedTopic(session, topic)
             for number, (stream, topic) in enumerate(topics.items())
         }
-        wait_until(lambda: all(is_heard(one.publisher) for one in self._drivers.values()), "somebody listens")
+        wait_until(lambda: all(has_subscribers(one.publisher) for one in self._drivers.values()), "somebody listens")
 
     def send(self, frame: Frame) -> None:
-        self._drivers[stream_of(frame)].put(cdr(frame))
+        self._drivers[stream_of(frame)].put(cdr_message(frame))
         self.sent[stream_of(frame)] += 1
 
     def close(self) -> None:

@@ -44,12 +44,12 @@ def with_images(window: Window, change: Callable[[Pixels, int], Pixels]) -> Wind
     return _each(window, changed)
 
 
-def with_points(window: Window, chosen: Callable[[LidarFrame, int], NDArray[np.intp]]) -> Window:
+def with_points(window: Window, select: Callable[[LidarFrame, int], NDArray[np.intp]]) -> Window:
     """Only the points of every sweep whose indices `chosen(sweep, index)` returns, in that order."""
 
     def changed(pair: FramePair, index: int) -> FramePair:
         sweep = pair.lidar
-        at = chosen(sweep, index)
+        at = select(sweep, index)
         return replace(
             pair,
             lidar=replace(
@@ -339,7 +339,7 @@ def _blended(below: Pixels, above: Pixels, opacity: NDArray[np.float32]) -> Pixe
     return np.asarray(below * (1.0 - share) + above * share, np.float32).round().astype(np.uint8)
 
 
-SCENARIOS: Mapping[str, Mutation] = MappingProxyType(
+DEGRADATIONS: Mapping[str, Mutation] = MappingProxyType(
     {
         mutation.__name__: mutation
         for mutation in (

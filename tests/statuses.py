@@ -7,7 +7,7 @@ from typing import Any
 from coec.schemas.replies import StatusReply, StorageStatus, WorkerStatus
 
 
-def a_status(**told: Any) -> StatusReply:
+def status_reply(**fields: Any) -> StatusReply:
     """Of a service that runs without pairs and has nothing to do; `told` is what is otherwise."""
     return StatusReply(
         **{
@@ -20,6 +20,6 @@ def a_status(**told: Any) -> StatusReply:
             "pairs": (),
             "worker": WorkerStatus(state="idle"),
             "storage": StorageStatus(bytes_used=0, bytes_free=0),
-            **told,
+            **fields,
         }
     )

@@ -14,13 +14,13 @@ from typing import Self
 import zenoh
 
 
-class Storage:
+class MemoryStorage:
     """In a session, while the block lasts."""
 
     def __init__(self, session: zenoh.Session, key_expr: str, *, complete: bool = True) -> None:
         self._lock = threading.Lock()
-        self.kept: dict[str, zenoh.Sample] = {}
-        self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.Callback(self._take, indirect=False))
+        self.samples: dict[str, zenoh.Sample] = {}
+        self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.Callback(self._store, indirect=False))
         handler = zenoh.handlers.Callback(self._answer, indirect=False)
         self._queryable = session.declare_queryable(key_expr, handler, complete=complete)
 
@@ -31,20 +31,20 @@ class Storage:
         self._subscriber.undeclare()
         self._queryable.undeclare()
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _store(self, sample: zenoh.Sample) -> None:
         with self._lock:
             key = str(sample.key_expr)
-            known = self.kept.get(key)
+            known = self.samples.get(key)
             before = None if known is None else known.timestamp
             if before is not None and sample.timestamp is not None and sample.timestamp <= before:
                 return
             if sample.kind == zenoh.SampleKind.PUT:
-                self.kept[key] = sample
+                self.samples[key] = sample
             else:
-                self.kept.pop(key, None)
+                self.samples.pop(key, None)
 
     def _answer(self, query: zenoh.Query) -> None:
         with query, self._lock:
-            for key, sample in self.kept.items():
+            for key, sample in self.samples.items():
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):
                     query.reply(key, sample.payload, encoding=sample.encoding, timestamp=sample.timestamp)

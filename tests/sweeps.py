@@ -11,11 +11,11 @@ from coec.calibration.types import LidarFrame
 from coec.geometry import se3
 
 ELEVATIONS_DEG = np.linspace(-15.0, 15.0, 16)
-ROOF = se3.exp(np.array([0.0, 0.0, 0.4, 1.4, 0.3, 2.1]))
-TILTED = se3.exp(np.array([0.1, 0.15, 0.4, 1.4, 0.3, 2.1]))
+ROOF_POSE = se3.exp(np.array([0.0, 0.0, 0.4, 1.4, 0.3, 2.1]))
+TILTED_ROOF_POSE = se3.exp(np.array([0.1, 0.15, 0.4, 1.4, 0.3, 2.1]))
 
 
-def a_sweep(seed: int = 1, noise_rad: float = 0.0, walkers: float = 0.0) -> LidarFrame:
+def turning_sweep(seed: int = 1, noise_rad: float = 0.0, walkers: float = 0.0) -> LidarFrame:
     """A turning LiDAR of 16 beams, 1.8 m above the ground, among walls 3 to 30 m away. `walkers`: share of the points
     whose elevation is anything."""
     rng = np.random.default_rng(seed)
@@ -32,7 +32,7 @@ def a_sweep(seed: int = 1, noise_rad: float = 0.0, walkers: float = 0.0) -> Lida
     return LidarFrame(5, "lidar", (range_m[:, None] * direction).astype(np.float32), ring=ring.astype(np.uint16))
 
 
-def in_frame(sweep: LidarFrame, T_frame_lidar: NDArray[np.float64]) -> LidarFrame:
+def sweep_in_frame(sweep: LidarFrame, T_frame_lidar: NDArray[np.float64]) -> LidarFrame:
     """The same points, given in another frame, as a driver would."""
     xyz_m = sweep.xyz_m.astype(np.float64) @ T_frame_lidar[:3, :3].T + T_frame_lidar[:3, 3]
     return replace(sweep, frame_id="base_link", xyz_m=xyz_m.astype(np.float32))

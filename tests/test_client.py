@@ -12,9 +12,9 @@ import zenoh
 
 import coec
 from coec import client
-from coec.adapters.zenoh.bus import MSGPACK, Answer, Bus, Lane, Request, Route, open_session
+from coec.adapters.zenoh.bus import MSGPACK, Answer, Bus, QueryLane, Request, Route, open_session
 from coec.adapters.zenoh.client import OF_ONE_KEY
-from coec.client import WAITING, Change, Vehicle
+from coec.client import MAX_QUEUED_CHANGES, PairUpdate, Vehicle
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConnectionFailedError, DecodeError, NotFoundError, RemoteError, UsageError
 from coec.schemas.base import to_msgpack
@@ -69,7 +69,7 @@ def answering(router: Router) -> Iterator[Callable[[str, Callable[[Request], Ans
     bus = Bus(open_session(ZenohConfig(connect=(router.endpoint,)), LimitsConfig()))
 
     def serve(key: str, answer: Callable[[Request], Answer]) -> Vehicle:
-        bus.serve(key, lambda asked: [Route(asked, answer, Lane.AT_ONCE)])
+        bus.serve(key, lambda asked: [Route(asked, answer, QueryLane.AT_ONCE)])
         return Vehicle("odd", connect=router.endpoint, timeout_s=PATIENCE_S)
 
     yield serve
@@ -77,7 +77,7 @@ def answering(router: Router) -> Iterator[Callable[[str, Callable[[Request], Ans
     assert bus.close(PATIENCE_S)
 
 
-async def until(changes: AsyncGenerator[Change], wanted: Callable[[Change], bool]) -> list[Change]:
+async def until(changes: AsyncGenerator[PairUpdate], wanted: Callable[[PairUpdate], bool]) -> list[PairUpdate]:
     """All changes to the first that is wanted."""
     seen = []
     async with asyncio.timeout(PATIENCE_S):
@@ -255,19 +255,19 @@ def test_changes_begin_with_what_is_so_now_and_go_on(endpoint: str, bus: Bus) ->
 def test_a_service_that_ends_is_told_and_heard_again(router: Router, tmp_path: Path) -> None:
     config = ZenohConfig(connect=(router.endpoint,))
 
-    def alive(value: bool) -> Callable[[Change], bool]:
+    def alive(value: bool) -> Callable[[PairUpdate], bool]:
         return lambda change: change.kind == "alive" and change.value is value
 
     async def asked() -> None:
         loop = asyncio.get_running_loop()
         async with Vehicle(VEHICLE, connect=router.endpoint, timeout_s=PATIENCE_S) as vehicle:
-            heard: asyncio.Queue[Change] = asyncio.Queue()
+            heard: asyncio.Queue[PairUpdate] = asyncio.Queue()
 
             async def listen() -> None:
                 async for change in vehicle.changes():
                     heard.put_nowait(change)
 
-            async def wait_for(wanted: Callable[[Change], bool]) -> None:
+            async def wait_for(wanted: Callable[[PairUpdate], bool]) -> None:
                 async with asyncio.timeout(PATIENCE_S):
                     while not wanted(await heard.get()):
                         pass
@@ -296,9 +296,9 @@ def test_a_slow_listener_loses_the_oldest_and_is_told(
     endpoint: str, bus: Bus, monkeypatch: pytest.MonkeyPatch, record_property: Callable[[str, object], None]
 ) -> None:
     waiting, said = 4, 20
-    monkeypatch.setattr(client, "WAITING", waiting)
+    monkeypatch.setattr(client, "MAX_QUEUED_CHANGES", waiting)
 
-    async def asked() -> list[Change]:
+    async def asked() -> list[PairUpdate]:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
             health = await vehicle.health()
             slow, prompt = vehicle.changes(), vehicle.changes()
@@ -318,21 +318,21 @@ def test_a_slow_listener_loses_the_oldest_and_is_told(
     assert said - waiting <= told[0]  # the last may have come when the first of those that waited was taken
     assert told == list(range(told[0], said + 1))
     assert [change.lost for change in seen] == [told[0] - 1, *[0] * (len(told) - 1)]
-    record_property("figure", f"{WAITING} wait")
+    record_property("figure", f"{MAX_QUEUED_CHANGES} wait")
 
 
-def _all_told() -> Callable[[Change], bool]:
+def _all_told() -> Callable[[PairUpdate], bool]:
     """Of one listener: whether it has heard all that is so now."""
     kinds: set[str] = set()
 
-    def told(change: Change) -> bool:
+    def told(change: PairUpdate) -> bool:
         kinds.add(change.kind)
         return kinds == {"alive", "extrinsic", "health"}
 
     return told
 
 
-def _says(since_ns: int) -> Callable[[Change], bool]:
+def _says(since_ns: int) -> Callable[[PairUpdate], bool]:
     return lambda change: isinstance(change.value, HealthReply) and change.value.since_ns == since_ns
 
 

@@ -9,12 +9,12 @@ import pytest
 from pydantic import ValidationError
 
 from coec.config import Config, RosConfig
-from pair_bench import configuration
+from pair_bench import pair_configuration
 
 
 def document(ros: dict[str, Any], middleware: str = "rmw_zenoh", *names: str) -> dict[str, Any]:
     """Of a service with pairs of these names."""
-    whole = configuration(Path("state")).model_dump(mode="json")
+    whole = pair_configuration(Path("state")).model_dump(mode="json")
     pairs = [{**whole["pairs"][0], "name": name} for name in names or ("front",)]
     return {**whole, "pairs": pairs, "middleware": middleware, "ros": ros}
 

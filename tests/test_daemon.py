@@ -36,7 +36,7 @@ from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment, rou
 from e2e.ros_listener import listening, speaking_to_ros
 from fakes import wait_until
 from ports import free_port
-from storages import Storage
+from storages import MemoryStorage
 
 SHORT_S = 12
 LATER_S = 60.0
@@ -174,9 +174,9 @@ def test_a_drive_an_end_and_a_restart(tmp_path: Path, drive: Drive, router: Rout
         told = running.until(running.history, lambda told: told["total"] == 2, "the second solve")
         one, two = told["results"]
         assert one == two, "the same window and configuration give the same result"
-        with Storage(router.session, running.keys.last("*")) as storage:
+        with MemoryStorage(router.session, running.keys.last("*")) as storage:
             assert running.terminate() == 0
-    words = {key: last_word.read(key, kept.payload.to_bytes()) for key, kept in storage.kept.items()}
+    words = {key: last_word.decode_heartbeat(key, kept.payload.to_bytes()) for key, kept in storage.samples.items()}
     assert {word.service for word in words.values()} == {"stopping"}, "it takes its leave"
     front = words[running.keys.last(FRONT)]
     assert (front.state, front.provenance, front.windows) == ("healthy", "estimated", 1)

@@ -35,7 +35,7 @@ def test_every_module_that_drawing_loads_is_in_the_fingerprint() -> None:
 
 
 def test_a_drawn_drive_is_the_drive() -> None:
-    drawn, drive = drives.drawn_source(TINY), open_source(TINY)
+    drawn, drive = drives.rendered_source(TINY), open_source(TINY)
     assert drawn.camera_stamps_ns == drive.camera_stamps_ns
     for ours, theirs in zip(drawn.messages(), drive.messages(), strict=True):
         if isinstance(ours, LidarFrame) and isinstance(theirs, LidarFrame):

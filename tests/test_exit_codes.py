@@ -27,7 +27,7 @@ from coec.config import Config, StateConfig, ZenohConfig
 from coec.daemon.service import exit_code_of
 from coec.daemon.state_folder import locked
 from coec.errors import CoecError, ConfigError
-from coec.exit_codes import MAY_BE_CURED, MEANINGS, NOT_CURED_BY_RESTART, ExitCode
+from coec.exit_codes import EXIT_CODE_MEANINGS, MAY_BE_CURED, NOT_CURED_BY_RESTART, ExitCode
 from conftest import REPOSITORY
 from deploy.written import compose
 from e2e.processes import COMMAND, PATIENCE_S, environment
@@ -78,13 +78,13 @@ def test_containers_are_started_again_as_the_page_says() -> None:
     assert {service["restart"] for service in compose().values()} == {"unless-stopped"}
     page = (REPOSITORY / "docs" / "operations.md").read_text()
     assert "`restart: unless-stopped`" in page
-    for code, meaning in MEANINGS.items():
+    for code, meaning in EXIT_CODE_MEANINGS.items():
         again = "no" if code in never_again() else "yes" if code in MAY_BE_CURED else ""
         assert re.search(rf"^\| {code.value} \| {re.escape(meaning)} \| {again} ?\|$", page, re.MULTILINE), code
 
 
 def test_every_exit_code_has_a_meaning() -> None:
-    assert set(MEANINGS) == set(ExitCode)
+    assert set(EXIT_CODE_MEANINGS) == set(ExitCode)
 
 
 @pytest.mark.parametrize("error", [*every_error(CoecError)], ids=lambda error: error.__name__)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import pytest
 
-from faults import HELD, NOT_RUN, TABLE, FaultTable, Row, figures_told, marked_rows, table_of
+from faults import HELD, NOT_RUN, TABLE, FaultTable, Row, marked_rows, recorded_figures, table_of
 
 MIN_ROWS = 60
 """Faults and attacks that were seen, or are to be expected, on a vehicle."""
@@ -16,7 +16,7 @@ MIN_ROWS = 60
 
 def test_the_table_has_every_marked_row_and_no_other() -> None:
     rows = marked_rows()
-    assert TABLE.read_text(encoding="utf-8") == table_of(rows, figures_told()), (
+    assert TABLE.read_text(encoding="utf-8") == table_of(rows, recorded_figures()), (
         "run the marked tests: pytest -m '' --faults docs/faults.md"
     )
 
@@ -28,7 +28,7 @@ def test_there_are_enough_of_them_and_none_twice() -> None:
 
 
 def test_every_promise_was_tried_and_held() -> None:
-    figures = figures_told()
+    figures = recorded_figures()
     assert not [row.test for row in marked_rows() if figures[row] == NOT_RUN or "FAILED" in figures[row]]
 
 
@@ -39,7 +39,7 @@ def test_a_table_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     ]
     table = tmp_path / "faults.md"
     table.write_text(table_of(rows, {rows[0]: "0.4 s"}), encoding="utf-8")
-    assert figures_told(table) == {rows[0]: "0.4 s", rows[1]: NOT_RUN}
+    assert recorded_figures(table) == {rows[0]: "0.4 s", rows[1]: NOT_RUN}
 
 
 def test_a_mark_without_its_texts_is_refused(tmp_path: Path) -> None:
@@ -60,9 +60,9 @@ def test_a_run_writes_what_its_tests_measured_and_what_failed(
     marks = [("fault", json.dumps(row)), *(("figure", figure) for figure in figures)]
     report = pytest.TestReport(row.test, ("", 0, ""), {}, outcome, None, "call", user_properties=marks)
     writer.pytest_runtest_logreport(report)
-    assert figures_told(tmp_path / "faults.md")[row] == told, "also where the run is ended now"
+    assert recorded_figures(tmp_path / "faults.md")[row] == told, "also where the run is ended now"
     writer.pytest_sessionfinish()
-    assert figures_told(tmp_path / "faults.md")[row] == told
+    assert recorded_figures(tmp_path / "faults.md")[row] == told
 
 
 def test_a_later_run_keeps_the_figures_of_tests_that_it_leaves_out(tmp_path: Path) -> None:
@@ -70,4 +70,4 @@ def test_a_later_run_keeps_the_figures_of_tests_that_it_leaves_out(tmp_path: Pat
     table = tmp_path / "faults.md"
     table.write_text(table_of([row], {row: "0.4 s"}), encoding="utf-8")
     FaultTable(table).pytest_sessionfinish()
-    assert figures_told(table)[row] == "0.4 s"
+    assert recorded_figures(table)[row] == "0.4 s"

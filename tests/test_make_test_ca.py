@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from certificates import MAKE, NAMES, TestAuthority
-from coec.adapters.tls.conversation import Listener, Speaker, credentials_of
+from certificates import CERTIFICATE_NAMES, MAKE_TEST_CA, TestAuthority
+from coec.adapters.tls.conversation import CommandListener, CommandSender, credentials_of
 from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.config import AuthorityConfig, load_yaml
 from conftest import REPOSITORY
@@ -22,12 +22,12 @@ pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs o
 
 
 def make(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [str(MAKE), *(str(argument) for argument in arguments)]
+    command = [str(MAKE_TEST_CA), *(str(argument) for argument in arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | environment)
 
 
 def test_its_certificates_pass_the_strictest_look(authority: TestAuthority) -> None:
-    for name in NAMES:
+    for name in CERTIFICATE_NAMES:
         purpose = "sslserver" if name in ("router", "vehicle") else "sslclient"
         command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", "ca.pem", f"{name}.pem"]
         subprocess.run(command, cwd=authority.folder, check=True, capture_output=True)
@@ -35,10 +35,14 @@ def test_its_certificates_pass_the_strictest_look(authority: TestAuthority) -> N
 
 def test_keys_are_for_their_owner_and_group_alone(authority: TestAuthority) -> None:
     keys = list(authority.folder.glob("*-key.pem"))
-    assert {f"{name}-key.pem" for name in (*NAMES, "ca")} <= {key.name for key in keys}
-    assert {stat.S_IMODE((authority.folder / f"{name}-key.pem").stat().st_mode) for name in NAMES} == {0o640}
+    assert {f"{name}-key.pem" for name in (*CERTIFICATE_NAMES, "ca")} <= {key.name for key in keys}
+    assert {stat.S_IMODE((authority.folder / f"{name}-key.pem").stat().st_mode) for name in CERTIFICATE_NAMES} == {
+        0o640
+    }
     assert stat.S_IMODE((authority.folder / "ca-key.pem").stat().st_mode) == 0o600, "who has it is everybody"
-    assert {stat.S_IMODE((authority.folder / f"{name}.pem").stat().st_mode) for name in (*NAMES, "ca")} == {0o644}
+    assert {stat.S_IMODE((authority.folder / f"{name}.pem").stat().st_mode) for name in (*CERTIFICATE_NAMES, "ca")} == {
+        0o644
+    }
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files to a group that it is not in")
@@ -69,10 +73,10 @@ def test_what_it_says_is_a_configuration_that_can_be_used(tmp_path: Path) -> Non
     file.write_text("\n".join(line[15:] for line in section.splitlines()))
     credentials = credentials_of(AuthorityConfig.model_validate(load_yaml(file)["authority"]))
     assert credentials is not None
-    speaker = Speaker(TestAuthority(folder).credentials("operator"), "truck-7")
-    flight = Listener(credentials).hear("1", speaker.hello())
+    speaker = CommandSender(TestAuthority(folder).credentials("operator"), "truck-7")
+    flight = CommandListener(credentials).receive("1", speaker.first_flight())
     assert isinstance(flight, bytes)
-    speaker.say(flight, b"hold")
+    speaker.send(flight, b"hold")
     for name in ("vehicle", "sensors", "ros", "operator", "viewer"):
         settings = read_settings(folder / f"{name}.json5")
         assert settings.get_json("connect/endpoints") == '["tls/vehicle-7.example:7448"]'

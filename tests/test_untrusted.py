@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from coec.errors import CoecError, DecodeError, RemoteError
 from coec.untrusted import LIMIT, Untrusted, json_printable, printable, printable_lines
-from hostile import HOSTILE, obeyed
+from hostile import HOSTILE, obeyed_characters
 
 ANYTHING = st.text(st.characters(codec=None, categories=None))
 """Unpaired surrogates too."""
@@ -23,7 +23,7 @@ def test_nothing_that_is_shown_is_obeyed(text: str) -> None:
     for shown in (printable(text), printable(text, None), f"{Untrusted(text)}", repr(Untrusted(text))):
         assert shown.isprintable()
         assert "\ufe0f" not in shown
-    assert obeyed(printable_lines(text)) == ""
+    assert obeyed_characters(printable_lines(text)) == ""
     assert printable_lines(text).count("\n") == text.count("\n")
     assert printable(printable(text, None), None) == printable(text, None), "what is printable stays as it is"
 
@@ -32,7 +32,7 @@ def test_nothing_that_is_shown_is_obeyed(text: str) -> None:
 def test_a_document_of_json_reads_back_to_the_same(value: object) -> None:
     for text in (json.dumps(value, ensure_ascii=False), json.dumps(value, ensure_ascii=False, indent=1)):
         shown = json_printable(text)
-        assert obeyed(shown) == ""
+        assert obeyed_characters(shown) == ""
         assert json.loads(shown) == json.loads(json.dumps(value))
 
 

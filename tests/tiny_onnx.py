@@ -45,7 +45,7 @@ def _int_attribute(name: str, value: int) -> bytes:
     return _bytes(1, name) + _number(3, value) + _number(20, 2)
 
 
-def first_channel(
+def first_channel_network(
     shape: Sequence[Dimension] = (1, 3, "h", "w"),
     *,
     then: str | None = None,
@@ -86,7 +86,7 @@ def first_channel(
     return _number(1, 8) + _bytes(7, graph) + _bytes(8, _bytes(1, "") + _number(2, 13))
 
 
-CARD = """
+MODEL_CARD = """
 name: tiny
 input: {name: image, size: {side: 32, multiple: 16, fit: short}, scale: 1.0}
 output: {name: depth, kind: inverse_depth}

@@ -8,35 +8,35 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from coec.adapters.tls.conversation import Listener, credentials_of
+from coec.adapters.tls.conversation import CommandListener, credentials_of
 from coec.adapters.zenoh.bus import Bus, open_session
 from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.settings import settings_of
 from coec.config import AuthorityConfig, LimitsConfig, UplinkConfig, ZenohConfig
 from coec.runtime.api.authority import Authority
-from coec.runtime.api.configuration import shown
-from coec.runtime.api.last_words import LastWords
-from coec.runtime.api.reception import Reception, Rules
+from coec.runtime.api.configuration import redacted_configuration
+from coec.runtime.api.last_words import Heartbeats
+from coec.runtime.api.reception import CommandHandler, CommandRules
 from coec.runtime.api.rig import RigAnswers
-from coec.runtime.api.routes import VehicleAnswers
-from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.api.routes import VehicleRoutes
+from coec.runtime.api.snapshots import SerializedReply
 from coec.runtime.api.uplink import Uplink
 from coec.schemas.keys import Keys
-from pair_bench import Bench
-from statuses import a_status
+from pair_bench import PairBench
+from statuses import status_reply
 
 VEHICLE = "vehicle"
 PAIR = "front"
 KEYS = Keys("coec", VEHICLE)
-LIMITS = LimitsConfig()
-END_S = 20.0
+VEHICLE_LIMITS = LimitsConfig()
+STOP_TIMEOUT_S = 20.0
 
 
 @dataclass(frozen=True)
-class Vehicle:
+class ServingVehicle:
     """What answers, and what it is made of."""
 
-    bench: Bench
+    bench: PairBench
     bus: Bus
     uplink: Uplink
 
@@ -51,39 +51,41 @@ class Vehicle:
         return self.bench.answers.status().commands
 
 
-def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> Vehicle:
+def serve(bench: PairBench, config: ZenohConfig, bus: Bus) -> ServingVehicle:
     """Declare all that a vehicle answers, as the daemon does."""
     pair, authority = bench.pair, bench.config.authority
     credentials = credentials_of(authority)
-    rules = Rules(
-        Authority(authority, Reach(settings_of(config, LIMITS)).outside),
-        None if credentials is None else Listener(credentials),
+    rules = CommandRules(
+        Authority(authority, Reach(settings_of(config, VEHICLE_LIMITS)).exposure),
+        None if credentials is None else CommandListener(credentials),
     )
-    reception = Reception(rules, {pair.name: pair.commands})
-    document = Snapshot.of_document({"schema_version": 1, "config_hash": "0", "config": shown(bench.config)})
+    command_handler = CommandHandler(rules, {pair.name: pair.commands})
+    document = SerializedReply.of_document(
+        {"schema_version": 1, "config_hash": "0", "config": redacted_configuration(bench.config)}
+    )
 
-    def status() -> Snapshot:
-        told = a_status(vehicle=VEHICLE, pairs=(pair.answers.status(),))
-        return Snapshot.of(told)
+    def status() -> SerializedReply:
+        reply = status_reply(vehicle=VEHICLE, pairs=(pair.answers.status(),))
+        return SerializedReply.of(reply)
 
     uplink = Uplink(UplinkConfig())
-    words = LastWords(KEYS, "0", UplinkConfig(), bus.publish)
-    VehicleAnswers(
+    heartbeats = Heartbeats(KEYS, "0", UplinkConfig(), bus.publish)
+    VehicleRoutes(
         KEYS,
         {pair.name: pair.answers},
-        reception,
+        command_handler,
         status,
         lambda: b"# EOF\n",
         lambda: document,
         RigAnswers(KEYS, bus.publish),
-        words,
+        heartbeats,
         uplink,
     ).declare(bus)
-    words.renew("running", "0", [pair.answers])
+    heartbeats.renew("running", "0", [pair.answers])
     for name, answer in (("extrinsic", pair.answers.extrinsic), ("health", pair.answers.health)):
         bus.publish(f"{KEYS.root}/{pair.name}/{name}", answer("msgpack"))
     bus.declare_alive(KEYS.alive(pair.name))
-    return Vehicle(bench, bus, uplink)
+    return ServingVehicle(bench, bus, uplink)
 
 
 @contextmanager
@@ -91,13 +93,13 @@ def serving(
     folder: Path,
     config: ZenohConfig,
     authority: AuthorityConfig | None = None,
-    before: Callable[[Bench], None] = lambda _: None,
-) -> Iterator[Vehicle]:
+    before: Callable[[PairBench], None] = lambda _: None,
+) -> Iterator[ServingVehicle]:
     """A vehicle in a session of its own, until the end of the block; `before` is what it did before it was asked."""
-    bench = Bench(folder, vehicle=VEHICLE, authority=authority)
+    bench = PairBench(folder, vehicle=VEHICLE, authority=authority)
     before(bench)
-    bus = Bus(open_session(config, LIMITS))
-    threads = (*bus.threads, bench.intake.thread, bench.pair.decider.thread)
+    bus = Bus(open_session(config, VEHICLE_LIMITS))
+    threads = (*bus.threads, bench.intake.thread, bench.pair.manager.thread)
     for thread in threads:
         thread.start()
     try:
@@ -105,9 +107,9 @@ def serving(
     finally:
         bus.undeclare_inputs()
         bench.intake.request_stop()
-        bench.pair.decider.request_stop()
+        bench.pair.manager.request_stop()
         for thread in threads:
             thread.request_stop()
-        assert all(thread.join(END_S) for thread in threads)
+        assert all(thread.join(STOP_TIMEOUT_S) for thread in threads)
         bus.undeclare_queryables()
-        assert bus.close(END_S)
+        assert bus.close(STOP_TIMEOUT_S)

@@ -24,28 +24,28 @@ from coec.config import (
     SearchConfig,
 )
 from coec.runtime.worker.tasks import Solver
-from drives import drawn_source
+from drives import rendered_source
 
 
-def lens(model: str, **parameters: float) -> CameraIntrinsics:
+def small_lens(model: str, **parameters: float) -> CameraIntrinsics:
     """A lens of a small picture."""
     size = {"width": 160, "height": 120, "fx": 60.0, "fy": 60.0, "cx": 79.5, "cy": 59.5}
     return CameraIntrinsics.model_validate({"model": model, **size, **parameters})
 
 
 LENSES = (
-    lens("pinhole"),
-    lens("kannala_brandt", k1=0.0, k2=0.0, k3=0.0, k4=0.0),
-    lens("mei", xi=1.5, k1=0.0, k2=0.0, p1=0.0, p2=0.0),
-    lens("eucm", alpha=0.5, beta=1.0),
-    lens("double_sphere", xi=0.0, alpha=0.5),
+    small_lens("pinhole"),
+    small_lens("kannala_brandt", k1=0.0, k2=0.0, k3=0.0, k4=0.0),
+    small_lens("mei", xi=1.5, k1=0.0, k2=0.0, p1=0.0, p2=0.0),
+    small_lens("eucm", alpha=0.5, beta=1.0),
+    small_lens("double_sphere", xi=0.0, alpha=0.5),
 )
 """A kernel is compiled for each of the models that the tests calibrate with."""
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def pairs(lenses: Sequence[CameraIntrinsics]) -> Iterator[PairConfig]:
+def pair_configs(lenses: Sequence[CameraIntrinsics]) -> Iterator[PairConfig]:
     """One of each."""
     calibration = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6))
     for camera in lenses:
@@ -59,21 +59,21 @@ def pairs(lenses: Sequence[CameraIntrinsics]) -> Iterator[PairConfig]:
         )
 
 
-def draw() -> None:
+def render() -> None:
     """The drives of many files."""
     for source in (SMALL, STREET, SHARP_STREET):
-        drawn_source(source)
+        rendered_source(source)
 
 
 def compile_for(lenses: Sequence[CameraIntrinsics]) -> None:
     """What calibrates with these."""
-    Solver(Config(pairs=tuple(pairs(lenses))), 1).warm_up()
+    Solver(Config(pairs=tuple(pair_configs(lenses))), 1).warm_up()
 
 
 def main() -> None:
     """What all lenses have in common is compiled with the first."""
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as processes:
-        for done in (processes.submit(draw), processes.submit(compile_for, LENSES[:1])):
+        for done in (processes.submit(render), processes.submit(compile_for, LENSES[:1])):
             done.result()
         for done in [processes.submit(compile_for, lenses) for lenses in (LENSES[1:3], LENSES[3:])]:
             done.result()

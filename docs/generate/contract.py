@@ -138,7 +138,7 @@ def keys_page() -> str:
         common="; and ".join(map(_argument, (commands.REASON, commands.SENSOR))),
         commands=table(
             ("command", "also takes", "what it does"),
-            [(code(name), _arguments(name), COMMANDS[name]) for name in commands.NAMES],
+            [(code(name), _arguments(name), COMMANDS[name]) for name in commands.COMMAND_NAMES],
         ),
         max_payload=payloads.MAX_PAYLOAD,
         errors=table(
@@ -195,7 +195,7 @@ def _type(body: dict[str, Any], shapes: Mapping[str, dict[str, Any]]) -> str:
 
 def _arguments(command: str) -> str:
     """Arguments of this command beyond those of all commands."""
-    return "; ".join(map(_argument, commands.OF_PAIR.get(command, ()))) or "–"
+    return "; ".join(map(_argument, commands.PAIR_ARGUMENTS.get(command, ()))) or "–"
 
 
 def _argument(one: commands.Argument) -> str:

@@ -11,9 +11,9 @@ from coec.calibration.lifecycle.states import MEANING, STATES, HealthState, mark
 from coec.calibration.monitor import change_detector, hypotheses, sensor_faults
 from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, Cause
 from coec.config import MonitorConfig
-from coec.exit_codes import MAY_BE_CURED, MEANINGS, NOT_CURED_BY_RESTART, ExitCode
+from coec.exit_codes import EXIT_CODE_MEANINGS, MAY_BE_CURED, NOT_CURED_BY_RESTART, ExitCode
 from coec.runtime.api.metrics import FAMILIES
-from coec.runtime.api.troubles import TROUBLES
+from coec.runtime.api.troubles import PROBLEMS
 from coec.runtime.reload import RELOADED
 from coec.runtime.timings import LONG_S, QUICK_S
 from generate.markdown import WRITTEN, code, prose, table
@@ -142,11 +142,11 @@ def operations_page() -> str:
         written=WRITTEN,
         codes=table(
             ("code", "meaning", "systemd starts `run` again"),
-            [(str(status.value), text, _is_restarted(status)) for status, text in MEANINGS.items()],
+            [(str(status.value), text, _is_restarted(status)) for status, text in EXIT_CODE_MEANINGS.items()],
         ),
         troubles=table(
             ("code", "meaning", "what to do"),
-            [(f"`{name}`", problem.meaning, problem.advice) for name, problem in TROUBLES.items()],
+            [(f"`{name}`", problem.meaning, problem.advice) for name, problem in PROBLEMS.items()],
         ),
         reloaded=table(("value", "holds"), [(f"`{place}`", when) for place, when in RELOADED.items()]),
         kept=table(("what", "an update", "a step back"), PRESERVED),
@@ -169,7 +169,7 @@ def figures_page() -> str:
         (
             code(name),
             f"{one.title}, {one.unit}" if one.unit else one.title,
-            prose(one.tells),
+            prose(one.measures),
             prose(one.fails),
             prose(one.advice),
         )
@@ -200,7 +200,7 @@ def health_page() -> str:
         f"between {hypotheses.LEAST_STEP:+g} and {hypotheses.MOST_STEP:+g}. One with faint edges may make a mount "
         "suspect, but confirms nothing.\n\n"
         "The threshold follows from how often a right mount may be accused. It is the logarithm of the number of\n"
-        f"tests, {change_detector.QUESTIONS} at every check, that begin within "
+        f"tests, {change_detector.TESTS_PER_CHECK} at every check, that begin within "
         "`monitor.hours_between_false_suspicions` for `suspect`, and\n"
         "within `monitor.hours_between_false_alarms` for `miscalibrated`: "
         f"{_LEVELS.suspect:.1f} and {_LEVELS.confirmed:.1f} with a check\n"

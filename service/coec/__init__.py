@@ -92,7 +92,7 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 # quick and give the same bits. A choice of the user, here or in NUMBA_THREADING_LAYER, wins.
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")
 
-_LATER = {
+_LAZY_NAMES = {
     "CalibrationConfig": "coec.config",
     "CalibrationOptions": "coec.calibration_options",
     "Description": "coec.recording",
@@ -124,8 +124,8 @@ else:  # hidden from type checkers: with this function in sight they would accep
 
         if name == "client":
             return import_module("coec.client")
-        if name in _LATER:
-            value: object = getattr(import_module(_LATER[name]), name)
+        if name in _LAZY_NAMES:
+            value: object = getattr(import_module(_LAZY_NAMES[name]), name)
         elif name in _ADDED:
             value = import_module("coec.api").added(name)
         else:

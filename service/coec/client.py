@@ -32,34 +32,34 @@ from typing import Any, Self, TypeVar
 import zenoh
 from pydantic import BaseModel
 
-from coec.adapters.tls.conversation import Speaker
+from coec.adapters.tls.conversation import CommandSender
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.changes import Change, listening
+from coec.adapters.zenoh.changes import PairUpdate, subscribed
 from coec.adapters.zenoh.client import (
     GRACE_S,
     Replies,
     Reply,
-    Way,
+    RouterAddress,
     connected_by,
     myself,
-    nobody,
+    no_reply_error,
     patience_ms,
     single_key,
     too_late,
 )
-from coec.adapters.zenoh.proven import give
+from coec.adapters.zenoh.proven import send_authenticated
 from coec.adapters.zenoh.settings import connected_of
 from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.config import Config, ZenohConfig
 from coec.errors import UsageError
 from coec.schemas.base import from_msgpack
-from coec.schemas.commands import NAMES, CommandName
+from coec.schemas.commands import COMMAND_NAMES, CommandName
 from coec.schemas.keys import Keys
 from coec.schemas.replies import Acknowledgement, ExtrinsicReply, HealthReply, HistoryReply, StatusReply, WindowsReply
 
-__all__ = ["Change", "Vehicle"]
+__all__ = ["PairUpdate", "Vehicle"]
 
-WAITING = 1024
+MAX_QUEUED_CHANGES = 1024
 """Changes that may wait until the program takes them, some 10 MB. Beyond that the oldest are dropped and counted."""
 
 M = TypeVar("M", bound=BaseModel)
@@ -105,11 +105,11 @@ class Vehicle:
         read = None if file is None else read_settings(file)
         given = (connect,) if isinstance(connect, str) else tuple(connect or ())
         endpoints = given or (() if read is None else connected_of(read)) or ZenohConfig().router
-        self._way = Way(tuple(endpoints), file)
+        self._way = RouterAddress(tuple(endpoints), file)
         self._credentials = None if read is None else credentials_in(read)
         self._connection: AbstractContextManager[zenoh.Session] | None = None
         self._open: zenoh.Session | None = None
-        self._listeners: set[_Waiting] = set()
+        self._listeners: set[_ChangeQueue] = set()
 
     def __repr__(self) -> str:
         return f"<coec.client.Vehicle {self._keys.root}>"
@@ -128,7 +128,7 @@ class Vehicle:
         try:
             self._open = await asyncio.shield(opening)
         except asyncio.CancelledError:
-            opening.add_done_callback(lambda done: _abandon(done, connection))
+            opening.add_done_callback(lambda done: _close_once_open(done, connection))
             raise
         self._connection = connection
         return self
@@ -142,7 +142,7 @@ class Vehicle:
         """Disconnects: every loop over `changes` ends."""
         connection, self._connection, self._open = self._connection, None, None
         for waiting in tuple(self._listeners):
-            waiting.end()
+            waiting.close()
         if connection is not None:
             closing = asyncio.get_running_loop().run_in_executor(None, connection.__exit__, None, None, None)
             await asyncio.shield(closing)
@@ -217,25 +217,25 @@ class Vehicle:
             NotProvenError: with a certificate: the one who answered is not the service.
             NotFoundError, RemoteError, DecodeError: as `extrinsic`.
         """
-        if name not in NAMES:
-            raise UsageError(f"no command {name!r}: known are {', '.join(NAMES)}")
+        if name not in COMMAND_NAMES:
+            raise UsageError(f"no command {name!r}: known are {', '.join(COMMAND_NAMES)}")
         waits_s = self._timeout_s if timeout_s is None else _seconds(timeout_s)
         key = self._keys.command(await self._pair(pair), name)
         selector = f"{single_key(key)}?timeout_ms={patience_ms(waits_s)};format=msgpack"
         try:
-            said = None if payload is None else json.dumps(dict(payload), allow_nan=False).encode()
+            encoded = None if payload is None else json.dumps(dict(payload), allow_nan=False).encode()
         except (TypeError, ValueError) as error:
             raise UsageError(f"payload of {name}: {error}") from error
         if self._credentials is None:
-            return from_msgpack(Acknowledgement, (await self._ask(selector, waits_s, said, myself())).payload)
-        speaker = Speaker(self._credentials, self._keys.vehicle)
+            return from_msgpack(Acknowledgement, (await self._query(selector, waits_s, encoded, myself())).payload)
+        speaker = CommandSender(self._credentials, self._keys.vehicle)
         session = self._session
         reply = await asyncio.get_running_loop().run_in_executor(
-            None, lambda: give(session, selector, said, waits_s, speaker, MSGPACK)
+            None, lambda: send_authenticated(session, selector, encoded, waits_s, speaker, MSGPACK)
         )
         return from_msgpack(Acknowledgement, reply.payload)
 
-    async def changes(self, pair: str | None = None) -> AsyncGenerator[Change]:
+    async def changes(self, pair: str | None = None) -> AsyncGenerator[PairUpdate]:
         """Yields the present state (`extrinsic`, `health`, `alive` of each pair), then every change as it comes, until
         the loop over it ends or the vehicle is disconnected. From an absent vehicle nothing comes until it appears. For
         one that goes away, `alive` False comes, and its changes come again when it is back.
@@ -250,15 +250,17 @@ class Vehicle:
         """
         if pair is not None:
             single_key(pair)
-        waiting = _Waiting(asyncio.get_running_loop())
-        of = listening(self._session, self._keys, pair or "*", self._timeout_s, waiting.take, waiting.refuse)
-        self._listeners.add(waiting)
+        queue = _ChangeQueue(asyncio.get_running_loop())
+        subscription = subscribed(
+            self._session, self._keys, pair or "*", self._timeout_s, queue.push, queue.count_invalid
+        )
+        self._listeners.add(queue)
         try:
-            with of:
-                while (change := await waiting.next()) is not None:
+            with subscription:
+                while (change := await queue.next()) is not None:
                     yield change
         finally:
-            self._listeners.discard(waiting)
+            self._listeners.discard(queue)
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
@@ -279,49 +281,49 @@ class Vehicle:
     async def _reply(self, model: type[M], selector: str, timeout_s: float | None) -> M:
         single_key(selector.partition("?")[0])
         waits_s = self._timeout_s if timeout_s is None else _seconds(timeout_s)
-        return from_msgpack(model, (await self._ask(selector, waits_s)).payload)
+        return from_msgpack(model, (await self._query(selector, waits_s)).payload)
 
-    async def _ask(
+    async def _query(
         self, selector: str, timeout_s: float, payload: bytes | None = None, attachment: bytes | None = None
     ) -> Reply:
         loop = asyncio.get_running_loop()
-        ended = asyncio.Event()
+        finished = asyncio.Event()
 
-        def end() -> None:
+        def on_finished() -> None:
             with suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(ended.set)
+                loop.call_soon_threadsafe(finished.set)
 
-        replies = Replies(selector, timeout_s, end)
+        replies = Replies(selector, timeout_s, on_finished)
         try:
             replies.query(self._session, payload, attachment)
             async with asyncio.timeout(timeout_s + GRACE_S):
-                await ended.wait()
+                await finished.wait()
         except TimeoutError:
             raise too_late(selector, timeout_s) from None
         finally:
             replies.close()
         answers = replies.result()
         if not answers:
-            raise nobody(selector)
+            raise no_reply_error(selector)
         return answers[0]
 
 
-class _Waiting:
+class _ChangeQueue:
     """Queue of changes from Zenoh's threads to one event loop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._lock = threading.Lock()
-        self._changes: deque[Change] = deque()
+        self._changes: deque[PairUpdate] = deque()
         self._lost = 0
         self._wakes = False
         self._woken = asyncio.Event()
-        self._ended = False
+        self._closed = False
 
-    def take(self, change: Change) -> None:
+    def push(self, change: PairUpdate) -> None:
         """Queues a change; called on any thread."""
         with self._lock:
-            if len(self._changes) >= WAITING:
+            if len(self._changes) >= MAX_QUEUED_CHANGES:
                 self._changes.popleft()
                 self._lost += 1
             self._changes.append(change)
@@ -330,17 +332,17 @@ class _Waiting:
             with suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._wake)
 
-    def refuse(self) -> None:
+    def count_invalid(self) -> None:
         """Counts a message that was no valid change; called on any thread."""
         with self._lock:
             self._lost += 1
 
-    def end(self) -> None:
+    def close(self) -> None:
         """No more changes come; called on the loop."""
-        self._ended = True
+        self._closed = True
         self._woken.set()
 
-    async def next(self) -> Change | None:
+    async def next(self) -> PairUpdate | None:
         """The next change; None: no more come."""
         while True:
             self._woken.clear()
@@ -348,7 +350,7 @@ class _Waiting:
                 if self._changes:
                     change, lost, self._lost = self._changes.popleft(), self._lost, 0
                     return replace(change, lost=lost)
-            if self._ended:
+            if self._closed:
                 return None
             await self._woken.wait()
 
@@ -358,7 +360,7 @@ class _Waiting:
         self._woken.set()
 
 
-def _abandon(opening: asyncio.Future[zenoh.Session], connection: AbstractContextManager[zenoh.Session]) -> None:
+def _close_once_open(opening: asyncio.Future[zenoh.Session], connection: AbstractContextManager[zenoh.Session]) -> None:
     """Closes a connection that came up after its caller had been cancelled."""
     if not opening.cancelled() and opening.exception() is None:
         threading.Thread(target=connection.__exit__, args=(None, None, None), daemon=True).start()

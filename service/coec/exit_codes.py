@@ -21,7 +21,7 @@ class ExitCode(IntEnum):
     """As a shell reports a process ended by SIGPIPE."""
 
 
-MEANINGS: Mapping[ExitCode, str] = {
+EXIT_CODE_MEANINGS: Mapping[ExitCode, str] = {
     ExitCode.SUCCESS: "success; of `calibrate`: accepted; of `doctor`: nothing failed; of `run`: stopped by a signal",
     ExitCode.FAILED: "the work failed, or the verdict is negative; standard error says why. `run` and `router` never "
     "end with it",

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.exports import FORMATS
-from coec.adapters.exports.extrinsic import Extrinsic
-from coec.adapters.exports.told import Frames, of_result
+from coec.adapters.exports.extrinsic import ExportedExtrinsic
+from coec.adapters.exports.told import ExportFrames, extrinsic_of_result
 from coec.adapters.files import output
 from coec.adapters.files.conversions import matrix_of, result_of
 from coec.adapters.files.rig import intrinsics_config
@@ -39,11 +39,11 @@ from coec.reports.overlay import titled
 from coec.reports.page.words import count
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Verdict
-from coec.sources import Recording as Source
+from coec.sources import RecordingSource as Source
 from coec.sources import windows
 from coec.sources.reading import read_bytes
-from coec.sources.recording import KnowsTruth
-from coec.sources.windows import Loaded, NoPairsError
+from coec.sources.recording import HasGroundTruth
+from coec.sources.windows import LoadedWindow, NoPairsError
 from coec.untrusted import Untrusted, printable
 
 NS_PER_S = 1e9
@@ -105,7 +105,7 @@ class Solution:
     offset: TimeOffset | None
 
 
-def solve(loaded: Loaded, options: CalibrationOptions, progress: ports.Progress) -> Solution:
+def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: ports.Progress) -> Solution:
     """Calibrates a loaded window.
 
     Args:
@@ -121,7 +121,7 @@ def solve(loaded: Loaded, options: CalibrationOptions, progress: ports.Progress)
     configuration = configuration_of(options, options.get("configuration") or loaded.configuration)
     window, perturb, model = loaded.window, options.get("perturb"), options.get("camera_model")
     if perturb is not None:
-        window = windows.started_at(window, perturbation_of(perturb))
+        window = windows.with_perturbed_start(window, perturbation_of(perturb))
     window, fit = (window, None) if model is None else fit_camera(window, model)
     depth = open_depth(configuration.depth, LimitsConfig())
     progress.step("prepare", 1, 1)
@@ -142,8 +142,8 @@ def perturbation_of(perturb: str | Sequence[float]) -> NDArray[np.float64]:
         UsageError: these are not three or six finite numbers, or too large.
     """
     if isinstance(perturb, str):
-        return windows.vector_of("--perturb", perturb)
-    return windows.xi_of(f"perturb={perturb!r}", perturb)
+        return windows.parse_perturbation("--perturb", perturb)
+    return windows.perturbation_vector(f"perturb={perturb!r}", perturb)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,21 +158,21 @@ class CallbackProgress:
             self.callback(stage, done, total)
 
 
-def require_accepted(extrinsic: Extrinsic, name: str, override: str, *, force: bool) -> None:
+def require_accepted(extrinsic: ExportedExtrinsic, name: str, override: str, *, force: bool) -> None:
     """Returns if the extrinsic may be written. `name` (of the calibration) and `override` (the option that forces
     the export) appear in the error message.
 
     Raises:
         NotAcceptedError: its verdict is negative, and `force` is False.
     """
-    if extrinsic.origin.objections and not force:
+    if extrinsic.origin.rejection_reasons and not force:
         raise NotAcceptedError(
-            f"{name}: not accepted: {' '.join(extrinsic.origin.objections)} "
+            f"{name}: not accepted: {' '.join(extrinsic.origin.rejection_reasons)} "
             f"`{override}` exports it all the same, and says so in the file."
         )
 
 
-def export_text(extrinsic: Extrinsic, form: str, path: Path | None) -> str:
+def export_text(extrinsic: ExportedExtrinsic, form: str, path: Path | None) -> str:
     """The new text of the file `path` (None: there is none). Its present content stays where the format has room for
     it.
 
@@ -333,10 +333,10 @@ class Result:
         if pose is not None and (pose.shape != (4, 4) or not np.isfinite(pose).all()):
             raise UsageError(f"T_parent_lidar: (4, 4) finite numbers are expected, not {pose.shape}")
         camera = intrinsics_config(self._solution.window.rig.camera)
-        extrinsic = of_result(self.document, camera, Frames(parent, child, pose))
+        extrinsic = extrinsic_of_result(self.document, camera, ExportFrames(parent, child, pose))
         require_accepted(extrinsic, self.document.window_id, "force=True", force=force)
         file = Path(fspath(path))
-        output.replace(file, export_text(extrinsic, format, file).encode())
+        output.replace_output(file, export_text(extrinsic, format, file).encode())
         return file
 
     def overlay(self, at: Pose = "result") -> NDArray[np.uint8]:
@@ -374,7 +374,7 @@ class Window:
     """Pairs of a camera frame and a LiDAR sweep from one slice of a drive: the input of one calibration. Made by
     `Recording.window` and `Recording.windows`."""
 
-    def __init__(self, source: str, frames: int | None, loaded: Loaded) -> None:
+    def __init__(self, source: str, frames: int | None, loaded: LoadedWindow) -> None:
         self._source = source
         self._frames = frames
         self._loaded = loaded
@@ -413,7 +413,7 @@ class Window:
         return self._frames
 
     @property
-    def loaded(self) -> Loaded:
+    def loaded(self) -> LoadedWindow:
         """The window as the package itself passes it on. Not part of the stable interface."""
         return self._loaded
 
@@ -541,7 +541,7 @@ class Recording:
 
     def truth(self, stamp_ns: int) -> NDArray[np.float64] | None:
         """(4, 4) true T_camera_lidar at a time, if the drive was simulated; else None."""
-        return self._opened.truth(stamp_ns) if isinstance(self._opened, KnowsTruth) else None
+        return self._opened.truth(stamp_ns) if isinstance(self._opened, HasGroundTruth) else None
 
     def window(
         self,
@@ -575,9 +575,9 @@ class Recording:
 
         usual = WindowConfig().pairs
         if self.configuration is None:
-            loaded = windows.chosen_from(self._opened, frames or usual, report, (begin_s, end_s))
+            loaded = windows.window_of_recording(self._opened, frames or usual, report, (begin_s, end_s))
         else:  # a recorded window keeps its pairs
-            loaded = windows.load(self._source, frames, usual, report, (begin_s, end_s))
+            loaded = windows.load_window(self._source, frames, usual, report, (begin_s, end_s))
         return Window(self._source, frames, loaded)
 
     def windows(self, *, seconds: float = 60.0, frames: int | None = None) -> Iterator[Window]:

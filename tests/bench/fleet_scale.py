@@ -24,14 +24,14 @@ import numpy as np
 import psutil
 import zenoh
 
-from coec.adapters.zenoh.words import Words
-from coec.fleet.roster import Roster
+from coec.adapters.zenoh.words import HeartbeatReceiver
+from coec.fleet.roster import FleetState
 from coec.schemas.base import to_msgpack
 from coec.schemas.keys import Keys
-from coec.schemas.last_word import read
-from last_words import a_word
+from coec.schemas.last_word import decode_heartbeat
+from last_words import heartbeat
 from ports import free_port
-from storages import Storage
+from storages import MemoryStorage
 
 ALL = Keys("coec", "*")
 SPAWN = multiprocessing.get_context("spawn")
@@ -66,7 +66,7 @@ def main(vehicles: int = 10_000, queryables: int = 0) -> dict[str, Any]:
                     told[name] = _phase(seconds, vehicles, words, roster, orders, (router, keeper, fleet))
                 with _watching(endpoint) as (late, empty):
                     begun_s = time.monotonic()
-                    late.told.wait(PATIENCE_S)
+                    late.initial_query_done.wait(PATIENCE_S)
                     told["late_watcher_s"] = time.monotonic() - begun_s
                     _hear(late, empty, [])
                     told["late_watcher_knows"] = empty.now(time.monotonic()).known
@@ -78,7 +78,7 @@ def main(vehicles: int = 10_000, queryables: int = 0) -> dict[str, Any]:
                 told["keeper_rss_mb"] = _rss_mb(keeper)
                 told["router_rss_mb_end"] = _rss_mb(router)
                 orders.put(None)
-    told["word_bytes"] = len(to_msgpack(a_word("v00000")))
+    told["word_bytes"] = len(to_msgpack(heartbeat("v00000")))
     return told
 
 
@@ -125,7 +125,7 @@ def _client(endpoint: str) -> zenoh.Session:
 
 
 def _keeper(ready: Event, stop: Event, endpoint: str) -> None:
-    with _client(endpoint) as session, Storage(session, ALL.last("*")):
+    with _client(endpoint) as session, MemoryStorage(session, ALL.last("*")):
         ready.set()
         stop.wait()
 
@@ -134,7 +134,7 @@ def _fleet(ready: Event, stop: Event, endpoint: str, vehicles: int, queryables: 
     """Says each word once in as many seconds as it is told; None ends it."""
     ready.set()
     opened = [_client(endpoint) for _ in range(SESSIONS)]
-    word = msgpack.unpackb(to_msgpack(a_word()))
+    word = msgpack.unpackb(to_msgpack(heartbeat()))
     every: list[tuple[zenoh.Session, Keys]] = []
     for number in range(vehicles):
         session, keys = opened[number % SESSIONS], Keys("coec", f"v{number:05}")
@@ -179,15 +179,20 @@ def _packed(keys: Keys, word: dict[str, Any]) -> bytes:
 
 
 @contextmanager
-def _watching(endpoint: str) -> Iterator[tuple[Words, Roster]]:
+def _watching(endpoint: str) -> Iterator[tuple[HeartbeatReceiver, FleetState]]:
     with _client(endpoint) as session, _client(endpoint) as of_tokens:
-        words = Words(session, of_tokens, ALL, PATIENCE_S)
-        with words.listening():
-            yield words, Roster()
+        words = HeartbeatReceiver(session, of_tokens, ALL, PATIENCE_S)
+        with words.subscribed():
+            yield words, FleetState()
 
 
 def _phase(
-    seconds: float, vehicles: int, words: Words, roster: Roster, orders: Any, others: tuple[psutil.Process, ...]
+    seconds: float,
+    vehicles: int,
+    words: HeartbeatReceiver,
+    roster: FleetState,
+    orders: Any,
+    others: tuple[psutil.Process, ...],
 ) -> dict[str, Any]:
     """Every vehicle says its word once, in so many seconds."""
     latencies_s: list[float] = []
@@ -217,18 +222,18 @@ def _phase(
     }
 
 
-def _hear(words: Words, roster: Roster, latencies_s: list[float]) -> int:
+def _hear(words: HeartbeatReceiver, roster: FleetState, latencies_s: list[float]) -> int:
     """What has come; how many words were said as they came."""
     count = 0
-    for came in words.take():
+    for came in words.pending():
         if came.kind == "said":
             count += 1
-            roster.hear(came.key, came.payload, came.at_s)
-            latencies_s.append((time.time_ns() - read(came.key, came.payload).said_ns) * 1e-9)
+            roster.on_heartbeat(came.key, came.payload, came.at_s)
+            latencies_s.append((time.time_ns() - decode_heartbeat(came.key, came.payload).said_ns) * 1e-9)
         elif came.kind == "kept":
-            roster.recall(came.key, came.payload, came.at_s, time.time_ns())
+            roster.restore(came.key, came.payload, came.at_s, time.time_ns())
     for cause, number in words.refused().items():
-        roster.refuse(cause, number)
+        roster.count_refused(cause, number)
     return count
 
 

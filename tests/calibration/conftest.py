@@ -9,19 +9,19 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.objective.edges import EdgeWitness, build_edges
+from coec.calibration.objective.edges import EdgeCue, build_edges
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import Window
 from coec.config import DepthConfig, LimitsConfig, PairingConfig
-from coec.sources import Recording
+from coec.sources import RecordingSource
 from coec.sources.windows import RECORDED_GAP_S
-from drives import drawn_source
+from drives import rendered_source
 
 STREET = "sim:seed=1&seconds=40&camera_hz=0.2&lidar_hz=0.2&camera=fisheye320&lidar=32&depth=yes"
 SHARP_STREET = "sim:seed=1&seconds=70&camera_hz=0.142857&lidar_hz=0.142857&camera=fisheye700&lidar=32&depth=yes"
 
 
-def window_of(recording: Recording, cameras: Sequence[int] | None = None) -> Window:
+def window_of(recording: RecordingSource, cameras: Sequence[int] | None = None) -> Window:
     """The window of all frames of a recording, or of the chosen camera frames; it starts at the recording's own
     calibration."""
     pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
@@ -33,7 +33,7 @@ def window_of(recording: Recording, cameras: Sequence[int] | None = None) -> Win
 @pytest.fixture(scope="session")
 def street() -> Window:
     """Eight pairs, 40 m apart; it starts at the truth."""
-    return window_of(drawn_source(STREET))
+    return window_of(rendered_source(STREET))
 
 
 @pytest.fixture(scope="session")
@@ -46,16 +46,16 @@ def stereo() -> DepthModel:
 def sharp_street() -> Window:
     """Ten pairs of the same street, 60 m apart, at twice the resolution: 0.27° per pixel. With coarser ones its edges
     hardly tell pitch from height."""
-    return window_of(drawn_source(SHARP_STREET))
+    return window_of(rendered_source(SHARP_STREET))
 
 
 @pytest.fixture(scope="session")
-def sharp_edges(sharp_street: Window) -> EdgeWitness:
+def sharp_edges(sharp_street: Window) -> EdgeCue:
     """The edge witness of the sharp street."""
     rig, pairs, images = sharp_street.rig, sharp_street.pairs, GreyImages(LimitsConfig())
     return build_edges(
         pairs,
-        lambda frame, chosen: compensate(pairs[frame], rig, enabled=True, chosen=chosen),
+        lambda frame, chosen: compensate(pairs[frame], rig, enabled=True, selection=chosen),
         [images.grey(pair.camera) for pair in pairs],
         rig,
     )

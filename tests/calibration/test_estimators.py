@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coec.adapters.images.codec import GreyImages
-from coec.calibration.estimators import Sight, depth_features, runner_up
+from coec.calibration.estimators import WindowData, depth_features, runner_up
 from coec.calibration.ports import Silence
 from coec.calibration.types import CameraFrame, DepthMap, Metric, Window
 from coec.config import LimitsConfig
@@ -47,7 +47,7 @@ def sixteen_beams(window: Window) -> Window:
 
 def test_all_beams_carry_the_depth_witness_in_equal_shares(street: Window) -> None:
     window = sixteen_beams(street)
-    sight = Sight(window, False, Flat(), GreyImages(LimitsConfig()), Silence())
+    sight = WindowData(window, False, Flat(), GreyImages(LimitsConfig()), Silence())
     at_most = len(window.pairs) * BEAMS * FIRINGS // 2
     frames = depth_features(sight, window.T_camera_lidar_start, at_most)
     assert sum(len(frame.xyz_m) for frame in frames) == at_most

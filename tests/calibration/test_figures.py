@@ -45,7 +45,7 @@ def test_every_figure_is_explained_and_no_other() -> None:
 
 def test_what_is_said_are_sentences() -> None:
     for figure in FIGURES.values():
-        assert figure.tells.endswith(".")
+        assert figure.measures.endswith(".")
         assert figure.advice.endswith(".")
         assert figure.fails
         assert not figure.fails.endswith(".")

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from coec.calibration.lifecycle import (
+    CalibrationStatus,
     CommandRefusedError,
+    ExtrinsicHold,
     HealthState,
-    Hold,
+    PairRules,
     PairState,
     Provenance,
-    Rules,
-    Status,
     after_commissioning,
     after_estimate,
     after_failure,
@@ -30,9 +30,9 @@ from coec.calibration.lifecycle import (
     restored,
     rolled_back,
     time_stepped_back,
-    window_wanted_since,
+    urgent_window_since,
 )
-from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation
+from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState, Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import (
     Decision,
@@ -56,8 +56,8 @@ CRASH = Reason("worker_failed", "The worker crashed twice.")
 OVERLAP = Reason("overlap", "too little")
 KNOCK = Reason("moved_within_window", "the camera moved")
 
-RULES = Rules(PolicyConfig(), TrackerConfig(), MonitorConfig())
-NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())
+RULES = PairRules(PolicyConfig(), TrackerConfig(), MonitorConfig())
+NEVER = PairRules(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())
 
 RIG = Rig(
     "front",
@@ -100,7 +100,7 @@ def estimate(turned_deg: float, stamp_s: int = 100, decision: Decision = Decisio
     )
 
 
-def solved(state: PairState, value: Estimate, rules: Rules = RULES) -> PairState:
+def solved(state: PairState, value: Estimate, rules: PairRules = RULES) -> PairState:
     return after_estimate(state, value, value.data_stamp_ns - 50 * S, rules)
 
 
@@ -148,7 +148,7 @@ def test_before_anything_the_nominal_extrinsic_is_served_and_health_is_unknown()
     state = initial_state(RIG)
     assert (state.provenance, state.status, state.health) == (
         Provenance.NOMINAL,
-        Status.NOT_ACCEPTED,
+        CalibrationStatus.NOT_ACCEPTED,
         HealthState.UNKNOWN,
     )
     assert [reason.code for reason in state.reasons] == ["not_evaluated"]
@@ -159,7 +159,7 @@ def test_the_first_accepted_estimate_is_served_to_the_last_bit() -> None:
     np.testing.assert_array_equal(HEALTHY.T_camera_lidar, pose_of(estimate(0.5)))
     assert (HEALTHY.provenance, HEALTHY.status, HEALTHY.health) == (
         Provenance.ESTIMATED,
-        Status.ACCEPTED,
+        CalibrationStatus.ACCEPTED,
         HealthState.HEALTHY,
     )
     assert HEALTHY.valid_from_ns == 100 * S
@@ -171,7 +171,7 @@ def test_the_first_accepted_estimate_is_served_to_the_last_bit() -> None:
 def test_a_failed_estimate_is_never_served(before: PairState) -> None:
     state = solved(before, estimate(3.0, 300, Decision.FAILED))
     np.testing.assert_array_equal(state.T_camera_lidar, before.T_camera_lidar)
-    assert (state.provenance, state.status) == (before.provenance, Status.FAILED)
+    assert (state.provenance, state.status) == (before.provenance, CalibrationStatus.FAILED)
     assert state.pending is None
 
 
@@ -218,7 +218,7 @@ def test_a_window_that_saw_a_knock_speaks_against_what_is_served_and_wants_the_n
     assert state.health is HealthState.SUSPECT
     assert state.reasons == (KNOCK,)
     assert np.array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
-    assert window_wanted_since(state) == (300 - 18) * S
+    assert urgent_window_since(state) == (300 - 18) * S
 
 
 def test_a_step_within_a_window_counts_unless_a_later_check_acquits_or_the_data_are_at_fault() -> None:
@@ -235,7 +235,7 @@ def test_a_step_within_a_window_counts_unless_a_later_check_acquits_or_the_data_
 def test_a_window_at_whose_end_the_camera_is_where_it_is_served_speaks_against_nothing() -> None:
     state = solved(HEALTHY, moved_within(3.0, 0.5))
     assert state.health is HealthState.HEALTHY
-    assert window_wanted_since(state) is None
+    assert urgent_window_since(state) is None
 
 
 def test_a_window_that_cannot_tell_for_another_reason_is_no_witness_of_a_knock() -> None:
@@ -243,23 +243,23 @@ def test_a_window_that_cannot_tell_for_another_reason_is_no_witness_of_a_knock()
     doubtful = replace(knocked, verdict=replace(knocked.verdict, reasons=(KNOCK, OVERLAP)))
     state = solved(HEALTHY, doubtful)
     assert state.health is HealthState.HEALTHY
-    assert window_wanted_since(state) is None
+    assert urgent_window_since(state) is None
 
 
 def test_a_window_is_wanted_no_longer_once_one_was_accepted_or_the_monitor_is_clear() -> None:
     knocked = solved(OBJECTED, moved_within(0.5, 3.0))
-    assert window_wanted_since(solved(knocked, estimate(0.5, 400))) is None
-    assert window_wanted_since(watched(knocked, *clear_from(310, 3))) is None
+    assert urgent_window_since(solved(knocked, estimate(0.5, 400))) is None
+    assert urgent_window_since(watched(knocked, *clear_from(310, 3))) is None
 
 
 def test_the_monitor_says_since_when_a_window_is_wanted() -> None:
     state = watched(HEALTHY, *clear_from(200, 2), *flagged_from(300, 6))
     assert state.flagged_since_ns is not None
-    assert window_wanted_since(state) == state.flagged_since_ns
+    assert urgent_window_since(state) == state.flagged_since_ns
 
 
 def test_one_poor_stretch_after_another_is_one() -> None:
-    poor = MonitorState(outcome=Finding.CLEAR, blind={"open_field": 3.0})
+    poor = MonitorState(outcome=MonitorOutcome.CLEAR, blind={"open_field": 3.0})
     state = watched(replace(HEALTHY, monitor=poor), *clear_from(300, 1))
     assert (state.health, state.poor_since_ns) == (HealthState.DEGRADED, 300 * S)
     early = watched(state, *clear_from(310, 4))
@@ -281,7 +281,7 @@ def test_a_refused_window_in_which_another_pose_stands_out_is_a_suspicion() -> N
 def test_a_window_that_gave_no_estimate_says_nothing_of_the_mount() -> None:
     state = after_failure(HEALTHY, CRASH)
     np.testing.assert_array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
-    assert (state.health, state.status, state.failures) == (HealthState.HEALTHY, Status.FAILED, (CRASH,))
+    assert (state.health, state.status, state.failures) == (HealthState.HEALTHY, CalibrationStatus.FAILED, (CRASH,))
     assert solved(state, estimate(0.5, 300)).health is HealthState.HEALTHY
 
 
@@ -335,7 +335,7 @@ def test_a_moved_mount_becomes_suspect_then_red_and_the_next_window_corrects_it(
     fresh = after_estimate(mixed, estimate(1.5, 260), 220 * S, RULES)
     assert fresh.health is HealthState.HEALTHY
     np.testing.assert_array_equal(fresh.T_camera_lidar, pose_of(estimate(1.5)))
-    assert fresh.monitor.outcome is Finding.UNKNOWN
+    assert fresh.monitor.outcome is MonitorOutcome.UNKNOWN
     assert fresh.flagged_since_ns is None
 
 
@@ -439,7 +439,7 @@ def test_a_step_beyond_the_limits_waits_for_a_person() -> None:
 
 
 def test_the_steps_of_a_day_add_up() -> None:
-    rules = Rules(PolicyConfig(max_step_deg=2.0, max_per_day_deg=3.0), TrackerConfig(), MonitorConfig())
+    rules = PairRules(PolicyConfig(max_step_deg=2.0, max_per_day_deg=3.0), TrackerConfig(), MonitorConfig())
     state = solved(initial_state(RIG), estimate(1.9, 100), rules)
     state = reduce(lambda s, e: solved(s, e, rules), [estimate(0.2, 300), estimate(0.2, 500)], state)
     assert [reason.code for reason in state.reasons] == ["candidate_waits", "day_exhausted"]
@@ -453,7 +453,7 @@ def test_the_steps_of_a_day_add_up() -> None:
 
 
 def test_hold_freezes_everything_but_the_estimates() -> None:
-    frozen = held(HEALTHY, Hold())
+    frozen = held(HEALTHY, ExtrinsicHold())
     state = solved(frozen, estimate(0.55, 300))
     np.testing.assert_array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
     assert state.health is HealthState.HEALTHY, "it agrees with what is served"
@@ -555,7 +555,7 @@ def test_what_the_data_decide_does_not_hang_on_how_long_the_machine_took(seed: i
     for stamp_s in range(300, 1200, 20):
         happens = anything(rng, stamp_s)
         prompt, busy = happens(prompt), happens(busy)
-        assert (busy.seen, window_wanted_since(busy)) == (prompt.seen, window_wanted_since(prompt))
+        assert (busy.seen, urgent_window_since(busy)) == (prompt.seen, urgent_window_since(prompt))
         assert np.array_equal(busy.T_camera_lidar, prompt.T_camera_lidar)
         for name in ("monitor", "flagged_since_ns", "poor_since_ns", "proven", "status"):
             assert getattr(busy, name) == getattr(prompt, name)

@@ -14,12 +14,12 @@ import pytest
 
 from calibration.test_lifecycle import RIG, RULES, check, estimate, moved_within
 from coec.calibration import lifecycle
-from coec.calibration.lifecycle import HealthState, Hold, PairState
+from coec.calibration.lifecycle import ExtrinsicHold, HealthState, PairState
 from coec.calibration.monitor.change_detector import ACQUITTAL_PERIODS, Observation, holds_at_rest
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import Decision, Estimate
-from coec.runtime.decisions.progress import Progress
-from coec.runtime.ingest.chooser import Chosen
+from coec.runtime.decisions.progress import CheckProgress
+from coec.runtime.ingest.chooser import SelectionStatistics
 from coec.runtime.ingest.decoder import CAMERA, LIDAR, StreamCounts
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 
@@ -50,13 +50,13 @@ class World:
 
     def __post_init__(self) -> None:
         self.steady_s = self.completed_s = 0.0
-        self.progress = Progress(PERIOD_S, 0.0, self.report)
+        self.progress = CheckProgress(PERIOD_S, 0.0, self.report)
 
     @property
     def report(self) -> StreamStatistics:
         many = StreamCounts(10 * self.now_s, 10 * self.now_s)
-        chosen = Chosen(checks=self.now_s, last_ns=self.now_s * S)
-        return StreamStatistics(streams={CAMERA: many, LIDAR: many}, pairs=self.now_s, chosen=chosen, pace=1.0)
+        chosen = SelectionStatistics(checks=self.now_s, last_ns=self.now_s * S)
+        return StreamStatistics(streams={CAMERA: many, LIDAR: many}, pairs=self.now_s, selection=chosen, pace=1.0)
 
     def step(self, what: str, after: PairState, completed_s: int | None = None) -> None:
         """Takes a step as the service does: progress, and then a look at the clocks. `completed_s`: sensor time of the
@@ -136,7 +136,7 @@ class World:
                 state, estimate(2.0).optimum.T_camera_lidar, estimate(2.0), RULES
             ),
             "reset": lambda: lifecycle.reset(state, RIG),
-            "hold": lambda: lifecycle.held(state, Hold()),
+            "hold": lambda: lifecycle.held(state, ExtrinsicHold()),
             "release": lambda: lifecycle.released(state),
             "commission": lambda: lifecycle.after_commissioning(state, state.T_camera_lidar),
         }
@@ -149,7 +149,7 @@ class World:
         self.step(name, after)
 
     def restarted(self) -> None:
-        self.progress = Progress(PERIOD_S, self.steady_s, self.report)
+        self.progress = CheckProgress(PERIOD_S, self.steady_s, self.report)
         self.acquitted_s, self.at_rest = None, False
         self.step("restart", lifecycle.restored(self.state))
 

@@ -5,7 +5,7 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.calibration.lifecycle.policy import NS_PER_DAY, Change, agrees, objection, remembered
+from coec.calibration.lifecycle.policy import NS_PER_DAY, AppliedChange, agrees, objection, remembered
 from coec.config import PolicyConfig
 
 LIMITS = PolicyConfig(max_step_deg=2.0, max_step_m=0.1, max_per_day_deg=5.0, max_per_day_m=0.2)
@@ -17,8 +17,8 @@ def step(axis: int, value: float) -> np.ndarray[tuple[int], np.dtype[np.float64]
     return made
 
 
-def past(axis: int, *values: float, stamp_ns: int = 0) -> list[Change]:
-    return [Change(stamp_ns, tuple(abs(step(axis, value)).tolist())) for value in values]
+def past(axis: int, *values: float, stamp_ns: int = 0) -> list[AppliedChange]:
+    return [AppliedChange(stamp_ns, tuple(abs(step(axis, value)).tolist())) for value in values]
 
 
 @pytest.mark.parametrize("axis", range(6))

@@ -2,32 +2,32 @@
 
 import pytest
 
-from coec.calibration.lifecycle import MEANING, TRANSITIONS, Event, HealthState, markdown
+from coec.calibration.lifecycle import MEANING, TRANSITIONS, HealthEvent, HealthState, markdown
 from coec.calibration.lifecycle.states import STATES
 from conftest import REPOSITORY
 from generate.service import health_page
 
 U, H, S, M, D, A = HealthState
 
-EDGES: dict[Event, tuple[HealthState, ...]] = {
+EDGES: dict[HealthEvent, tuple[HealthState, ...]] = {
     # from:                   unknown, healthy, suspect, miscalibrated, degraded, stale
-    Event.CONFIRMED_BY_WINDOW: (H, H, H, H, H, H),
-    Event.CONFIRMED_EARLIER: (U, U, U, U, U, U),
-    Event.CONTRADICTED: (M, M, M, M, M, M),
-    Event.STEP_SUSPECTED: (S, S, S, M, S, S),
-    Event.REFUSED_ELSEWHERE: (S, S, S, M, S, S),
-    Event.CLEAR: (H, H, H, S, H, H),
-    Event.NO_OBJECTION: (U, H, S, S, U, U),
-    Event.SUSPECTED: (S, S, S, M, S, S),
-    Event.MOUNT_MOVED: (M, M, M, M, M, M),
-    Event.AT_ODDS: (D, D, S, M, D, D),
-    Event.DATA_CAUSE: (D, D, D, M, D, D),
-    Event.NOT_ACQUITTED: (D, D, S, M, D, D),
-    Event.OVERDUE: (U, D, S, M, D, A),
-    Event.AGED: (U, A, A, M, A, A),
-    Event.REPLACED: (U, U, U, U, U, U),
-    Event.TIME_STEPPED_BACK: (U, U, S, M, U, U),
-    Event.RESTARTED: (U, U, S, M, U, U),
+    HealthEvent.CONFIRMED_BY_WINDOW: (H, H, H, H, H, H),
+    HealthEvent.CONFIRMED_EARLIER: (U, U, U, U, U, U),
+    HealthEvent.CONTRADICTED: (M, M, M, M, M, M),
+    HealthEvent.STEP_SUSPECTED: (S, S, S, M, S, S),
+    HealthEvent.REFUSED_ELSEWHERE: (S, S, S, M, S, S),
+    HealthEvent.CLEAR: (H, H, H, S, H, H),
+    HealthEvent.NO_OBJECTION: (U, H, S, S, U, U),
+    HealthEvent.SUSPECTED: (S, S, S, M, S, S),
+    HealthEvent.MOUNT_MOVED: (M, M, M, M, M, M),
+    HealthEvent.AT_ODDS: (D, D, S, M, D, D),
+    HealthEvent.DATA_CAUSE: (D, D, D, M, D, D),
+    HealthEvent.NOT_ACQUITTED: (D, D, S, M, D, D),
+    HealthEvent.OVERDUE: (U, D, S, M, D, A),
+    HealthEvent.AGED: (U, A, A, M, A, A),
+    HealthEvent.REPLACED: (U, U, U, U, U, U),
+    HealthEvent.TIME_STEPPED_BACK: (U, U, S, M, U, U),
+    HealthEvent.RESTARTED: (U, U, S, M, U, U),
 }
 
 
@@ -39,34 +39,40 @@ EDGES: dict[Event, tuple[HealthState, ...]] = {
         for before, after in zip(HealthState, row, strict=True)
     ],
 )
-def test_edge(event: Event, before: HealthState, after: HealthState) -> None:
+def test_edge(event: HealthEvent, before: HealthState, after: HealthState) -> None:
     assert TRANSITIONS[before, event] is after
 
 
 def test_the_table_is_total_and_every_event_has_a_meaning() -> None:
-    assert set(TRANSITIONS) == {(state, event) for state in HealthState for event in Event}
-    assert set(MEANING) == set(Event)
+    assert set(TRANSITIONS) == {(state, event) for state in HealthState for event in HealthEvent}
+    assert set(MEANING) == set(HealthEvent)
 
 
 def test_green_is_only_reached_by_looking() -> None:
     ways = {event for (before, event), after in TRANSITIONS.items() if after is H and before is not H}
-    assert ways == {Event.CONFIRMED_BY_WINDOW, Event.CLEAR}
+    assert ways == {HealthEvent.CONFIRMED_BY_WINDOW, HealthEvent.CLEAR}
 
 
 def test_silence_and_bad_data_hide_no_red() -> None:
-    silent = (Event.OVERDUE, Event.AGED, Event.TIME_STEPPED_BACK, Event.RESTARTED)
-    for event in (*silent, Event.DATA_CAUSE, Event.REFUSED_ELSEWHERE, Event.SUSPECTED):
+    silent = (HealthEvent.OVERDUE, HealthEvent.AGED, HealthEvent.TIME_STEPPED_BACK, HealthEvent.RESTARTED)
+    for event in (*silent, HealthEvent.DATA_CAUSE, HealthEvent.REFUSED_ELSEWHERE, HealthEvent.SUSPECTED):
         assert TRANSITIONS[M, event] is M
 
 
 def test_whoever_has_not_looked_is_not_green() -> None:
-    for event in (Event.OVERDUE, Event.AGED, Event.TIME_STEPPED_BACK, Event.RESTARTED, Event.REPLACED):
+    for event in (
+        HealthEvent.OVERDUE,
+        HealthEvent.AGED,
+        HealthEvent.TIME_STEPPED_BACK,
+        HealthEvent.RESTARTED,
+        HealthEvent.REPLACED,
+    ):
         assert H not in {TRANSITIONS[state, event] for state in HealthState}
 
 
 def test_only_a_moved_mount_is_red() -> None:
     ways = {event for (before, event), after in TRANSITIONS.items() if after is M and before is not M}
-    assert ways == {Event.CONTRADICTED, Event.MOUNT_MOVED}
+    assert ways == {HealthEvent.CONTRADICTED, HealthEvent.MOUNT_MOVED}
 
 
 def test_every_state_can_be_reached_and_left() -> None:

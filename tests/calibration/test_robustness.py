@@ -19,7 +19,7 @@ from coec.config import CalibrationConfig, DepthConfig, LimitsConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.sources import windows
-from scenarios import SCENARIOS, torn_clusters_in_the_cloud
+from scenarios import DEGRADATIONS, torn_clusters_in_the_cloud
 
 CONFIGURATION = CalibrationConfig()
 GREY = GreyImages(LimitsConfig())
@@ -49,7 +49,7 @@ HARMFUL = ("night", "motion_blur", "blown_out_sky", "few_points", "half_the_azim
 
 
 def mutated(window: Window, scenario: str) -> Window:
-    return SCENARIOS[scenario](window, np.random.default_rng(zlib.crc32(scenario.encode())))
+    return DEGRADATIONS[scenario](window, np.random.default_rng(zlib.crc32(scenario.encode())))
 
 
 def solve(window: Window, depth: DepthModel, images: ImageReader, start_deg: tuple[float, ...]) -> Estimate | None:
@@ -95,7 +95,7 @@ def test_on_the_simulated_street(sharp_street: Window, stereo: DepthModel, scena
     check(solve(mutated(sharp_street, scenario), stereo, GREY, STARTS_DEG[1]))
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize("scenario", DEGRADATIONS)
 def test_a_mutation_is_seeded_and_leaves_its_window_alone(street: Window, scenario: str) -> None:
     few = replace(street, pairs=street.pairs[:2])
     before = contents(few)
@@ -114,7 +114,9 @@ def test_a_mutation_is_seeded_and_leaves_its_window_alone(street: Window, scenar
 @pytest.fixture(scope="module", params=["image_00", "image_01"])
 def drive(sample_data: Path, request: pytest.FixtureRequest) -> Window:
     """Ten frames of KITTI-360."""
-    return windows.load(f"kitti360:{sample_data / 'kitti360'}?camera={request.param}", None, 25, lambda *_: None).window
+    return windows.load_window(
+        f"kitti360:{sample_data / 'kitti360'}?camera={request.param}", None, 25, lambda *_: None
+    ).window
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +125,7 @@ def network(sample_data: Path) -> DepthModel:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize("scenario", DEGRADATIONS)
 def test_on_a_real_drive(drive: Window, network: DepthModel, scenario: str) -> None:
     images, depth = CachedGreys(GREY, len(drive.pairs)), CachedDepth(network, len(drive.pairs))
     harmed = mutated(drive, scenario)
@@ -153,7 +155,7 @@ def test_what_takes_evidence_away_lowers_the_confidence(drive: Window, network: 
 )
 def test_frames_of_one_view_do_not_lead_away_from_a_calibration_in_use(sample_data: Path) -> None:
     """Slow traffic under a bridge, six degrees of freedom: 12.6° aside edges stand out a quarter more."""
-    window = windows.load(f"kitti-raw:{sample_data / 'kitti_raw_2011_09_26'}", None, 25, lambda *_: None).window
+    window = windows.load_window(f"kitti-raw:{sample_data / 'kitti_raw_2011_09_26'}", None, 25, lambda *_: None).window
     six = CONFIGURATION.model_copy(update={"search": CONFIGURATION.search.model_copy(update={"dof": 6})})
     estimate = calibrate(window, open_depth(six.depth, LimitsConfig()), GREY, six, Silence())
     assert np.degrees(np.linalg.norm(estimate.correction[:3])) < REFERENCE_DEG

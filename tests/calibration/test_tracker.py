@@ -16,12 +16,12 @@ from coec.calibration.tracker import (
     Measurement,
     StepState,
     Track,
-    absorb,
     chi_square_tail,
     fits,
     prior_sigma,
     track_from_dict,
     track_to_dict,
+    update_track,
 )
 from coec.calibration.types import Uncertainty
 from coec.config import TrackerConfig
@@ -64,7 +64,7 @@ def drawn(rng: np.random.Generator, count: int, sigma: Array = SIGMA) -> list[Me
 
 def after(track: Track, measurements: list[Measurement], config: TrackerConfig = STILL) -> Track:
     for measurement in measurements:
-        track = absorb(track, measurement, config)
+        track = update_track(track, measurement, config)
     return track
 
 
@@ -136,7 +136,7 @@ def test_correlated_axes_inform_each_other() -> None:
 
 def test_a_window_that_tells_nothing_changes_nothing() -> None:
     track = track_at(TRUTH)
-    assert absorb(track, about(TRUTH, yaw(1.0), np.full(6, np.nan)), STILL) is track
+    assert update_track(track, about(TRUTH, yaw(1.0), np.full(6, np.nan)), STILL) is track
 
 
 def test_a_mount_that_creeps_is_followed(rng: np.random.Generator) -> None:
@@ -146,7 +146,7 @@ def test_a_mount_that_creeps_is_followed(rng: np.random.Generator) -> None:
     hours = 20
     for k in range(hours * 20):
         crept = yaw(0.2 * k / (hours * 20))
-        track = absorb(track, about(TRUTH, crept + rng.normal(0.0, SIGMA), SIGMA, k * PERIOD_NS), config)
+        track = update_track(track, about(TRUTH, crept + rng.normal(0.0, SIGMA), SIGMA, k * PERIOD_NS), config)
         assert track.step is StepState.NONE
     assert degrees(error(track)[1]) == pytest.approx(0.2, abs=0.03)
 
@@ -179,8 +179,8 @@ def test_a_scene_that_pulls_elsewhere_is_no_step(rng: np.random.Generator) -> No
     """Another scene, another tenth of a degree: within what windows of one scene share, that is not a bent mount."""
     window = about(TRUTH, yaw(0.3))
     track = after(track_at(TRUTH), drawn(rng, 200))
-    assert absorb(track, window, STILL).step is StepState.SUSPECTED
-    assert absorb(track, sharing(window, {"edges": yaw(0.1)}), STILL).step is StepState.NONE
+    assert update_track(track, window, STILL).step is StepState.SUSPECTED
+    assert update_track(track, sharing(window, {"edges": yaw(0.1)}), STILL).step is StepState.NONE
 
 
 def test_three_sigma_covers() -> None:
@@ -198,17 +198,17 @@ def test_a_step_is_noticed_by_the_first_window_and_taken_at_the_second(rng: np.r
     track = after(track_at(TRUTH), drawn(rng, 20))
     before = track.T_camera_lidar
     first, second = (about(TRUTH, yaw(1.0) + rng.normal(0.0, SIGMA)) for _ in range(2))
-    track = absorb(track, first, STILL)
+    track = update_track(track, first, STILL)
     assert track.step is StepState.SUSPECTED
     assert track.candidate is not None
     assert track.chance < STILL.step_false_alarm
     np.testing.assert_array_equal(track.T_camera_lidar, before)
-    track = absorb(track, second, STILL)
+    track = update_track(track, second, STILL)
     assert track.step is StepState.CONFIRMED
     assert track.candidate is None
     assert track.windows == 2
     assert degrees(error(track)[1]) == pytest.approx(1.0, abs=3 * 0.04 / sqrt(2))
-    assert absorb(track, second, STILL).step is StepState.NONE
+    assert update_track(track, second, STILL).step is StepState.NONE
 
 
 @pytest.mark.fault("a single wrong window", "what is served does not move")
@@ -240,8 +240,8 @@ def test_an_overwhelming_window_is_taken_alone_only_where_that_is_allowed(rng: n
     bold = STILL.model_copy(update={"overwhelming_false_alarm": 1e-30})
     track = after(track_at(TRUTH), drawn(rng, 10))
     window = about(TRUTH, yaw(5.0))
-    assert absorb(track, window, STILL).step is StepState.SUSPECTED
-    taken = absorb(track, window, bold)
+    assert update_track(track, window, STILL).step is StepState.SUSPECTED
+    taken = update_track(track, window, bold)
     assert taken.step is StepState.CONFIRMED
     np.testing.assert_allclose(taken.T_camera_lidar, window.T_camera_lidar, atol=1e-12)
 
@@ -251,7 +251,7 @@ def test_false_alarms_are_as_rare_as_asked_for() -> None:
     config = STILL.model_copy(update={"step_false_alarm": 0.01})
     rng = np.random.default_rng(5)
     track = after(track_at(TRUTH), drawn(rng, 20), config)
-    alarms = sum(absorb(track, w, config).step is StepState.SUSPECTED for w in drawn(rng, 3000))
+    alarms = sum(update_track(track, w, config).step is StepState.SUSPECTED for w in drawn(rng, 3000))
     assert alarms == pytest.approx(30, abs=4 * sqrt(30))
 
 
@@ -280,8 +280,8 @@ def test_a_restart_gives_the_same_bytes(rng: np.random.Generator) -> None:
     through = track_at(TRUTH)
     restarted = through
     for window in windows:
-        through = absorb(through, window, config)
-        restarted = absorb(track_from_dict(json.loads(json.dumps(track_to_dict(restarted)))), window, config)
+        through = update_track(through, window, config)
+        restarted = update_track(track_from_dict(json.loads(json.dumps(track_to_dict(restarted)))), window, config)
     assert json.dumps(track_to_dict(through)) == json.dumps(track_to_dict(restarted))
     assert through.T_camera_lidar.tobytes() == restarted.T_camera_lidar.tobytes()
 
@@ -309,8 +309,10 @@ def test_a_track_starts_at_a_rigid_pose_with_a_spread(pose: Array, sigma: Array)
 def test_a_drift_is_followed_while_the_monitor_doubts_and_averaged_away_otherwise() -> None:
     settled = after(track_at(TRUTH), [about(TRUTH, np.zeros(6), SIGMA, k * PERIOD_NS) for k in range(5)])
     aside = about(TRUTH, yaw(0.18), SIGMA, 5 * PERIOD_NS)
-    assert absorb(settled, aside, STILL).step is StepState.NONE
-    calm, doubted = (degrees(error(absorb(settled, aside, STILL, doubted=doubted))[1]) for doubted in (False, True))
+    assert update_track(settled, aside, STILL).step is StepState.NONE
+    calm, doubted = (
+        degrees(error(update_track(settled, aside, STILL, doubted=doubted))[1]) for doubted in (False, True)
+    )
     assert calm < 0.04
     assert 0.09 < doubted < 0.18
 
@@ -318,7 +320,7 @@ def test_a_drift_is_followed_while_the_monitor_doubts_and_averaged_away_otherwis
 def test_a_doubt_changes_nothing_about_a_window_that_is_probable() -> None:
     settled = after(track_at(TRUTH), [about(TRUTH, np.zeros(6), SIGMA, k * PERIOD_NS) for k in range(5)])
     near = about(TRUTH, yaw(0.03), SIGMA, 5 * PERIOD_NS)
-    one, other = (absorb(settled, near, STILL, doubted=doubted) for doubted in (False, True))
+    one, other = (update_track(settled, near, STILL, doubted=doubted) for doubted in (False, True))
     np.testing.assert_array_equal(one.T_camera_lidar, other.T_camera_lidar)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.looks import Looks
-from coec.calibration.confidence.loosened import CLOCKS_FREE, LENS_FREE, Loosened
+from coec.calibration.confidence.looks import IndependentSamples
+from coec.calibration.confidence.loosened import CLOCKS_FREE, LENS_FREE, RelaxedAssumption
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
@@ -149,16 +149,16 @@ def at_speed(street: Window, speed_mps: float | None) -> list[FramePair]:
 
 def test_what_fits_a_driving_vehicle_by_the_lines_of_its_road_alone_is_not_accepted(street: Window) -> None:
     pairs = at_speed(street, 30.0)
-    by_lines = Looks(count=2.5, significance=8.0)
+    by_lines = IndependentSamples(count=2.5, significance=8.0)
     verdict = verdict_on(of_objective=(*OUTSTANDING, *repetition_metric(by_lines, pairs, LIMITS)))
     assert [reason.code for reason in verdict.reasons] == ["edges_once"]
-    past_trees = repetition_metric(Looks(count=3.0, significance=25.0), pairs, LIMITS)
+    past_trees = repetition_metric(IndependentSamples(count=3.0, significance=25.0), pairs, LIMITS)
     assert verdict_on(of_objective=(*OUTSTANDING, *past_trees)).decision is Decision.ACCEPTED
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, None])
 def test_a_vehicle_that_is_not_known_to_drive_may_see_one_scene(street: Window, speed_mps: float | None) -> None:
-    assert repetition_metric(Looks(count=1.0, significance=8.0), at_speed(street, speed_mps), LIMITS) == ()
+    assert repetition_metric(IndependentSamples(count=1.0, significance=8.0), at_speed(street, speed_mps), LIMITS) == ()
 
 
 def test_an_objective_without_edges_has_none_to_count_once(street: Window) -> None:
@@ -202,8 +202,8 @@ def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
     assert verdict_after(change).decision is Decision.ACCEPTED
 
 
-def loosened(name: str, certainty: float, moved_px: float) -> Loosened:
-    return Loosened(name, certainty, moved_px, np.zeros(12), np.zeros(6), believed=1.0)
+def loosened(name: str, certainty: float, moved_px: float) -> RelaxedAssumption:
+    return RelaxedAssumption(name, certainty, moved_px, np.zeros(12), np.zeros(6), believed=1.0)
 
 
 @pytest.mark.parametrize(
@@ -216,9 +216,9 @@ def loosened(name: str, certainty: float, moved_px: float) -> Loosened:
     ],
     ids=["another lens", "one that hardly matters", "one that is not certain", "other clocks"],
 )
-def test_a_window_through_another_lens_is_refused_for_that(found: Loosened, refused: bool) -> None:
+def test_a_window_through_another_lens_is_refused_for_that(found: RelaxedAssumption, refused: bool) -> None:
     verdict = verdict_on(of_objective=(*OUTSTANDING, *intrinsics_metric([found], LIMITS)))
     assert [reason.code for reason in verdict.reasons] == ([INTRINSICS_OFF] if refused else [])
-    assert verdict.tells_another_lens is refused
+    assert verdict.shows_another_lens is refused
     if refused:
-        assert verdict.cannot_tell
+        assert verdict.is_inconclusive

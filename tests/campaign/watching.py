@@ -18,7 +18,7 @@ import zenoh
 
 from campaign.drives import Drive, Truth
 from coec.adapters.frames.msgpack_frames import decode_ego
-from coec.adapters.zenoh.client import ask_one
+from coec.adapters.zenoh.client import query_one
 from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, PolicyConfig, WindowConfig, load_config
 from coec.errors import CoecError
 from coec.reports.commented_yaml import commented_yaml
@@ -136,7 +136,7 @@ class Watch:
 
     def ask(self, key: str) -> Any:
         """The document behind a key."""
-        return json.loads(ask_one(self.session, f"{key}?format=json", ANSWER_S).payload)
+        return json.loads(query_one(self.session, f"{key}?format=json", ANSWER_S).payload)
 
     def look(self) -> Sample:
         """One more sample.

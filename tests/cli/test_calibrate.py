@@ -16,7 +16,7 @@ from coec.adapters.images.codec import encode_png
 from coec.calibration.ports import DepthModel
 from coec.config import DepthConfig, LimitsConfig, VerdictConfig
 from coec.errors import OutputError, UsageError
-from coec.sources.windows import evenly, vector_of
+from coec.sources.windows import evenly_spread, parse_perturbation
 
 TOLERANCE_DEG = 0.35
 
@@ -77,7 +77,7 @@ def test_a_result_that_cannot_be_written_in_the_end_is_printed(
     def full(path: Path, _: bytes) -> Path:
         raise OutputError(f"cannot write {path}: No space left on device")
 
-    monkeypatch.setattr(output, "write", full)
+    monkeypatch.setattr(output, "write_output", full)
     arguments = ("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--output", tmp_path)
     outcome = coec(*arguments, "--json")
     assert outcome.status == 1
@@ -198,7 +198,7 @@ def test_unknown_camera_model_is_a_usage_error(coec: Coec) -> None:
 @pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", "", "200,0,0", "0,0,0,120,-30,0"])
 def test_malformed_perturbation(text: str) -> None:
     with pytest.raises(UsageError):
-        vector_of("--perturb", text)
+        parse_perturbation("--perturb", text)
 
 
 @pytest.mark.parametrize(
@@ -206,4 +206,4 @@ def test_malformed_perturbation(text: str) -> None:
     [(3, 25, [0, 1, 2]), (10, 1, [0]), (10, 2, [0, 9]), (101, 5, [0, 25, 50, 75, 100]), (4, 3, [0, 2, 3])],
 )
 def test_evenly_spreads_over_the_recording(count: int, wanted: int, chosen: list[int]) -> None:
-    assert evenly(count, wanted) == chosen
+    assert evenly_spread(count, wanted) == chosen

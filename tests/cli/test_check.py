@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from bags import Bag, a_drive
+from bags import Bag, drive_messages
 from cli.conftest import SMALL, Coec
 
 
@@ -26,15 +26,17 @@ def test_json_has_the_same(coec: Coec) -> None:
 
 
 def test_a_bag_of_which_nothing_can_come_says_why(coec: Coec, tmp_path: Path) -> None:
-    few = [m for m in a_drive() if m[0] != "/front/image"] + [m for m in a_drive() if m[0] == "/front/image"][:2]
+    few = [m for m in drive_messages() if m[0] != "/front/image"] + [
+        m for m in drive_messages() if m[0] == "/front/image"
+    ][:2]
     outcome = coec("check", Bag(few).write(tmp_path / "bag.mcap"))
     assert outcome.status == 1
     assert "fail  2 camera frames; a calibration needs 4." in outcome.out
 
 
 def test_several_topics_are_listed_with_types_and_counts(coec: Coec, tmp_path: Path) -> None:
-    other = [("/rear/points", message) for topic, message in a_drive() if topic == "/points"]
-    outcome = coec("check", Bag([*a_drive(), *other]).write(tmp_path / "bag.mcap"))
+    other = [("/rear/points", message) for topic, message in drive_messages() if topic == "/points"]
+    outcome = coec("check", Bag([*drive_messages(), *other]).write(tmp_path / "bag.mcap"))
     assert outcome.status == 1
     assert "/rear/points (sensor_msgs/msg/PointCloud2, 8 messages)" in outcome.err
     assert re.search(r"/odom +nav_msgs/msg/Odometry +20 +\d", outcome.out)

@@ -138,7 +138,7 @@ def test_an_edited_file_is_not_overwritten_unless_asked(coec: Coec, tmp_path: Pa
 def test_a_failed_conversion_does_not_refuse_the_next(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    replace = output.replace
+    replace = output.replace_output
 
     def full_disk(path: Path, data: bytes) -> Path:
         if path.suffix == ".yaml":
@@ -146,7 +146,7 @@ def test_a_failed_conversion_does_not_refuse_the_next(
         return replace(path, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr(output, "replace", full_disk)
+        patch.setattr(output, "replace_output", full_disk)
         assert coec("convert", SMALL, tmp_path / "coec.yaml").status == 1
     assert list(tmp_path.iterdir()) == []
     assert coec("convert", SMALL, tmp_path / "coec.yaml").status == 0

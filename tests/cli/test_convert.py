@@ -9,7 +9,7 @@ import numpy as np
 from cli.conftest import SMALL, Coec
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.sources import open_source
-from readers import opened
+from readers import read_recording
 
 
 def test_bag_reads_back_to_the_same_frames(coec: Coec, tmp_path: Path) -> None:
@@ -35,7 +35,7 @@ def test_bag_reads_back_to_the_same_frames(coec: Coec, tmp_path: Path) -> None:
 def test_bag_opens_in_ros_tools(coec: Coec, tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     coec("convert", SMALL, path)
-    bag = opened(path)
+    bag = read_recording(path)
     assert (
         bag.types.keys()
         == bag.counts.keys()

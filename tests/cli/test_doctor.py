@@ -26,8 +26,8 @@ from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encod
 from coec.adapters.system import clock
 from coec.adapters.zenoh.bus import MSGPACK, open_session
 from coec.adapters.zenoh.endpoints import Endpoint
-from coec.adapters.zenoh.ros_topics import Topics
-from coec.adapters.zenoh.tls import CertificateError, Material, host_and_port, material_of, read_certificate
+from coec.adapters.zenoh.ros_topics import RosTopicList
+from coec.adapters.zenoh.tls import CertificateError, TlsFiles, host_and_port, read_certificate, tls_files
 from coec.calibration.types import LidarFrame
 from coec.cli import doctor_computer, doctor_connection
 from coec.cli.doctor import examine
@@ -36,7 +36,7 @@ from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, 
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.doctor import Finding
 from conftest import REPOSITORY
-from pair_bench import configuration, pair_at
+from pair_bench import frame_pair_at, pair_configuration
 from ports import free_port
 
 RATE_HZ = 10.0
@@ -72,7 +72,7 @@ VEHICLE = {
 
 def written(folder: Path, zenoh_config: ZenohConfig, *names: str) -> Path:
     """A configuration with these pairs, and a state directory beside it."""
-    config = configuration(folder / "state")
+    config = pair_configuration(folder / "state")
     (pair,) = config.pairs
 
     def named(name: str) -> object:
@@ -96,7 +96,7 @@ def babble(session: zenoh.Session, name: str, sensors: Sensors, end: threading.E
     """Send until told to stop."""
     while not end.is_set():
         now_ns = time.time_ns()
-        pair = pair_at(now_ns)
+        pair = frame_pair_at(now_ns)
         assert pair.motion is not None
         times = None
         if sensors.point_times_s is not None:
@@ -190,7 +190,7 @@ def test_a_rate_is_judged_by_what_a_check_wants(tmp_path: Path, rate_hz: float, 
     for number in range(count):
         camera.arrivals_s.append(number / rate_hz)
         camera.sizes.append(1000)
-    found = list(stream_findings(pair, {"camera": camera, "lidar": silent}, config, 5.0, Topics()))
+    found = list(stream_findings(pair, {"camera": camera, "lidar": silent}, config, 5.0, RosTopicList()))
     assert of(found, "stream", pair.camera.place)[0] == level
     assert of(found, "stream", pair.lidar.place)[0] == "fail"
 
@@ -348,7 +348,7 @@ def found_with(authority: Path, port: int, name: str, folder: Path, vehicle: str
     file = folder / "session.json5"
     session = {"connect": {"endpoints": [f"tls/127.0.0.1:{port}"]}, "transport": {"link": {"tls": tls}}}
     file.write_text(json.dumps(session))
-    config = configuration(folder).model_copy(update={"zenoh": ZenohConfig(file=file), "vehicle": vehicle})
+    config = pair_configuration(folder).model_copy(update={"zenoh": ZenohConfig(file=file), "vehicle": vehicle})
     found = [*doctor_connection.certificate_findings(config), *doctor_connection.router_findings(config)]
     with_session = doctor_connection.session_of_client(config)
     found.append(doctor_connection.session_finding(config, with_session))
@@ -412,8 +412,8 @@ def test_rules_that_refuse_are_told_from_no_router(authority: Path, guarded: int
     assert "its access control refuses" in found["rules"].text
 
 
-def material(folder: Path, certificate: str, key: str, root: str = "ca") -> Material:
-    return Material(
+def material(folder: Path, certificate: str, key: str, root: str = "ca") -> TlsFiles:
+    return TlsFiles(
         folder / f"{root}.pem", folder / f"{certificate}.pem", folder / f"{key}-key.pem", names_checked=True
     )
 
@@ -435,9 +435,9 @@ def test_files_that_do_not_belong_together_are_told(authority: Path) -> None:
 def test_an_endpoint_has_files_of_its_own(authority: Path) -> None:
     settings = zenoh.Config.from_file(authority / "router.json5")
     plain, own = Endpoint.parse("tls/[::1]:7448"), Endpoint.parse("tls/[::1]:7448#listen_certificate_file=/own.pem")
-    assert material_of(settings, plain, "listen").certificate == authority / "router.pem"
-    assert material_of(settings, own, "listen").certificate == Path("/own.pem")
-    assert material_of(settings, own, "connect").certificate is None
+    assert tls_files(settings, plain, "listen").certificate == authority / "router.pem"
+    assert tls_files(settings, own, "listen").certificate == Path("/own.pem")
+    assert tls_files(settings, own, "connect").certificate is None
     assert host_and_port(own) == ("::1", 7448)
 
 
@@ -450,7 +450,7 @@ def levels(config: Config) -> dict[str, str]:
 
 @pytest.mark.fault("a full disk before the start", "the doctor says so, and leaves nothing behind on it")
 def test_a_full_disk_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = configuration(tmp_path)
+    config = pair_configuration(tmp_path)
     assert levels(config) == {"state": "ok", "lock": "ok", "disk": "ok", "writing": "ok"}
     left = sorted(tmp_path.iterdir())
     wanting = config.state.model_copy(update={"min_free_bytes": 2**60})
@@ -469,7 +469,7 @@ def test_a_full_disk_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_service_that_holds_the_state_is_seen_and_not_disturbed(tmp_path: Path) -> None:
-    config = configuration(tmp_path)
+    config = pair_configuration(tmp_path)
     with (tmp_path / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         (held,) = (one for one in doctor_computer.state_findings(config.state) if one.check == "lock")
@@ -479,10 +479,10 @@ def test_a_service_that_holds_the_state_is_seen_and_not_disturbed(tmp_path: Path
 
 
 def test_a_state_directory_that_cannot_be_made_fails(tmp_path: Path) -> None:
-    config = configuration(tmp_path / "new" / "state")
+    config = pair_configuration(tmp_path / "new" / "state")
     assert levels(config) == {"state": "ok"}
     (tmp_path / "file").write_text("")
-    assert levels(configuration(tmp_path / "file"))["state"] == "fail"
+    assert levels(pair_configuration(tmp_path / "file"))["state"] == "fail"
     assert not (tmp_path / "new").exists()
 
 

@@ -17,7 +17,7 @@ from coec.cli.doctor import examine
 from coec.schemas.doctor import Finding
 from conftest import REPOSITORY
 from ports import free_port
-from ros_nodes import Driver
+from ros_nodes import RosDriver
 
 SECONDS = 0.5
 CAMERA, POINTS = "/camera/image_raw/compressed", "/points"
@@ -51,8 +51,8 @@ def silent_router(endpoint: str) -> AbstractContextManager[zenoh.Session]:
 def sending(endpoint: str) -> Iterator[None]:
     """A node whose camera and LiDAR send until the end of the block."""
     end = threading.Event()
-    with rmw_zenoh_defaults.node(endpoint) as session:
-        drivers = [Driver(session, topic, kind, 10 * n) for n, (topic, kind) in enumerate(TOPICS.items(), start=1)]
+    with rmw_zenoh_defaults.rmw_node(endpoint) as session:
+        drivers = [RosDriver(session, topic, kind, 10 * n) for n, (topic, kind) in enumerate(TOPICS.items(), start=1)]
 
         def send() -> None:
             while not end.wait(0.05):
@@ -100,8 +100,8 @@ def of(findings: Sequence[Finding], check: str, where: str | None = None) -> Fin
 @pytest.mark.parametrize(
     ("router", "session"),
     [
-        (rmw_zenoh_defaults.router, None),
-        (rmw_zenoh_defaults.router, GOSSIPS),
+        (rmw_zenoh_defaults.rmw_router, None),
+        (rmw_zenoh_defaults.rmw_router, GOSSIPS),
         (shipped, None),
         (shipped, GOSSIPS),
         (silent_router, None),
@@ -132,7 +132,12 @@ def test_what_the_service_receives_is_in_order(
 @pytest.mark.parametrize(
     ("router", "session", "cause", "way_out"),
     [
-        (rmw_zenoh_defaults.router, DEAF, "a peer without gossip", "`mode`, `listen` and `scouting` out of zenoh.file"),
+        (
+            rmw_zenoh_defaults.rmw_router,
+            DEAF,
+            "a peer without gossip",
+            "`mode`, `listen` and `scouting` out of zenoh.file",
+        ),
         (shipped, DEAF, "a peer without gossip", "so that the service is a client"),
         (silent_router, GOSSIPS, "it is not connected to them", "enable gossip at the router"),
     ],
@@ -165,8 +170,8 @@ def test_the_service_that_runs_is_not_disturbed_by_a_second_session_of_its_setti
         "connect/endpoints": [endpoint],
     }
     with (
-        rmw_zenoh_defaults.router(endpoint) as router,
-        zenoh.open(rmw_zenoh_defaults.settings(rmw_zenoh_defaults.SESSION, taken)) as service,
+        rmw_zenoh_defaults.rmw_router(endpoint) as router,
+        zenoh.open(rmw_zenoh_defaults.rmw_settings(rmw_zenoh_defaults.RMW_SESSION, taken)) as service,
         sending(endpoint),
     ):
         findings = found(tmp_path, endpoint, own)

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from coec.adapters.ros.wire.publisher import Publisher
-from coec.adapters.zenoh.ros_topics import Topics
+from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.cli.doctor_streams import NAMED, StreamSamples, stream_findings, topic_findings
 from coec.config import IDENTITY, Config
 from coec.runtime.ingest.decoder import StreamCounts
 
 IMAGE, POINTS = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2"
 LEFT, RIGHT = b"l" * 16, b"r" * 16
-THERE = Topics(
+THERE = RosTopicList(
     (
         Publisher("/front/image", IMAGE, "/left", LEFT),
         Publisher("/front/image", IMAGE, "/right", RIGHT),
@@ -43,14 +43,14 @@ def test_topics_that_may_be_streams_are_named_with_types_and_nodes() -> None:
 
 
 def test_a_vehicle_with_very_many_names_some() -> None:
-    many = Topics(tuple(Publisher(f"/image{number:03}", IMAGE, "/node", None) for number in range(NAMED + 5)))
+    many = RosTopicList(tuple(Publisher(f"/image{number:03}", IMAGE, "/node", None) for number in range(NAMED + 5)))
     (found,) = topic_findings(many, many, configured())
     assert found.text.count("/image") == NAMED
     assert "; 5 more such; 0 of other types" in found.text
 
 
 def test_topics_that_only_a_client_of_the_router_sees_are_named() -> None:
-    here = Topics(tuple(one for one in THERE.publishers if one.topic != "/top/points"))
+    here = RosTopicList(tuple(one for one in THERE.publishers if one.topic != "/top/points"))
     _, found = topic_findings(here, THERE, configured())
     assert found.level == "fail"
     assert "the service does not see /top/points: " in found.text
@@ -58,14 +58,14 @@ def test_topics_that_only_a_client_of_the_router_sees_are_named() -> None:
 
 @pytest.mark.parametrize(("middleware", "where"), [("rmw_zenoh", "domain 0"), ("ros2dds", "bridge")])
 def test_nobody_there_is_told_with_what_may_be_wrong(middleware: str, where: str) -> None:
-    (found,) = topic_findings(Topics(), Topics(), configured(middleware))
+    (found,) = topic_findings(RosTopicList(), RosTopicList(), configured(middleware))
     assert (found.level, found.where) == ("warn", where)
     assert found.advice is not None
     assert "@ros2_lv/**" in found.advice
 
 
 def test_tokens_that_were_not_read_are_told() -> None:
-    there = Topics(THERE.publishers, Counter(too_many=7, malformed=2))
+    there = RosTopicList(THERE.publishers, Counter(too_many=7, malformed=2))
     *_, found = topic_findings(there, there, configured())
     assert (found.level, "2 malformed, 7 too_many" in found.text) == ("warn", True)
 

@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from cli.conftest import Coec
 from coec.adapters.files.conversions import result_of
-from coec.calibration.lifecycle import PairState, Rules, after_estimate, initial_state
+from coec.calibration.lifecycle import PairRules, PairState, after_estimate, initial_state
 from coec.calibration.types import Decision, Reason, Verdict
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.geometry import cameras, se3
@@ -20,23 +20,23 @@ from coec.runtime.api.extrinsic import extrinsic_of
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.decisions.stored_pair import Clocks
 from coec.schemas.base import to_json
-from estimates import RIG, estimate
+from estimates import ESTIMATE_RIG, estimate
 
-RULES = Rules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
+RULES = PairRules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
 CLOCKS = Clocks(None, None, None)
-SERVED = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
+SERVED = after_estimate(initial_state(ESTIMATE_RIG), estimate(1), 0, RULES)
 
 
 def kept(folder: Path, state: PairState) -> None:
     store = StateStore(folder, "v7")
-    store.remember(RIG, state, CLOCKS, dict)
+    store.update(ESTIMATE_RIG, state, CLOCKS, dict)
     store.flush()
 
 
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
     path = tmp_path / "result.json"
-    path.write_bytes(to_json(result_of(estimate(1), RIG, "v7")))
+    path.write_bytes(to_json(result_of(estimate(1), ESTIMATE_RIG, "v7")))
     return path
 
 
@@ -67,8 +67,8 @@ def test_a_state_directory_gives_what_is_served(coec: Coec, state: Path, inside:
 
 
 def test_a_reply_of_a_service_gives_what_it_tells(coec: Coec, tmp_path: Path) -> None:
-    accepted = result_of(estimate(1), RIG, "v7")
-    reply = extrinsic_of("v7", RIG, SERVED, accepted, 0.0, "hash")
+    accepted = result_of(estimate(1), ESTIMATE_RIG, "v7")
+    reply = extrinsic_of("v7", ESTIMATE_RIG, SERVED, accepted, 0.0, "hash")
     path = tmp_path / "extrinsic.json"
     path.write_bytes(to_json(reply))
     document = coec("export", path, "--format", "json").document
@@ -80,8 +80,8 @@ def test_a_reply_of_a_service_gives_what_it_tells(coec: Coec, tmp_path: Path) ->
 
 def holders(folder: Path) -> dict[str, Path]:
     """Everything but a window that holds a calibration: the file or folder by its kind."""
-    accepted = result_of(estimate(1), RIG, "v7")
-    files = {"result": accepted, "reply": extrinsic_of("v7", RIG, SERVED, accepted, 0.0, "hash")}
+    accepted = result_of(estimate(1), ESTIMATE_RIG, "v7")
+    files = {"result": accepted, "reply": extrinsic_of("v7", ESTIMATE_RIG, SERVED, accepted, 0.0, "hash")}
     for name, model in files.items():
         (folder / f"{name}.json").write_bytes(to_json(model))
     (folder / "state").mkdir()
@@ -92,7 +92,7 @@ def holders(folder: Path) -> dict[str, Path]:
 @pytest.mark.parametrize("source", ["result", "reply", "state"])
 def test_the_intrinsics_that_it_was_estimated_with_come_along(coec: Coec, tmp_path: Path, source: str) -> None:
     path = holders(tmp_path)[source]
-    camera = RIG.camera
+    camera = ESTIMATE_RIG.camera
     K = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     chain = YAML(typ="safe").load(coec("export", path, "--format", "kalibr").out)["cam0"]
     assert (chain["camera_model"], chain["distortion_model"]) == ("pinhole", "none")
@@ -134,7 +134,7 @@ def test_what_is_not_accepted_is_refused_and_forced(coec: Coec, tmp_path: Path) 
     bad = estimate(2, Decision.FAILED)
     refused = replace(bad, verdict=Verdict(Decision.FAILED, (), (Reason("edges", "The edges are faint."),)))
     path, file = tmp_path / "result.json", tmp_path / "camera.urdf"
-    path.write_bytes(to_json(result_of(refused, RIG, "v7")))
+    path.write_bytes(to_json(result_of(refused, ESTIMATE_RIG, "v7")))
     outcome = coec("export", path, "--format", "urdf", "--output", file)
     assert outcome.status == 1
     assert "The edges are faint." in outcome.err
@@ -145,7 +145,7 @@ def test_what_is_not_accepted_is_refused_and_forced(coec: Coec, tmp_path: Path) 
 
 
 def test_a_nominal_state_is_refused(coec: Coec, tmp_path: Path) -> None:
-    kept(tmp_path, initial_state(RIG))
+    kept(tmp_path, initial_state(ESTIMATE_RIG))
     outcome = coec("export", tmp_path, "--format", "tf")
     assert outcome.status == 2
     assert "nothing was accepted yet" in outcome.err

@@ -20,7 +20,7 @@ from coec.adapters.images.codec import encode_jpeg
 from coec.adapters.mcap.windows import WindowWriter, write_result
 from coec.adapters.zenoh.bus import Answer
 from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.window_fetch import PIECE_BYTES, SPARE_BYTES, NoRoomError, Recording, fetch_window
+from coec.adapters.zenoh.window_fetch import PIECE_BYTES, SPARE_BYTES, NoSpaceError, RecordingInfo, fetch_window
 from coec.cli import fetch as cli_fetch
 from coec.config import UplinkConfig, ZenohConfig
 from coec.errors import NotFoundError, RemoteError, UsageError
@@ -32,10 +32,10 @@ from coec.schemas.keys import Keys, parse_range_selector
 from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
 from e2e.processes import Router
 from fakes import wait_until
-from last_words import a_word, packed
-from pair_bench import BEGIN_S, END_S, NOMINAL, RIG, Bench, S, pair_at
-from storages import Storage
-from vehicles import KEYS, PAIR, Vehicle, serving
+from last_words import heartbeat, packed_heartbeat
+from pair_bench import BEGIN_S, DRIVE_END_S, NOMINAL, NS_PER_S, PAIR_RIG, PairBench, frame_pair_at
+from storages import MemoryStorage
+from vehicles import KEYS, PAIR, ServingVehicle, serving
 
 VEHICLE = "vehicle"
 DATA = bytes(range(256)) * 6000
@@ -46,7 +46,7 @@ WINDOW = "front-7"
 
 
 @pytest.fixture(scope="module")
-def vehicle(router: Router, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vehicle]:
+def vehicle(router: Router, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServingVehicle]:
     """Its mount was knocked, and its pair was put right again."""
     with (
         serving(tmp_path_factory.mktemp("state"), ZenohConfig(connect=(router.endpoint,)), before=driven) as made,
@@ -56,17 +56,17 @@ def vehicle(router: Router, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         yield made
 
 
-def driven(bench: Bench) -> None:
+def driven(bench: PairBench) -> None:
     """Its windows lie in the folder as recorder and worker leave them, and its pictures are pictures."""
-    bench.drive(BEGIN_S, END_S)
-    folder = bench.outside.folder
+    bench.drive(BEGIN_S, DRIVE_END_S)
+    folder = bench.context.folder
     for result in bench.store.history.results():
         path = folder.path(result.window_id)
         path.unlink(missing_ok=True)
         configuration = bench.config.pairs[0].calibration
-        writer = WindowWriter(path, RIG, NOMINAL, result.window_id, configuration, {"vehicle": VEHICLE})
+        writer = WindowWriter(path, PAIR_RIG, NOMINAL, result.window_id, configuration, {"vehicle": VEHICLE})
         for second in range(3):
-            writer.add(pair_at(result.data_stamp_ns + second * S))
+            writer.add(frame_pair_at(result.data_stamp_ns + second * NS_PER_S))
         writer.finish()
         write_result(path, result)
     reader = DigestReader(folder, PAIR)
@@ -125,7 +125,7 @@ def test_an_event_comes_home_as_one_folder_that_tells_its_story(coec: Coec, rout
 
 
 def test_whoever_asks_again_fetches_no_window_twice(
-    coec: Coec, router: Router, vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    coec: Coec, router: Router, vehicle: ServingVehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, read = tmp_path / "event", []
     existing = vehicle.bench.answers.read_window
@@ -152,10 +152,10 @@ def test_recordings_can_be_left_on_board(coec: Coec, router: Router, tmp_path: P
 
 @pytest.mark.fault("the uplink of the vehicle is spent", "what is fetched comes when it may, and is counted")
 def test_whatever_is_fetched_is_metered_and_waited_for(
-    coec: Coec, router: Router, vehicle: Vehicle, tmp_path: Path
+    coec: Coec, router: Router, vehicle: ServingVehicle, tmp_path: Path
 ) -> None:
     before = dict(vehicle.uplink.sent)
-    vehicle.uplink.use(UplinkConfig(evidence_bytes_per_s=1_000_000))
+    vehicle.uplink.reconfigure(UplinkConfig(evidence_bytes_per_s=1_000_000))
     vehicle.uplink.metered("test", lambda: Answer(bytes(BURST_BYTES + 300_000), ""))
     outcome = coec("fetch", VEHICLE, "latest", "--connect", router.endpoint, "--output", tmp_path, "--json")
     assert outcome.status == 0, outcome.err
@@ -194,10 +194,13 @@ def test_what_is_not_there_is_said(
 
 def test_of_a_vehicle_that_is_parked_its_last_word_is_told(coec: Coec, router: Router) -> None:
     key = Keys("coec", "truck-3").last("front")
-    with Storage(router.session, Keys("coec", "*").last("*")) as storage, connected([router.endpoint], 5.0) as session:
-        word = a_word("truck-3", service="stopping", state="miscalibrated")
-        session.put(key, packed(word), timestamp=session.new_timestamp())
-        wait_until(lambda: bool(storage.kept), "it is kept")
+    with (
+        MemoryStorage(router.session, Keys("coec", "*").last("*")) as storage,
+        connected([router.endpoint], 5.0) as session,
+    ):
+        word = heartbeat("truck-3", service="stopping", state="miscalibrated")
+        session.put(key, packed_heartbeat(word), timestamp=session.new_timestamp())
+        wait_until(lambda: bool(storage.samples), "it is kept")
         outcome = coec("fetch", "truck-3", "latest", "--connect", router.endpoint)
     assert outcome.status == NotFoundError.exit_code
     assert re.search(r"truck-3 does not answer; it logged off \d+ d ago \(front: miscalibrated\)", outcome.err)
@@ -282,7 +285,7 @@ def far(request: pytest.FixtureRequest) -> Keys:
     return Keys("coec", re.sub(r"[^A-Za-z0-9]", "-", request.node.name)[:60])
 
 
-def fetch(router: Router, keys: Keys, path: Path, patience_s: float = 0.3) -> Recording:
+def fetch(router: Router, keys: Keys, path: Path, patience_s: float = 0.3) -> RecordingInfo:
     with connected([router.endpoint], 5.0) as session:
         return fetch_window(session, keys, PAIR, WINDOW, path, 5.0, patience_s, lambda *_: None)
 
@@ -314,7 +317,7 @@ def test_a_window_for_which_there_is_no_room_is_not_begun(
     sender = Sender(router.session, far, whole)
     free = SPARE_BYTES + len(DATA) - 1
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
-    with pytest.raises(NoRoomError, match=f"{len(DATA)} bytes are to be fetched, {free} are free"):
+    with pytest.raises(NoSpaceError, match=f"{len(DATA)} bytes are to be fetched, {free} are free"):
         fetch(router, far, tmp_path / "w.mcap")
     assert (sender.asked, list(tmp_path.iterdir())) == ([], [])
     free += 1

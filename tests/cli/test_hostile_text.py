@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from pydantic import BaseModel
 
 import coec as coec_library
-from bags import TREE, Bag, a_drive, a_joint, an_image, an_info
+from bags import TREE, Bag, camera_info_message, compressed_image_message, drive_messages, transform_message
 from cli.conftest import Coec, Outcome
 from coec.adapters.zenoh.bus import JSON, MSGPACK
 from coec.adapters.zenoh.client import Reply, connected
@@ -37,8 +37,8 @@ from coec.schemas.replies import (
     WindowsReply,
 )
 from e2e.processes import Router
-from hostile import HOSTILE, SHORT, hostile, obeyed, texts
-from pair_bench import configuration
+from hostile import HOSTILE, HOSTILE_SHORT, hostile_message, message_texts, obeyed_characters
+from pair_bench import pair_configuration
 
 KEYS = Keys("coec", "hostile")
 REFUSING = Keys("coec", "refusing")
@@ -60,18 +60,18 @@ QUERIES = ("extrinsic", "health", "history", "windows", "evidence", f"evidence/{
 
 def everything() -> dict[str, tuple[bytes, str]]:
     """What the hostile vehicle answers: payload and encoding by key."""
-    event = hostile(EvidenceEvent, vehicle=KEYS.vehicle, pair="front", event_id=EVENT, wall_ns=1, stamp_ns=7)
-    listed = hostile(EvidenceReply, pair="front", events=(event,))
+    event = hostile_message(EvidenceEvent, vehicle=KEYS.vehicle, pair="front", event_id=EVENT, wall_ns=1, stamp_ns=7)
+    listed = hostile_message(EvidenceReply, pair="front", events=(event,))
     of_models: dict[str, BaseModel] = {
-        KEYS.status: hostile(StatusReply),
-        KEYS.rig: hostile(rig_state.RigReply),
-        KEYS.extrinsic("front"): hostile(ExtrinsicReply),
-        KEYS.health("front"): hostile(HealthReply),
-        KEYS.history("front"): hostile(HistoryReply),
-        KEYS.windows("front"): hostile(WindowsReply),
+        KEYS.status: hostile_message(StatusReply),
+        KEYS.rig: hostile_message(rig_state.RigReply),
+        KEYS.extrinsic("front"): hostile_message(ExtrinsicReply),
+        KEYS.health("front"): hostile_message(HealthReply),
+        KEYS.history("front"): hostile_message(HistoryReply),
+        KEYS.windows("front"): hostile_message(WindowsReply),
         KEYS.evidence("front"): listed,
         KEYS.evidence_of("front", EVENT): event,
-        KEYS.command("front", "hold"): hostile(Acknowledgement),
+        KEYS.command("front", "hold"): hostile_message(Acknowledgement),
     }
     config = json.dumps({HOSTILE: [HOSTILE, {"x": HOSTILE}]}, ensure_ascii=False).encode()
     return {
@@ -83,14 +83,14 @@ def everything() -> dict[str, tuple[bytes, str]]:
 
 
 def a_word() -> last_word.LastWord:
-    return hostile(last_word.LastWord, vehicle=KEYS.vehicle, pair="front")
+    return hostile_message(last_word.LastWord, vehicle=KEYS.vehicle, pair="front")
 
 
 @pytest.fixture(scope="module")
 def vehicle(router: Router) -> Iterator[str]:
     """The endpoint of a router with a vehicle that answers everything with texts that a terminal would obey, and one
     that refuses everything in such words."""
-    refusal = base.to_json(hostile(ErrorReply))
+    refusal = base.to_json(hostile_message(ErrorReply))
 
     def answer(key: str, payload: bytes, encoding: str) -> Callable[[zenoh.Query], None]:
         def reply(asked: zenoh.Query) -> None:
@@ -126,8 +126,8 @@ def styled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> b
 def harmless(outcome: Outcome, *, styled: bool = False) -> str:
     """What a command printed, which moves no cursor."""
     assert "Traceback" not in outcome.err
-    assert obeyed(outcome.out, styled=styled) == ""
-    assert obeyed(outcome.err, styled=styled) == ""
+    assert obeyed_characters(outcome.out, styled=styled) == ""
+    assert obeyed_characters(outcome.err, styled=styled) == ""
     return outcome.out + outcome.err
 
 
@@ -138,10 +138,10 @@ def test_a_reply_steers_no_terminal(coec: Coec, vehicle: str, styled: bool, key:
     shown = harmless(coec(*asked), styled=styled)
     assert r"\x1b[35;45m" in shown or r"\u001b[35;45m" in shown, "what was sent is shown"
     document = coec(*asked, "--json")
-    assert obeyed(document.out) == ""
+    assert obeyed_characters(document.out) == ""
     if key != "metrics":
         assert document.out.count("\n") == 1
-        assert HOSTILE in texts(document.document), "a program reads what was sent"
+        assert HOSTILE in message_texts(document.document), "a program reads what was sent"
 
 
 @pytest.mark.parametrize("choice", [0, 1])
@@ -149,9 +149,9 @@ def test_a_reply_steers_no_terminal(coec: Coec, vehicle: str, styled: bool, key:
 def test_whatever_fixed_words_a_reply_has_it_steers_no_terminal(
     capsys: pytest.CaptureFixture[str], styled: bool, kind: str, choice: int
 ) -> None:
-    replies.BY_KIND[kind](base.to_json(hostile(MODELS[kind], choice)))
+    replies.BY_KIND[kind](base.to_json(hostile_message(MODELS[kind], choice)))
     captured = capsys.readouterr()
-    assert obeyed(captured.out, styled=styled) == ""
+    assert obeyed_characters(captured.out, styled=styled) == ""
     assert captured.out
 
 
@@ -164,7 +164,7 @@ def test_a_refusal_steers_no_terminal(coec: Coec, vehicle: str, key: str) -> Non
     assert r"\x1b[35;45m" in harmless(outcome)
     assert outcome.err.count("\n") == 1, "a message makes no second line"
     told = coec(*asked, "--json")
-    assert obeyed(told.out) == ""
+    assert obeyed_characters(told.out) == ""
     assert told.document["error"]["code"] == HOSTILE
 
 
@@ -176,30 +176,30 @@ def test_what_is_watched_steers_no_terminal(coec: Coec, vehicle: str, styled: bo
     assert outcome.status == 0
     shown = harmless(outcome, styled=styled)
     assert r"\x1b" in shown
-    assert obeyed(coec(*watched, "--json").out) == ""
+    assert obeyed_characters(coec(*watched, "--json").out) == ""
 
 
 def test_details_of_a_pair_on_the_board_steer_no_terminal(capsys: pytest.CaptureFixture[str], styled: bool) -> None:
-    fleet = hostile(fleet_now.FleetNow)
+    fleet = hostile_message(fleet_now.FleetNow)
     console.out.print(fleet_board.board(fleet, 0, 0, 1, HOSTILE))
     console.out.print(fleet_board.detail(fleet.pairs[0]))
-    assert obeyed(capsys.readouterr().out, styled=styled) == ""
+    assert obeyed_characters(capsys.readouterr().out, styled=styled) == ""
 
 
 def test_findings_about_a_service_steer_no_terminal(
     coec: Coec, vehicle: str, styled: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = configuration(tmp_path).model_copy(update={"vehicle": KEYS.vehicle, "prefix": KEYS.prefix})
+    config = pair_configuration(tmp_path).model_copy(update={"vehicle": KEYS.vehicle, "prefix": KEYS.prefix})
 
     def examined(*_: object) -> Iterator[Finding]:
-        yield hostile(Finding)
+        yield hostile_message(Finding)
         with connected([vehicle], 5.0) as session:
             yield from service_findings(session, Config.model_validate(config))
 
     monkeypatch.setattr(doctor, "examine", examined)
     shown = harmless(coec("doctor"), styled=styled)
     assert r"\x1b[35;45m" in shown
-    assert obeyed(coec("doctor", "--json").out) == ""
+    assert obeyed_characters(coec("doctor", "--json").out) == ""
 
 
 def test_what_is_fetched_steers_no_terminal_and_no_page(coec: Coec, vehicle: str, styled: bool, tmp_path: Path) -> None:
@@ -209,9 +209,9 @@ def test_what_is_fetched_steers_no_terminal_and_no_page(coec: Coec, vehicle: str
     assert EVENT in harmless(listed, styled=styled)
     outcome = coec(*of, EVENT, "--output", tmp_path / "event", "--patience", "0.1")
     harmless(outcome, styled=styled)
-    assert obeyed((tmp_path / "event" / "index.html").read_text()) == ""
+    assert obeyed_characters((tmp_path / "event" / "index.html").read_text()) == ""
     again = coec(*of, EVENT, "--output", tmp_path / "again", "--patience", "0.1", "--json")
-    assert obeyed(again.out) == ""
+    assert obeyed_characters(again.out) == ""
     assert {path.name for path in tmp_path.iterdir()} == {"event", "again"}, "no text becomes a path"
 
 
@@ -238,22 +238,22 @@ def test_names_in_a_recording_steer_no_terminal(
     outcome = coec(command, path, *more.get(command, ()))
     assert outcome.status == 1
     assert r"\x1b[35;45m" in harmless(outcome, styled=styled)
-    assert obeyed(coec(command, path, *more.get(command, ()), "--json").out) == ""
+    assert obeyed_characters(coec(command, path, *more.get(command, ()), "--json").out) == ""
 
 
 @pytest.mark.parametrize("command", ["check", "calibrate", "convert"])
 def test_frames_in_a_drive_steer_no_terminal(coec: Coec, styled: bool, tmp_path: Path, command: str) -> None:
-    drive = a_drive(
-        info=an_info("plumb_bob", [0.0] * 5, HOSTILE),
-        tree=[*TREE, a_joint("optical", HOSTILE, np.eye(4))],
-        image=lambda stamp_ns: an_image(stamp_ns, HOSTILE),
+    drive = drive_messages(
+        info=camera_info_message("plumb_bob", [0.0] * 5, HOSTILE),
+        tree=[*TREE, transform_message("optical", HOSTILE, np.eye(4))],
+        image=lambda stamp_ns: compressed_image_message(stamp_ns, HOSTILE),
     )
-    path = Bag(drive).write(tmp_path / f"{SHORT}.mcap")
-    more = (tmp_path / f"{SHORT}.yaml",) if command == "convert" else ()
+    path = Bag(drive).write(tmp_path / f"{HOSTILE_SHORT}.mcap")
+    more = (tmp_path / f"{HOSTILE_SHORT}.yaml",) if command == "convert" else ()
     harmless(coec(command, path, *more), styled=styled)
-    assert obeyed(coec(command, path, *more, "--json").out) == ""
+    assert obeyed_characters(coec(command, path, *more, "--json").out) == ""
     recording = coec_library.open(path)
-    assert obeyed(f"{recording.describe()}{recording!r}") == ""
+    assert obeyed_characters(f"{recording.describe()}{recording!r}") == ""
     assert r"\x1b[35;45m" in str(recording.describe())
 
 

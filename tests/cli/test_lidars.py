@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags import Bag, a_drive
+from bags import Bag, drive_messages
 from cli.conftest import Coec
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
@@ -60,7 +60,7 @@ def test_what_does_not_fit_is_refused(coec: Coec, arguments: tuple[str, ...], sa
 
 @needs_search
 def test_a_bag_without_the_topic_names_those_that_it_has(coec: Coec, tmp_path: Path) -> None:
-    bag = Bag(a_drive()).write(tmp_path / "b.mcap")
+    bag = Bag(drive_messages()).write(tmp_path / "b.mcap")
     outcome = coec("lidars", bag, "/points", "/others")
     assert outcome.status == 1
     assert "no topic /others for points; there: /points" in outcome.err

@@ -13,7 +13,7 @@ from cli.conftest import SMALL, Coec
 from coec.adapters.depth.maps import open_depth
 from coec.config import DepthConfig, LimitsConfig
 from coec.schemas.evaluation import ModelAssessment
-from tiny_onnx import first_channel
+from tiny_onnx import first_channel_network
 
 
 def test_lists_the_cards_of_the_contract(coec: Coec) -> None:
@@ -54,7 +54,7 @@ def test_a_known_network_without_its_file_is_refused_with_the_way_out(coec: Coec
 
 def test_adds_an_export_of_a_network_once_and_then_uses_it(coec: Coec, folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "dpt_beit_large_512.onnx"
-    file.write_bytes(first_channel())
+    file.write_bytes(first_channel_network())
     before = os.umask(0o077)
     try:
         outcome = coec("models", "add", file)
@@ -75,7 +75,7 @@ def test_adds_an_export_of_a_network_once_and_then_uses_it(coec: Coec, folder: P
 
 def test_another_file_in_its_place_is_replaced_only_if_asked(coec: Coec, folder: Path, tmp_path: Path) -> None:
     file, place = tmp_path / "any.onnx", folder / "midas_small.onnx"
-    file.write_bytes(first_channel())
+    file.write_bytes(first_channel_network())
     folder.mkdir(parents=True)
     place.write_bytes(b"another export")
     refused = coec("models", "add", file, "--as", "midas_small")
@@ -89,11 +89,11 @@ def test_another_file_in_its_place_is_replaced_only_if_asked(coec: Coec, folder:
 @pytest.mark.parametrize(
     ("name", "content", "more", "status", "said"),
     [
-        ("mine.onnx", first_channel(), (), 1, "docs/own-network.md"),
-        ("mine.onnx", first_channel(), ("--as", "nosuch"), 2, "no built-in card of this name"),
-        ("street.onnx", first_channel(), (), 1, "another file, or a damaged one"),
+        ("mine.onnx", first_channel_network(), (), 1, "docs/own-network.md"),
+        ("mine.onnx", first_channel_network(), ("--as", "nosuch"), 2, "no built-in card of this name"),
+        ("street.onnx", first_channel_network(), (), 1, "another file, or a damaged one"),
         ("midas_small.onnx", b"rubbish", (), 1, "midas_small.onnx"),
-        ("midas_small.onnx", first_channel((1, 4, "h", "w")), (), 1, "midas_small.onnx"),
+        ("midas_small.onnx", first_channel_network((1, 4, "h", "w")), (), 1, "midas_small.onnx"),
         ("midas_small.onnx", None, (), 1, "there is no file"),
     ],
     ids=["unknown", "unknown name", "another file", "damaged", "another input", "absent"],
@@ -119,7 +119,7 @@ def test_what_is_no_known_network_is_not_added(
 
 def test_weights_in_other_files_are_refused_with_the_way_out(coec: Coec, folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "midas_small.onnx"
-    file.write_bytes(first_channel())
+    file.write_bytes(first_channel_network())
     (tmp_path / "midas_small.onnx.data").write_bytes(b"weights")
     outcome = coec("models", "add", file)
     assert outcome.status == 1

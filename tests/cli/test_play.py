@@ -15,10 +15,10 @@ import xxhash
 import zenoh
 from mcap.writer import Writer
 
-from bags import STORE, Bag, a_drive
+from bags import STORE, Bag, drive_messages
 from cli.conftest import SMALL, Coec
 from coec.adapters.ros.incoming import decode
-from coec.adapters.ros.wire.rmw_zenoh import Attachment
+from coec.adapters.ros.wire.rmw_zenoh import MessageAttachment
 from coec.adapters.zenoh.bus import open_session
 from coec.config import LimitsConfig, ZenohConfig
 from fakes import wait_until
@@ -57,8 +57,8 @@ class Listener:
     def _note(self, sample: zenoh.Sample) -> None:
         self.tokens.add(str(sample.key_expr))
 
-    def attachments(self, key: str) -> list[Attachment]:
-        told = [Attachment.parse(s.attachment.to_bytes()) for s in self.samples[key] if s.attachment]
+    def attachments(self, key: str) -> list[MessageAttachment]:
+        told = [MessageAttachment.parse(s.attachment.to_bytes()) for s in self.samples[key] if s.attachment]
         return [attachment for attachment in told if attachment is not None]
 
     def count(self) -> int:
@@ -89,7 +89,7 @@ def played(coec: Coec, listener: Listener, source: object, *options: object) -> 
 def test_a_bag_keeps_its_topics_types_and_bytes_on_the_keys_of_rmw_zenoh(
     coec: Coec, listener: Listener, tmp_path: Path
 ) -> None:
-    drive = a_drive()
+    drive = drive_messages()
     document = played(coec, listener, Bag(drive).write(tmp_path / "b.mcap"), "--middleware", "rmw_zenoh")
     assert document["frames"] == {
         "/front/image": 4, "/front/camera_info": 1, "/points": 8, "/odom": 20, "/tf_static": 1
@@ -106,7 +106,7 @@ def test_a_bag_keeps_its_topics_types_and_bytes_on_the_keys_of_rmw_zenoh(
 
 
 def test_a_bag_on_the_keys_of_a_bridge(coec: Coec, listener: Listener, tmp_path: Path) -> None:
-    drive = a_drive()
+    drive = drive_messages()
     config = tmp_path / "coec.yaml"
     config.write_text(
         "middleware: ros2dds\nros: {namespace: /shuttle}\npairs:\n- name: front\n  points: /points\n"
@@ -122,7 +122,7 @@ def test_a_bag_on_the_keys_of_a_bridge(coec: Coec, listener: Listener, tmp_path:
 
 
 def test_topics_are_chosen_by_name(coec: Coec, listener: Listener, tmp_path: Path) -> None:
-    bag = Bag(a_drive()).write(tmp_path / "b.mcap")
+    bag = Bag(drive_messages()).write(tmp_path / "b.mcap")
     document = played(coec, listener, bag, "--middleware", "ros2dds", "--topics", "/points,/odom")
     assert set(document["frames"]) == {"/points", "/odom"}
     said = coec("play", bag, "--middleware", "ros2dds", "--topics", "/lidar", "--connect", listener.endpoint)
@@ -133,7 +133,7 @@ def test_topics_are_chosen_by_name(coec: Coec, listener: Listener, tmp_path: Pat
 def test_stamps_begin_now_where_asked_and_all_else_is_as_recorded(
     coec: Coec, listener: Listener, tmp_path: Path
 ) -> None:
-    drive = a_drive()
+    drive = drive_messages()
     bag = Bag(drive).write(tmp_path / "b.mcap")
     played(coec, listener, bag, "--middleware", "rmw_zenoh", "--start-now")
     now, then = listener.payloads(IMAGE_KEY), recorded(drive, "/front/image")
@@ -148,7 +148,7 @@ def test_stamps_begin_now_where_asked_and_all_else_is_as_recorded(
 def test_a_loop_goes_on_in_time_until_it_is_told_to_stop(
     coec: Coec, listener: Listener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive = a_drive()
+    drive = drive_messages()
     take = listener.take
 
     def counted(sample: zenoh.Sample) -> None:
@@ -191,7 +191,7 @@ def test_types_that_are_not_ros_own_have_no_key_of_rmw_zenoh(coec: Coec, listene
 @pytest.mark.fault("a bag with topics that are not valid ROS names", "they are named, escaped, and not played")
 @pytest.mark.parametrize("topic", ["/**", "/a/*/b", "a", "/", "//a", "/a$b", "/a\x1b[2J", "/" + 300 * "a", "/@ros2_lv"])
 def test_names_that_are_none_are_left_out(coec: Coec, listener: Listener, tmp_path: Path, topic: str) -> None:
-    bag = Bag([*a_drive(), (topic, a_drive()[1][1])]).write(tmp_path / "b.mcap")
+    bag = Bag([*drive_messages(), (topic, drive_messages()[1][1])]).write(tmp_path / "b.mcap")
     told = coec("play", bag, "--middleware", "ros2dds", "--rate", 0, "--connect", listener.endpoint, "--json")
     assert told.status == 0, told.err
     assert len(told.document["frames"]) == 5
@@ -240,6 +240,6 @@ def test_all_sensors_of_a_rig_are_played_on_topics_of_their_own(coec: Coec, list
     ],
 )
 def test_options_that_do_not_go_together_are_refused(coec: Coec, tmp_path: Path, options: Any, said: str) -> None:
-    told = coec("play", Bag(a_drive()).write(tmp_path / "b.mcap"), *options)
+    told = coec("play", Bag(drive_messages()).write(tmp_path / "b.mcap"), *options)
     assert told.status == 2
     assert said in told.err

@@ -10,10 +10,10 @@ from certificates import TestAuthority
 from cli.conftest import Coec
 from coec.adapters.zenoh.bus import open_session
 from coec.config import SenderConfig, ZenohConfig
-from doors import opened
+from doors import shipped_router
 from fakes import wait_until
 from ports import free_port
-from vehicles import KEYS, LIMITS, serving
+from vehicles import KEYS, VEHICLE_LIMITS, serving
 
 
 @pytest.mark.fault("`coec query command/...` by somebody without permission", "it says `not_allowed`, and exits with 1")
@@ -24,7 +24,7 @@ def test_the_command_line_proves_who_it_is(authority: TestAuthority, coec: Coec,
     may = authority.of_service(SenderConfig(name="operator", commands=("hold",)))
     with (
         serving(tmp_path / "state", config, may) as there,
-        open_session(ZenohConfig(connect=(endpoint,)), LIMITS) as client,
+        open_session(ZenohConfig(connect=(endpoint,)), VEHICLE_LIMITS) as client,
     ):
         wait_until(lambda: bool(list(client.get(KEYS.status, timeout=20.0))), "the vehicle answers")
         told = coec("query", "command/hold", *operator, "--json")
@@ -56,7 +56,7 @@ def test_a_file_that_is_none_is_named(coec: Coec, tmp_path: Path) -> None:
 def test_what_the_router_keeps_back_reads_as_denied(authority: TestAuthority, coec: Coec, tmp_path: Path) -> None:
     may = authority.of_service(SenderConfig(name="operator"))
     with (
-        opened(authority, tmp_path) as door,
+        shipped_router(authority, tmp_path) as door,
         serving(tmp_path / "state", ZenohConfig(connect=(door.loopback,)), may) as there,
     ):
         viewer, operator = ("--zenoh", door.file("viewer")), ("--zenoh", door.file("operator"))

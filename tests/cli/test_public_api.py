@@ -23,7 +23,7 @@ from coec.schemas.base import to_json
 from coec.schemas.evaluation import EvaluationReport
 from coec.schemas.replies import CalibrationResult
 from conftest import REPOSITORY
-from drives import drawn
+from drives import rendered_drive
 from e2e.processes import environment
 
 HEAVY = ("asyncio", "cv2", "matplotlib", "numba", "numpy", "onnxruntime", "pydantic", "rich", "typing", "zenoh")
@@ -41,7 +41,7 @@ def drive() -> package.Recording:
 def results() -> dict[float, package.Result]:
     """Of the drive, by how far the start is off in yaw: right, and beyond what can be found."""
     with pytest.MonkeyPatch.context() as patch:  # as `drawn_once`, which comes later
-        patch.setattr("coec.simulation.source.open_sim", drawn)
+        patch.setattr("coec.simulation.source.open_sim", rendered_drive)
         window = package.open(SMALL).window()
     return {yaw: window.calibrate(depth="stereo", objective="mi", perturb=(0, yaw, 0)) for yaw in (1.0, 40.0)}
 

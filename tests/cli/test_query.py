@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.zenoh.bus import JSON, Answer, Bus, Lane, Request, Route, open_session
+from coec.adapters.zenoh.bus import JSON, Answer, Bus, QueryLane, Request, Route, open_session
 from coec.cli.query import KEYS as HELPED
 from coec.cli.query import PLAIN_KEYS, WITH_ARGUMENT, query
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError
 from coec.schemas.base import Message, to_json
-from coec.schemas.commands import NAMES, arguments_of
+from coec.schemas.commands import COMMAND_NAMES, arguments_of
 from coec.schemas.keys import RIG, Keys, parse_command_selector, parse_range_selector
 from coec.schemas.replies import (
     Acknowledgement,
@@ -31,7 +31,7 @@ from coec.schemas.replies import (
 )
 from conftest import REPOSITORY
 from ports import free_port
-from statuses import a_status
+from statuses import status_reply
 
 DEADLINE_S = 20.0
 KEYS = Keys("coec", "vehicle")
@@ -74,12 +74,12 @@ def vehicle() -> Iterator[str]:
 
 
 def serve_document(bus: Bus, key: str, document: Message) -> None:
-    route = Route(key, lambda _: Answer(to_json(document), JSON), Lane.AT_ONCE)
+    route = Route(key, lambda _: Answer(to_json(document), JSON), QueryLane.AT_ONCE)
     bus.serve(key, lambda _: [route])
 
 
 def serve_status(bus: Bus, *pairs: str) -> None:
-    status = a_status(pairs=tuple(PairStatus(name=name) for name in pairs))
+    status = status_reply(pairs=tuple(PairStatus(name=name) for name in pairs))
     serve_document(bus, KEYS.status, status)
 
 
@@ -88,7 +88,7 @@ def window_routes(key: str) -> Sequence[Route]:
         chosen = parse_range_selector(parameters)
         return Answer(WINDOW[chosen.offset : chosen.offset + chosen.length], "application/octet-stream")
 
-    return [Route(key, lambda request: answer(request.parameters), Lane.FILES)]
+    return [Route(key, lambda request: answer(request.parameters), QueryLane.FILES)]
 
 
 def acknowledging(key: str) -> Sequence[Route]:
@@ -102,7 +102,7 @@ def acknowledging(key: str) -> Sequence[Route]:
         )
         return Answer(to_json(done), JSON)
 
-    return [Route(key, answer, Lane.AT_ONCE)]
+    return [Route(key, answer, QueryLane.AT_ONCE)]
 
 
 def no_event(_: str) -> Sequence[Route]:
@@ -322,7 +322,7 @@ def test_options_stand_for_the_entries_of_a_payload(
 
 def test_every_entry_of_a_payload_has_its_option() -> None:
     fields = set(inspect.signature(query).parameters)
-    for command in NAMES:
+    for command in COMMAND_NAMES:
         for for_rig in (False, True):
             assert {argument.name for argument in arguments_of(command, for_rig=for_rig)} <= fields
 

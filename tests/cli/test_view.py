@@ -18,12 +18,12 @@ import pytest
 pytest.importorskip("foxglove", reason="needs the optional extra `foxglove`")
 
 from adapters.foxglove.test_shown import places, projected
-from boards import MOVED, NOMINAL
+from boards import BOARD_MOVED, BOARD_NOMINAL
 from cli.conftest import SMALL, Coec, Outcome
 from cli.vehicle_on_screen import CANDIDATE, KEYS, PAIR, RIG, Sensors, Service, configuration, extrinsic, health
 from coec.adapters.files.conversions import result_of
 from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.topics import POINTS, TOPICS, Pose
+from coec.adapters.foxglove.topics import POINTS_TOPICS, TOPIC_DESCRIPTIONS, DisplayedPose
 from coec.adapters.frames.msgpack_frames import encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
 from coec.calibration.frames.motion_compensation import compensate
@@ -32,8 +32,8 @@ from coec.errors import ConfigError, ConnectionFailedError, SourceError, Unavail
 from coec.geometry import se3
 from coec.reports import console
 from coec.schemas.base import to_json
-from coec.sources.windows import chosen_from
-from drives import drawn_source
+from coec.sources.windows import window_of_recording
+from drives import rendered_source
 from e2e.processes import Router, free_endpoint
 from estimates import estimate
 from fakes import wait_until
@@ -97,7 +97,7 @@ def came(message: Any) -> np.ndarray:
 
 def take(stamps: list[int], viewer: Viewer) -> None:
     """The stamp of the next picture; one that rests on the screen is shown again now and then."""
-    stamp = stamp_ns(viewer.next_on(topics.IMAGE))
+    stamp = stamp_ns(viewer.next_on(topics.IMAGE_TOPIC))
     if not stamps or stamps[-1] != stamp:
         stamps.append(stamp)
 
@@ -124,38 +124,38 @@ def result_file(folder: Path, rig: Rig, T_camera_lidar: np.ndarray) -> Path:
 
 
 def test_a_recording_is_shown_and_stays_to_be_seen(viewing: Callable[..., Outcome], tmp_path: Path) -> None:
-    recording = drawn_source(SMALL)
+    recording = rendered_source(SMALL)
     rig = recording.rig
     turned = se3.perturb(rig.T_camera_lidar_nominal, np.radians([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    last = chosen_from(recording, len(recording.camera_stamps_ns), lambda *_: None).window.pairs[-1]
+    last = window_of_recording(recording, len(recording.camera_stamps_ns), lambda *_: None).window.pairs[-1]
     xyz_m = compensate(last, rig, enabled=True)
     stamps: list[int] = []
 
     def look(url: str) -> None:
         with Viewer(url) as viewer:
-            viewer.subscribe([topics.IMAGE, topics.HEALTH, *POINTS.values()])
+            viewer.subscribe([topics.IMAGE_TOPIC, topics.HEALTH_TOPIC, *POINTS_TOPICS.values()])
             while len(stamps) < len(recording.camera_stamps_ns):
                 take(stamps, viewer)
-            picture = synchronised(viewer, set(POINTS.values()))  # the last pair, which stays
+            picture = synchronised(viewer, set(POINTS_TOPICS.values()))  # the last pair, which stays
             for pose, T_camera_lidar in (
-                (Pose.SERVED, rig.T_camera_lidar_nominal), (Pose.NOMINAL, rig.T_camera_lidar_nominal),
-                (Pose.CANDIDATE, turned),
+                (DisplayedPose.SERVED, rig.T_camera_lidar_nominal), (DisplayedPose.NOMINAL, rig.T_camera_lidar_nominal),
+                (DisplayedPose.CANDIDATE, turned),
             ):  # fmt: skip
-                drawn = places(came(picture[POINTS[pose]]))
+                drawn = places(came(picture[POINTS_TOPICS[pose]]))
                 assert len(drawn) > 500
                 assert drawn <= places(projected(rig.camera, T_camera_lidar, xyz_m))
-            moment = viewer.next_on(topics.HEALTH)
+            moment = viewer.next_on(topics.HEALTH_TOPIC)
         assert (moment["state"], moment["status"], moment["candidate"]) == ("recorded", "accepted", True)
         assert moment["step"]["rx_deg"] == pytest.approx(3.0)
         with Viewer(url) as late:
-            late.subscribe([topics.IMAGE])
-            assert stamp_ns(late.next_on(topics.IMAGE)) == stamps[-1], "who comes late sees the last pair"
+            late.subscribe([topics.IMAGE_TOPIC])
+            assert stamp_ns(late.next_on(topics.IMAGE_TOPIC)) == stamps[-1], "who comes late sees the last pair"
 
     outcome = viewing(look, SMALL, "--rate", "20", "--result", result_file(tmp_path, rig, turned))
     assert outcome.status == 0
     assert stamps == list(recording.camera_stamps_ns)
     told = outcome.document
-    assert set(told["topics"]) == set(TOPICS)
+    assert set(told["topics"]) == set(TOPIC_DESCRIPTIONS)
     assert told["frames"]["served"] == f"{rig.camera_frame}_served"
     assert told["url"].startswith("ws://127.0.0.1:")
 
@@ -165,13 +165,13 @@ def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Out
 
     def look(url: str) -> None:
         with Viewer(url) as viewer:
-            viewer.subscribe([topics.IMAGE, topics.HEALTH])
+            viewer.subscribe([topics.IMAGE_TOPIC, topics.HEALTH_TOPIC])
             while len(stamps) < 9:
                 take(stamps, viewer)
-            assert viewer.next_on(topics.HEALTH)["state"] == "recorded", "however fast it is played"
+            assert viewer.next_on(topics.HEALTH_TOPIC)["state"] == "recorded", "however fast it is played"
 
     assert viewing(look, SMALL, "--rate", "100", "--repeat").status == 0
-    recorded = list(drawn_source(SMALL).camera_stamps_ns)
+    recorded = list(rendered_source(SMALL).camera_stamps_ns)
     assert len(recorded) == 6
     assert stamps[:6] == recorded
     assert np.diff(stamps).min() > 0
@@ -183,7 +183,7 @@ def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Out
 def until(viewer: Viewer, condition: Callable[[Any], bool], meanwhile: Callable[[], None] = lambda: None) -> Any:
     """The first line of the timeline for which it holds. What is done `meanwhile` may be lost on a busy bus."""
     end_s = time.monotonic() + PATIENCE_S
-    while not condition(moment := viewer.next_on(topics.HEALTH)):
+    while not condition(moment := viewer.next_on(topics.HEALTH_TOPIC)):
         assert time.monotonic() < end_s, moment
         meanwhile()
     return moment
@@ -195,8 +195,8 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
 ) -> None:
     def look(url: str) -> None:
         with Viewer(url) as viewer, Sensors(router.session) as sensors:
-            viewer.subscribe([topics.HEALTH, topics.LOG])
-            assert viewer.next_on(topics.HEALTH)["state"] == "not_served"
+            viewer.subscribe([topics.HEALTH_TOPIC, topics.LOG_TOPIC])
+            assert viewer.next_on(topics.HEALTH_TOPIC)["state"] == "not_served"
             service = Service(router.session)
             moment = until(viewer, lambda moment: moment["state"] == "healthy" and "provenance" in moment)
             assert (moment["provenance"], moment["level"], moment["candidate"]) == ("estimated", 0, True)
@@ -204,11 +204,15 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
             assert "camera_s" not in moment["ages"]
             assert not sensors.are_heard, "nobody looks at pictures"
 
-            viewer.subscribe([topics.IMAGE, *POINTS.values()])
-            picture = synchronised(viewer, {topics.IMAGE, *POINTS.values()})
-            expected = {Pose.SERVED: MOVED, Pose.NOMINAL: NOMINAL, Pose.CANDIDATE: CANDIDATE}
+            viewer.subscribe([topics.IMAGE_TOPIC, *POINTS_TOPICS.values()])
+            picture = synchronised(viewer, {topics.IMAGE_TOPIC, *POINTS_TOPICS.values()})
+            expected = {
+                DisplayedPose.SERVED: BOARD_MOVED,
+                DisplayedPose.NOMINAL: BOARD_NOMINAL,
+                DisplayedPose.CANDIDATE: CANDIDATE,
+            }
             for pose, T_camera_lidar in expected.items():
-                marks = picture[POINTS[pose]]
+                marks = picture[POINTS_TOPICS[pose]]
                 assert places(came(marks)) == places(projected(RIG.camera, T_camera_lidar, PAIR.lidar.xyz_m))
             assert marks.texts[0].text == "candidate: waits for apply"
             assert sensors.are_heard
@@ -224,11 +228,11 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
             record_property("figure", f"{time.monotonic() - died_s:.1f} s")
             assert moment["level"] == 3
             assert moment["provenance"] == "estimated", "the last that is known"
-            while "not_served" not in viewer.next_on(POINTS[Pose.SERVED]).texts[0].text:
+            while "not_served" not in viewer.next_on(POINTS_TOPICS[DisplayedPose.SERVED]).texts[0].text:
                 pass
             wait_until(lambda: sensors.are_heard, "frames, still")
         with Viewer(url) as other, Sensors(router.session) as sensors:
-            other.subscribe([topics.HEALTH])
+            other.subscribe([topics.HEALTH_TOPIC])
             wait_until(lambda: not sensors.are_heard, "the end of the subscriptions")
 
     assert viewing(look, "--config", configuration(tmp_path, router.endpoint)).status == 0
@@ -243,7 +247,7 @@ def test_rubbish_is_counted(
     def look(url: str) -> None:
         service = Service(router.session)
         with Viewer(url) as viewer, Sensors(router.session) as sensors:
-            viewer.subscribe([topics.HEALTH, topics.IMAGE])
+            viewer.subscribe([topics.HEALTH_TOPIC, topics.IMAGE_TOPIC])
             until(viewer, lambda moment: moment["state"] == "healthy")
             wait_until(lambda: sensors.are_heard, "subscriptions")
             key = KEYS.extrinsic("front")
@@ -261,7 +265,7 @@ def test_rubbish_is_counted(
             }  # fmt: skip
             moment = until(viewer, lambda moment: refused <= counted(moment), babble)
             assert moment["provenance"] == "estimated", "what was served is served"
-            viewer.next_on(topics.IMAGE)
+            viewer.next_on(topics.IMAGE_TOPIC)
             record_property("figure", f"{len(refused)} causes")
         service.end()
 
@@ -301,7 +305,7 @@ def test_what_is_not_there_is_said(coec: Coec, tmp_path: Path, router: Router) -
     rubbish.write_text("[]")
     outcome = coec("view", SMALL, "--result", rubbish)
     assert (outcome.status, "coec calibrate --json" in outcome.err) == (SourceError.exit_code, True)
-    result_file(tmp_path, drawn_source(SMALL).rig, np.diag([2.0, 1.0, 1.0, 1.0]))
+    result_file(tmp_path, rendered_source(SMALL).rig, np.diag([2.0, 1.0, 1.0, 1.0]))
     outcome = coec("view", SMALL, "--result", rubbish)
     assert (outcome.status, "no rotation" in outcome.err) == (SourceError.exit_code, True)
     path = configuration(tmp_path, router.endpoint)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from boards import MOVED, NOMINAL
+from boards import BOARD_MOVED, BOARD_NOMINAL
 from cli.vehicle_on_screen import PAIR, RIG, configuration, extrinsic, health
-from coec.adapters.foxglove.topics import Pose
+from coec.adapters.foxglove.topics import DisplayedPose
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
 from coec.cli import view_vehicle
@@ -39,8 +39,8 @@ SAID = ServiceState(
     alive=True,
     answer_age_s=1.0,
     health=from_msgpack(HealthReply, health("miscalibrated")),
-    extrinsic=from_msgpack(ExtrinsicReply, extrinsic(MOVED)),
-    served=MOVED,
+    extrinsic=from_msgpack(ExtrinsicReply, extrinsic(BOARD_MOVED)),
+    served=BOARD_MOVED,
 )
 
 
@@ -59,13 +59,13 @@ def test_who_does_not_answer_is_silent_and_who_is_not_there_serves_nothing() -> 
 
 def test_what_is_not_known_is_not_drawn_and_says_so() -> None:
     nothing = extrinsics_of_service(RIG, ServiceState())
-    assert nothing[Pose.SERVED].T_camera_lidar is None
-    assert nothing[Pose.SERVED].title == "served: not known, not_served"
-    np.testing.assert_array_equal(nothing[Pose.NOMINAL].T_camera_lidar, NOMINAL)
-    assert nothing[Pose.CANDIDATE].title == "candidate: none"
+    assert nothing[DisplayedPose.SERVED].T_camera_lidar is None
+    assert nothing[DisplayedPose.SERVED].title == "served: not known, not_served"
+    np.testing.assert_array_equal(nothing[DisplayedPose.NOMINAL].T_camera_lidar, BOARD_NOMINAL)
+    assert nothing[DisplayedPose.CANDIDATE].title == "candidate: none"
     gone = extrinsics_of_service(RIG, replace(SAID, alive=False))
-    assert gone[Pose.SERVED].T_camera_lidar is MOVED, "the last that is known"
-    assert gone[Pose.SERVED].title == "served: estimated, not_served"
+    assert gone[DisplayedPose.SERVED].T_camera_lidar is BOARD_MOVED, "the last that is known"
+    assert gone[DisplayedPose.SERVED].title == "served: estimated, not_served"
 
 
 @pytest.fixture

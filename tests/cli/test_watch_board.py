@@ -19,34 +19,34 @@ from coec.adapters.images.codec import encode_jpeg
 from coec.adapters.system import keyboard
 from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.words import Words
+from coec.adapters.zenoh.words import HeartbeatReceiver
 from coec.cli.fleet_screen import Board, PairQuery
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import DecodeError
-from coec.fleet.roster import Filter, Roster
+from coec.fleet.roster import FleetFilter, FleetState
 from coec.reports import half_blocks
 from coec.schemas.base import to_msgpack
 from coec.schemas.keys import Keys
 from coec.schemas.replies import HistoryReply
 from e2e.processes import Router, free_endpoint
 from fakes import wait_until
-from last_words import a_word, packed
-from storages import Storage
+from last_words import heartbeat, packed_heartbeat
+from storages import MemoryStorage
 
 ALL = Keys("coec", "*")
 
 
 def say(session: zenoh.Session, vehicle: str, **told: Any) -> None:
     key = Keys("coec", vehicle).last("front")
-    session.put(key, packed(a_word(vehicle, **told)), timestamp=session.new_timestamp())
+    session.put(key, packed_heartbeat(heartbeat(vehicle, **told)), timestamp=session.new_timestamp())
 
 
 def test_what_was_kept_is_told_once_most_urgent_first(coec: Coec, router: Router) -> None:
-    with Storage(router.session, ALL.last("*")) as storage, connected([router.endpoint], 5.0) as vehicle:
+    with MemoryStorage(router.session, ALL.last("*")) as storage, connected([router.endpoint], 5.0) as vehicle:
         say(vehicle, "truck-1")
         say(vehicle, "truck-2", state="miscalibrated", event="front-7")
         say(vehicle, "truck-3", service="stopping")
-        wait_until(lambda: len(storage.kept) == 3, "the words are kept")
+        wait_until(lambda: len(storage.samples) == 3, "the words are kept")
         outcome = coec("watch", "--once", "--connect", router.endpoint, "--json")
         told = [(pair["word"]["vehicle"], pair["standing"]) for pair in outcome.document["pairs"]]
         assert told == [("truck-2", "silent"), ("truck-1", "silent"), ("truck-3", "parked")], "all long ago"
@@ -86,9 +86,9 @@ def test_what_does_not_go_together_is_a_usage_error(
 @contextmanager
 def board_of(router: Router) -> Iterator[Board]:
     with connected([router.endpoint], 5.0) as session, connected([router.endpoint], 5.0) as of_tokens:
-        words = Words(session, of_tokens, ALL, 2.0)
-        with words.listening(), PairQuery(session, "coec") as asking:
-            yield Board(Roster(), words, Filter(), asking)
+        words = HeartbeatReceiver(session, of_tokens, ALL, 2.0)
+        with words.subscribed(), PairQuery(session, "coec") as asking:
+            yield Board(FleetState(), words, FleetFilter(), asking)
 
 
 def text(board: Board) -> str:
@@ -149,14 +149,14 @@ def test_a_word_that_was_lost_is_asked_for(router: Router) -> None:
     key = Keys("coec", "truck-5").last("front")
     now_s = 1000.0
     with connected([router.endpoint], 5.0) as vehicle, board_of(router) as board:
-        wait_until(lambda: board.heartbeats.told.is_set(), "nobody has said anything")
+        wait_until(lambda: board.heartbeats.initial_query_done.is_set(), "nobody has said anything")
 
         def answer(query: zenoh.Query) -> None:
             with query:
-                query.reply(key, packed(a_word("truck-5", said_ns=2**62)))
+                query.reply(key, packed_heartbeat(heartbeat("truck-5", said_ns=2**62)))
 
         vehicle.declare_queryable(key, answer)
-        board.state.hear(key, packed(a_word("truck-5", state="suspect")), -now_s)
+        board.state.on_heartbeat(key, packed_heartbeat(heartbeat("truck-5", state="suspect")), -now_s)
         assert "silent (suspect)" in text(board)
         board.queried_s = -now_s
         wait_until(lambda: "1 healthy" in text(board), "it has answered")
@@ -176,7 +176,7 @@ def test_a_link_that_breaks_is_said_and_words_come_again_with_it(
     with ExitStack() as stack:
         with router_at(endpoint) as session:
             board = stack.enter_context(board_of(Router(session, endpoint)))
-            wait_until(lambda: board.heartbeats.told.is_set(), "nobody has said anything")
+            wait_until(lambda: board.heartbeats.initial_query_done.is_set(), "nobody has said anything")
             say(session, "truck-1")
             wait_until(lambda: "1 vehicle, 1 pair: 1 healthy" in text(board), "it is told")
         wait_until(lambda: "no router: nothing new arrives" in text(board), "the link is gone")
@@ -200,7 +200,7 @@ def test_keys_are_read_as_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> N
     ours, theirs = os.openpty()
     with os.fdopen(theirs) as terminal, os.fdopen(ours, "wb", buffering=0) as hand:
         monkeypatch.setattr(sys, "stdin", terminal)
-        with keyboard.keys() as poll:
+        with keyboard.pressed_keys() as poll:
             assert poll(0.0) is None
             for sent, key in ((b"\x1b[A", "up"), (b"q", "q"), (b"\xff", None), (b"\x1b[B", "down")):
                 hand.write(sent)
@@ -210,7 +210,7 @@ def test_keys_are_read_as_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.fault("an invalid picture from a vehicle", "refused, the board goes on")
 def test_a_picture_that_is_none_is_refused() -> None:
     with pytest.raises(DecodeError):
-        half_blocks.drawn(b"\xff\xd8\xff not a picture", 80, 24)
-    drawn = half_blocks.drawn(encode_jpeg(np.zeros((100, 400, 3), np.uint8)), 80, 24).plain
+        half_blocks.half_block_text(b"\xff\xd8\xff not a picture", 80, 24)
+    drawn = half_blocks.half_block_text(encode_jpeg(np.zeros((100, 400, 3), np.uint8)), 80, 24).plain
     rows = drawn.splitlines()
     assert (len(rows), {len(row) for row in rows}) == (10, {80})

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from boards import LENSES, MOVED, NOMINAL, pair_with, rig_with
+from boards import BOARD_LENSES, BOARD_MOVED, BOARD_NOMINAL, board_frame_pair, board_rig
 from coec.adapters.files.conversions import transform_of
 from coec.adapters.files.rig import intrinsics_config
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.matching import is_heard
+from coec.adapters.zenoh.matching import has_subscribers
 from coec.config import Config
 from coec.geometry import se3
 from coec.reports.commented_yaml import commented_yaml
@@ -33,11 +33,11 @@ from coec.schemas.replies import (
     Reason,
 )
 
-RIG = rig_with(LENSES["double_sphere"])
-PAIR = pair_with(RIG.camera)
+RIG = board_rig(BOARD_LENSES["double_sphere"])
+PAIR = board_frame_pair(RIG.camera)
 PAIR = replace(PAIR, lidar=replace(PAIR.lidar, xyz_m=PAIR.lidar.xyz_m[::16], ring=None))
 KEYS = Keys("coec", "vehicle")
-CANDIDATE = se3.perturb(NOMINAL, np.radians([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+CANDIDATE = se3.perturb(BOARD_NOMINAL, np.radians([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
 PERIOD_S = 0.05
 
 
@@ -46,7 +46,7 @@ class Service:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
-        self._said = {KEYS.health("front"): health("healthy"), KEYS.extrinsic("front"): extrinsic(MOVED)}
+        self._said = {KEYS.health("front"): health("healthy"), KEYS.extrinsic("front"): extrinsic(BOARD_MOVED)}
         self._queryables = [session.declare_queryable(key, self._answer) for key in self._said]
         self._token = session.liveliness().declare_token(KEYS.alive("front"))
 
@@ -94,7 +94,7 @@ def configuration(folder: Path, endpoint: str) -> Path:
         "name": "front",
         "camera": {"key": "in/camera", "frame_id": "cam", "intrinsics": intrinsics_config(RIG.camera).model_dump()},
         "lidar": {"key": "in/lidar", "frame_id": "velo"},
-        "T_camera_lidar": NOMINAL.tolist(),
+        "T_camera_lidar": BOARD_NOMINAL.tolist(),
     }
     zenoh_config = {"connect": [endpoint], "listen": [endpoint]}
     path = folder / "coec.yaml"
@@ -122,7 +122,7 @@ class Sensors:
 
     @property
     def are_heard(self) -> bool:
-        return any(is_heard(publisher) for publisher in self._publishers.values())
+        return any(has_subscribers(publisher) for publisher in self._publishers.values())
 
     def _send(self) -> None:
         number = 0

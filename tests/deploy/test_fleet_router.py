@@ -16,17 +16,17 @@ import zenoh
 
 from certificates import TestAuthority
 from coec.adapters.zenoh.bus import MSGPACK, Answer
-from coec.adapters.zenoh.client import Way, ask, connected, connected_by
+from coec.adapters.zenoh.client import RouterAddress, connected, connected_by, query_all
 from coec.adapters.zenoh.settings import unguarded
 from coec.config import ZenohConfig
 from coec.schemas import last_word
 from coec.schemas.keys import Keys
 from conftest import REPOSITORY
-from doors import RULES
+from doors import ROUTER_RULES
 from fakes import wait_until
-from last_words import a_word, packed
+from last_words import heartbeat, packed_heartbeat
 from ports import free_port
-from storages import Storage
+from storages import MemoryStorage
 from vehicles import KEYS, PAIR, serving
 
 DEPLOY = REPOSITORY / "deploy"
@@ -45,10 +45,10 @@ class Fleet:
     router: zenoh.Session
     endpoint: str
     of_vehicle: str
-    storage: Storage
+    storage: MemoryStorage
 
-    def way(self, name: str) -> Way:
-        return Way((self.endpoint,), self.authority.session(name, self.endpoint))
+    def way(self, name: str) -> RouterAddress:
+        return RouterAddress((self.endpoint,), self.authority.session(name, self.endpoint))
 
 
 def replaced(text: str, *pairs: tuple[str, str]) -> str:
@@ -66,8 +66,10 @@ def fleet(authority: TestAuthority, tmp_path_factory: pytest.TempPathFactory) ->
     central = folder / "fleet-router.json5"
     central.write_text(replaced(FLEET_RULES.read_text(), tls, ("tls/[::]:7448", f"tls/127.0.0.1:{ports[0]}")))
     of_vehicle = folder / "router.json5"
-    (line,) = [line.strip("/ \n") for line in RULES.read_text().splitlines() if "tls/FLEET" in line]
-    text = replaced(RULES.read_text(), ("connect: { endpoints: [] }", f"connect: {{ endpoints: [{line}] }}"), tls)
+    (line,) = [line.strip("/ \n") for line in ROUTER_RULES.read_text().splitlines() if "tls/FLEET" in line]
+    text = replaced(
+        ROUTER_RULES.read_text(), ("connect: { endpoints: [] }", f"connect: {{ endpoints: [{line}] }}"), tls
+    )
     doors = (
         ("tls/FLEET:7448", f"tls/localhost:{ports[0]}"),
         ("tls/[::]:7448", f"tls/127.0.0.1:{ports[1]}"),
@@ -78,7 +80,7 @@ def fleet(authority: TestAuthority, tmp_path_factory: pytest.TempPathFactory) ->
     with ExitStack() as stack:
         router = stack.enter_context(zenoh.open(zenoh.Config.from_file(central)))
         told = STORAGES["storages"]["last_words"]
-        storage = stack.enter_context(Storage(router, told["key_expr"], complete=told["complete"]))
+        storage = stack.enter_context(MemoryStorage(router, told["key_expr"], complete=told["complete"]))
         stack.enter_context(zenoh.open(zenoh.Config.from_file(of_vehicle)))
         yield Fleet(authority, router, endpoint, loopback, storage)
 
@@ -107,18 +109,18 @@ def test_a_vehicle_that_was_heard_once_can_be_asked_about_when_it_has_gone(fleet
     with connected_by(fleet.way("viewer"), PATIENCE_S) as viewer:
         config = ZenohConfig(connect=(fleet.of_vehicle,))
         with serving(tmp_path, config) as vehicle:
-            wait_until(lambda: bool(ask(viewer, KEYS.health(PAIR), 5.0)), "the viewer reaches the vehicle")
+            wait_until(lambda: bool(query_all(viewer, KEYS.health(PAIR), 5.0)), "the viewer reaches the vehicle")
             vehicle.bus.publish(KEYS.last(PAIR), vehicle_answer())
-            wait_until(lambda: KEYS.last(PAIR) in fleet.storage.kept, "the fleet has kept its word")
-            assert [reply.key for reply in ask(viewer, "coec/@v1/*/*/health", 5.0)] == [KEYS.health(PAIR)]
-        wait_until(lambda: not ask(viewer, KEYS.health(PAIR), 5.0), "it has gone")
+            wait_until(lambda: KEYS.last(PAIR) in fleet.storage.samples, "the fleet has kept its word")
+            assert [reply.key for reply in query_all(viewer, "coec/@v1/*/*/health", 5.0)] == [KEYS.health(PAIR)]
+        wait_until(lambda: not query_all(viewer, KEYS.health(PAIR), 5.0), "it has gone")
         for expression in (KEYS.last(PAIR), ALL.last("*")):
-            (reply,) = ask(viewer, expression, 5.0)
-            assert last_word.read(reply.key, reply.payload).state == "suspect"
+            (reply,) = query_all(viewer, expression, 5.0)
+            assert last_word.decode_heartbeat(reply.key, reply.payload).state == "suspect"
 
 
 def vehicle_answer() -> Answer:
-    return Answer(packed(a_word(state="suspect")), MSGPACK)
+    return Answer(packed_heartbeat(heartbeat(state="suspect")), MSGPACK)
 
 
 @pytest.mark.fault("a vehicle that speaks for another", "the fleet's router does not let it through")
@@ -127,9 +129,9 @@ def test_a_vehicle_speaks_for_itself_alone(fleet: Fleet) -> None:
     mark = Keys("coec", "vehicle").last("mark")
     with connected([fleet.of_vehicle], 5.0) as onboard:
         for key, vehicle, pair in ((other, "other", PAIR), (mark, "vehicle", "mark")):
-            onboard.put(key, packed(a_word(vehicle, pair)), timestamp=onboard.new_timestamp())
-        wait_until(lambda: mark in fleet.storage.kept, "its own word is kept")
-    assert other not in fleet.storage.kept, "each link keeps the order"
+            onboard.put(key, packed_heartbeat(heartbeat(vehicle, pair)), timestamp=onboard.new_timestamp())
+        wait_until(lambda: mark in fleet.storage.samples, "its own word is kept")
+    assert other not in fleet.storage.samples, "each link keeps the order"
 
 
 @pytest.mark.fault(
@@ -142,8 +144,8 @@ def test_nobody_commands_over_the_fleet_unless_he_is_let(fleet: Fleet, tmp_path:
         connected_by(fleet.way("operator"), PATIENCE_S) as operator,
         connected([fleet.of_vehicle], 5.0) as onboard,
     ):
-        wait_until(lambda: bool(ask(operator, KEYS.health(PAIR), 5.0)), "the operator reaches the vehicle")
-        assert ask(operator, KEYS.command(PAIR, "hold"), 2.0) == []
+        wait_until(lambda: bool(query_all(operator, KEYS.health(PAIR), 5.0)), "the operator reaches the vehicle")
+        assert query_all(operator, KEYS.command(PAIR, "hold"), 2.0) == []
         assert not vehicle.is_held
-        assert ask(onboard, KEYS.command(PAIR, "hold"), 5.0) != []
+        assert query_all(onboard, KEYS.command(PAIR, "hold"), 5.0) != []
         assert vehicle.is_held

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.http import HttpServer, Page
-from coec.adapters.system.notify import Notifier
+from coec.adapters.system.http import HttpResponse, HttpServer
+from coec.adapters.system.notify import ServiceManagerNotifier
 from coec.runtime.api.pages import pages
 from deploy.written import DEPLOY, compose, stages
 from ports import free_port
@@ -58,7 +58,7 @@ def test_a_service_that_serves_pages_is_asked_for_one(heartbeat: Path, host: str
     if ":" in host and not socket.has_ipv6:
         pytest.skip("needs IPv6")
     with serving(host) as address:
-        Notifier(None, heartbeat).watchdog(address)
+        ServiceManagerNotifier(None, heartbeat).watchdog(address)
         status, words = checked(heartbeat)
     assert (status, "answers" in words) == (0, True), words
 
@@ -69,7 +69,7 @@ def test_a_service_that_serves_pages_is_asked_for_one(heartbeat: Path, host: str
 )
 def test_what_a_service_thinks_of_its_pairs_does_not_matter(heartbeat: Path, record_property: Record) -> None:
     with serving("127.0.0.1") as address:
-        Notifier(None, heartbeat).watchdog(address)
+        ServiceManagerNotifier(None, heartbeat).watchdog(address)
         before = os.times()
         assert checked(heartbeat)[0] == 0
         after = os.times()
@@ -82,7 +82,7 @@ def test_what_a_service_thinks_of_its_pairs_does_not_matter(heartbeat: Path, rec
     "the health check of the image fails, and says why",
 )
 def test_a_service_that_is_stuck_is_not_alive(heartbeat: Path) -> None:
-    notifier = Notifier(None, heartbeat)
+    notifier = ServiceManagerNotifier(None, heartbeat)
     with serving("127.0.0.1", alive=False) as address:
         notifier.watchdog(address)
         assert checked(heartbeat) == (1, f"stuck: 127.0.0.1:{address[1]} answers 503\n")
@@ -94,7 +94,7 @@ def test_a_service_that_is_stuck_is_not_alive(heartbeat: Path) -> None:
 
 
 def test_without_http_the_heartbeat_is_looked_at(heartbeat: Path) -> None:
-    Notifier(None, heartbeat).watchdog(None)
+    ServiceManagerNotifier(None, heartbeat).watchdog(None)
     status, words = checked(heartbeat)
     assert (status, words.startswith("alive: the last heartbeat is ")) == (0, True)
 
@@ -107,7 +107,7 @@ def test_no_heartbeat_or_a_damaged_one_is_no_life(heartbeat: Path, content: str 
 
 
 def test_a_service_that_ends_takes_its_heartbeat_along(heartbeat: Path) -> None:
-    notifier = Notifier(None, heartbeat)
+    notifier = ServiceManagerNotifier(None, heartbeat)
     notifier.watchdog(None)
     notifier.stopping()
     status, words = checked(heartbeat)
@@ -124,10 +124,10 @@ def test_no_health_check_that_runs_often_starts_an_interpreter() -> None:
 
 
 def test_the_page_of_another_program_is_no_life(heartbeat: Path) -> None:
-    server = HttpServer("127.0.0.1", free_port(), lambda _: Page(404, b"", "text/plain"))
+    server = HttpServer("127.0.0.1", free_port(), lambda _: HttpResponse(404, b"", "text/plain"))
     server.thread.start()
     try:
-        Notifier(None, heartbeat).watchdog(("127.0.0.1", int(server._listener.getsockname()[1])))
+        ServiceManagerNotifier(None, heartbeat).watchdog(("127.0.0.1", int(server._listener.getsockname()[1])))
         assert checked(heartbeat)[0] == 1
     finally:
         server.close(PATIENCE_S)

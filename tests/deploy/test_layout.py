@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.timeline import schema
-from coec.adapters.foxglove.topics import POINTS, TOPICS, Pose
+from coec.adapters.foxglove.timeline import timeline_schema
+from coec.adapters.foxglove.topics import POINTS_TOPICS, TOPIC_DESCRIPTIONS, DisplayedPose
 from coec.cli.view import LAYOUT
 from conftest import REPOSITORY
 
@@ -51,15 +51,17 @@ def test_every_panel_has_a_place_and_every_place_a_panel() -> None:
 
 def test_every_topic_in_it_is_served_and_every_topic_served_is_in_it() -> None:
     named = {text.partition(".")[0] for text in texts_in(layout()["configById"]) if text.startswith("/")}
-    assert named <= set(TOPICS), "a topic of the layout is not served"
-    assert set(TOPICS) - named == {topics.TRANSFORMS}, "transforms are taken by every 3D panel, unasked"
+    assert named <= set(TOPIC_DESCRIPTIONS), "a topic of the layout is not served"
+    assert set(TOPIC_DESCRIPTIONS) - named == {topics.TRANSFORMS_TOPIC}, (
+        "transforms are taken by every 3D panel, unasked"
+    )
 
 
 def test_every_field_in_it_is_one_of_the_timeline() -> None:
-    paths = [text for text in texts_in(layout()["configById"]) if text.startswith(f"{topics.HEALTH}.")]
+    paths = [text for text in texts_in(layout()["configById"]) if text.startswith(f"{topics.HEALTH_TOPIC}.")]
     assert len(paths) > 5
     for path in paths:
-        node = schema()
+        node = timeline_schema()
         for name in path.split(".")[1:]:
             node = node["properties"][name]
         assert node["type"] in ("string", "number"), path
@@ -70,7 +72,7 @@ def test_an_image_waits_for_the_points_that_it_shows_and_for_no_others() -> None
     images = [panel["imageMode"] for name, panel in layout()["configById"].items() if name.startswith("Image!")]
     visible = []
     for panel in images:
-        assert (panel["imageTopic"], panel["synchronize"]) == (topics.IMAGE, True)
-        assert set(panel["annotations"]) == set(POINTS.values())
+        assert (panel["imageTopic"], panel["synchronize"]) == (topics.IMAGE_TOPIC, True)
+        assert set(panel["annotations"]) == set(POINTS_TOPICS.values())
         visible += [topic for topic, one in panel["annotations"].items() if one["visible"]]
-    assert visible == [POINTS[Pose.SERVED], POINTS[Pose.CANDIDATE]]
+    assert visible == [POINTS_TOPICS[DisplayedPose.SERVED], POINTS_TOPICS[DisplayedPose.CANDIDATE]]

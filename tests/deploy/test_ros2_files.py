@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from coec.adapters.ros import messages
-from coec.adapters.ros.diagnostics import Level
+from coec.adapters.ros.diagnostics import DiagnosticLevel
 from coec.adapters.ros.outgoing import MAX_RESIDUAL_PX
 from coec.config import Config, RosConfig, parse_yaml
 from coec.schemas import ros_names
@@ -78,7 +78,9 @@ def test_the_page_names_topics_and_types_as_they_are_published() -> None:
 
 def test_the_page_says_the_level_of_every_state() -> None:
     told = {row[0]: set(re.findall(r"`(\w+)`", row[1])) for row in rows("/diagnostics")}
-    assert told == {level.name: {state for state, number in ROS_LEVELS.items() if number == level} for level in Level}
+    assert told == {
+        level.name: {state for state, number in ROS_LEVELS.items() if number == level} for level in DiagnosticLevel
+    }
 
 
 def test_the_page_says_the_defaults_and_limits() -> None:

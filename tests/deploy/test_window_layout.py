@@ -13,7 +13,7 @@ from adapters.mcap.test_windows import a_result, a_window
 from coec.adapters.mcap.windows import write_result
 from conftest import REPOSITORY
 from deploy.test_layout import panels_in, texts_in
-from readers import Opened, opened
+from readers import RecordingContents, read_recording
 
 LAYOUT = REPOSITORY / "deploy" / "foxglove-window-layout.json"
 
@@ -28,12 +28,12 @@ def layout() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def window(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def window(tmp_path_factory: pytest.TempPathFactory) -> RecordingContents:
     """Of the pair `front`, with all that a window may hold."""
     path = a_window(tmp_path_factory.mktemp("window") / "front-1.mcap").path
     picture = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
     write_result(path, a_result(), picture)
-    return opened(path)
+    return read_recording(path)
 
 
 def test_every_panel_has_a_place_and_every_place_a_panel(layout: dict[str, Any]) -> None:
@@ -41,13 +41,13 @@ def test_every_panel_has_a_place_and_every_place_a_panel(layout: dict[str, Any])
 
 
 def test_every_topic_in_it_is_in_a_window_and_every_topic_of_a_window_in_it(
-    layout: dict[str, Any], window: Opened
+    layout: dict[str, Any], window: RecordingContents
 ) -> None:
     named = {text.partition(".")[0] for text in texts_in(layout["configById"]) if text.startswith("/")}
     assert named == window.counts.keys() - KNOWN_TO_ALL
 
 
-def test_pictures_are_shown_as_images_and_clouds_as_clouds(layout: dict[str, Any], window: Opened) -> None:
+def test_pictures_are_shown_as_images_and_clouds_as_clouds(layout: dict[str, Any], window: RecordingContents) -> None:
     panels = layout["configById"]
     modes = [panel["imageMode"] for name, panel in panels.items() if name.startswith("Image!")]
     assert next(mode["imageTopic"] for mode in modes) == "/coec/front/overlay"
@@ -61,7 +61,7 @@ def test_pictures_are_shown_as_images_and_clouds_as_clouds(layout: dict[str, Any
     assert coloured_by in {field.name for field in window.first[cloud].fields}
 
 
-def test_every_field_that_is_plotted_is_in_its_message(layout: dict[str, Any], window: Opened) -> None:
+def test_every_field_that_is_plotted_is_in_its_message(layout: dict[str, Any], window: RecordingContents) -> None:
     paths = [path["value"] for path in layout["configById"]["Plot!coec-motion"]["paths"]]
     assert len(paths) == 2
     for path in paths:

@@ -22,7 +22,7 @@ from typing import Any
 import psutil
 
 from coec import geometry
-from coec.adapters.zenoh.client import ask, ask_one, connected, connected_by
+from coec.adapters.zenoh.client import connected, connected_by, query_all, query_one
 from coec.cli.options import service_address
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig, load_config
 from coec.errors import RemoteError
@@ -340,7 +340,7 @@ def rights_of_viewer(service: Service) -> dict[str, str]:
     found = {}
     with connected_by(service_address(None, None, None, None, file).way, PATIENCE_S) as viewer:
         for name, key in (("health", keys.health(pair)), ("command", keys.command(pair, "hold"))):
-            replies = ask(viewer, key, PATIENCE_S)
+            replies = query_all(viewer, key, PATIENCE_S)
             found[name] = "answered" if replies else "nothing"
     return found
 
@@ -348,7 +348,7 @@ def rights_of_viewer(service: Service) -> dict[str, str]:
 def answer_of(service: Service, key: str) -> str:
     """`answered`, or the code of the refusal."""
     try:
-        ask_one(service.session, key, PATIENCE_S)
+        query_one(service.session, key, PATIENCE_S)
     except RemoteError as error:
         return error.reply_code
     return "answered"

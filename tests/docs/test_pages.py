@@ -10,8 +10,8 @@ import pytest
 
 import coec
 from coec.errors import CoecError
-from coec.exit_codes import MEANINGS, ExitCode
-from coec.runtime.api.troubles import TROUBLES
+from coec.exit_codes import EXIT_CODE_MEANINGS, ExitCode
+from coec.runtime.api.troubles import PROBLEMS
 from coec.runtime.edges.plan import NOT_INSTALLED
 from conftest import REPOSITORY
 from generate.__main__ import PAGES
@@ -49,7 +49,7 @@ def all_errors(base: type[CoecError]) -> Iterator[type[CoecError]]:
 def test_every_way_to_end_is_in_the_table() -> None:
     codes = {error.exit_code for error in all_errors(CoecError)}
     others = {ExitCode.SUCCESS, ExitCode.FAULT, ExitCode.INTERRUPTED, ExitCode.BROKEN_PIPE}
-    assert codes | others == set(MEANINGS) == set(ExitCode)
+    assert codes | others == set(EXIT_CODE_MEANINGS) == set(ExitCode)
 
 
 def reasons_made() -> set[str]:
@@ -85,7 +85,7 @@ def _called(function: ast.expr) -> str:
 
 def test_every_trouble_is_in_the_table_with_what_to_do() -> None:
     made = reasons_made() - OF_A_JOB - {"internal_error"}
-    assert made | COMPOSED | {NOT_INSTALLED.code} == set(TROUBLES), (
+    assert made | COMPOSED | {NOT_INSTALLED.code} == set(PROBLEMS), (
         "a row of coec.runtime.api.troubles for each, and none for others"
     )
-    assert all(trouble.meaning and trouble.advice for trouble in TROUBLES.values())
+    assert all(trouble.meaning and trouble.advice for trouble in PROBLEMS.values())

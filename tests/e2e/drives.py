@@ -16,7 +16,7 @@ from coec.config import CalibrationConfig, DepthConfig, MonitorConfig, PolicyCon
 from coec.geometry.se3 import inverse, rotation_angle_rad
 from coec.simulation.source import open_sim
 from coec.sources.spec import parse_spec
-from drives import drawn_source
+from drives import rendered_source
 from e2e.processes import Router, write_configuration
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class Drive:
 def rendered(query: str) -> Drive:
     """The drive of `sim:QUERY`."""
     source = f"sim:{query}"
-    return Drive(source, open_sim(parse_spec(source).query), tuple(drawn_source(source).messages()))
+    return Drive(source, open_sim(parse_spec(source).query), tuple(rendered_source(source).messages()))
 
 
 def later(frames: Sequence[Frame], seconds: float) -> list[Frame]:

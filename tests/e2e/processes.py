@@ -24,15 +24,15 @@ import zenoh
 from coec.adapters.files.rig import mask_to_png
 from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.cadence import Played
-from coec.adapters.zenoh.client import ask_one, connected
-from coec.adapters.zenoh.player import CAMERA, Frame, Player, Streams, stream_of
+from coec.adapters.zenoh.client import connected, query_one
+from coec.adapters.zenoh.player import CAMERA, Frame, Player, StreamKeys, stream_of
 from coec.cli.convert import configuration_for
 from coec.config import BudgetConfig, Config, LimitsConfig, StateConfig, ZenohConfig, load_config
 from coec.errors import NotFoundError
 from coec.geometry.se3 import Array, perturb
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
-from coec.sources import Recording
+from coec.sources import RecordingSource
 from conftest import REPOSITORY
 
 COMMAND: Sequence[str] = [sys.executable, "-m", "coec"]
@@ -108,7 +108,7 @@ def routing() -> Iterator[Router]:
 
 
 def write_configuration(
-    folder: Path, recording: Recording, endpoint: str, perturbation: Array | None = None, **of_pair: Any
+    folder: Path, recording: RecordingSource, endpoint: str, perturbation: Array | None = None, **of_pair: Any
 ) -> Path:
     """A configuration for a recording.
 
@@ -179,7 +179,7 @@ class Service:
         Raises:
             RemoteError: the service refused.
         """
-        return json.loads(ask_one(self.session, f"{key}?format=json{parameters}", PATIENCE_S, payload).payload)
+        return json.loads(query_one(self.session, f"{key}?format=json{parameters}", PATIENCE_S, payload).payload)
 
     def extrinsic(self) -> Any:
         return self.ask(self.keys.extrinsic(self.pair))
@@ -239,7 +239,7 @@ class Service:
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Publishes frames, in portions that its inbox holds: however slow the machine is, none is lost."""
-        player = Player(self.session, Streams.of_pair(self.config.pairs[0]), "msgpack")
+        player = Player(self.session, StreamKeys.of_pair(self.config.pairs[0]), "msgpack")
         try:
             assert not player.wait_for_listener(PATIENCE_S)
             for portion in portions(frames):

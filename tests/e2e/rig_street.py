@@ -12,13 +12,13 @@ from multiprocessing import get_context
 from coec.adapters.zenoh.player import Frame
 from coec.calibration.types import Matrix4
 from coec.evaluation.rig_looks import ROWS
-from coec.simulation.faults import SensorFault, Step
+from coec.simulation.faults import SensorFault, StepFault
 from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigConfig, RigDrive
+from coec.simulation.rig_drive import RigDrive, RigDriveConfig
 from coec.simulation.rig_instants import instants
 from coec.simulation.rigs import FOUR_FISHEYES, RigLayout
 from coec.simulation.schedule import Arrival
-from drives import kept
+from drives import cached_messages
 
 NS_PER_S = 1_000_000_000
 
@@ -62,12 +62,12 @@ class Street:
         sensors = (*self.layout.names, *self.lidars)
         return ("rig street", self.seed, self.camera, self.seconds, self.knock_s, self.rows, sensors)
 
-    def config_of(self, knock: Knock | None) -> RigConfig:
+    def config_of(self, knock: Knock | None) -> RigDriveConfig:
         """Of a drive; None: nobody is knocked."""
         faults: tuple[SensorFault, ...] = ()
         if knock is not None:
-            faults = (SensorFault(knock.sensor, Step(self.knock_s, float("inf"), ry=knock.turn_deg)),)
-        return RigConfig(
+            faults = (SensorFault(knock.sensor, StepFault(self.knock_s, float("inf"), ry=knock.turn_deg)),)
+        return RigDriveConfig(
             layout=self.layout, seed=self.seed, seconds=self.seconds, camera=self.camera, ego_hz=20.0, faults=faults,
             rows=self.rows, depth=True,
         )  # fmt: skip
@@ -83,7 +83,7 @@ class Street:
             moved = self.drive_of(None).stream(knock.sensor)
             after = [e for e in found if e.stream == moved and second_of(e.stamp_ns) >= self.knock_s]
             config = self.config_of(knock)
-            found |= zip(after, kept((*self.name, knock, after), lambda: drawn(config, after)), strict=True)
+            found |= zip(after, cached_messages((*self.name, knock, after), lambda: drawn(config, after)), strict=True)
         return sorted(found.values(), key=lambda frame: frame.stamp_ns)
 
     def truth(self, knock: Knock | None, camera: str, lidar: str, second: float) -> Matrix4:
@@ -120,7 +120,7 @@ def _as_built(street: Street) -> dict[Arrival, Frame]:
         sweeps = (instant.sweep, *(_nearest(drive, lidar, instant.sweep.stamp_ns) for lidar in street.lidars[1:]))
         entries |= dict.fromkeys((*sweeps, *instant.pictures.values(), *instant.motions))
     plan = list(entries)
-    return dict(zip(plan, kept((*street.name, plan), lambda: drawn(config, plan)), strict=True))
+    return dict(zip(plan, cached_messages((*street.name, plan), lambda: drawn(config, plan)), strict=True))
 
 
 def _nearest(drive: RigDrive, lidar: str, stamp_ns: int) -> Arrival:
@@ -129,7 +129,7 @@ def _nearest(drive: RigDrive, lidar: str, stamp_ns: int) -> Arrival:
     return min((e for e in drive.plan if e.stream == stream), key=lambda entry: abs(entry.stamp_ns - stamp_ns))
 
 
-def drawn(config: RigConfig, entries: Sequence[Arrival]) -> list[Frame]:
+def drawn(config: RigDriveConfig, entries: Sequence[Arrival]) -> list[Frame]:
     """By two processes, in the order of the entries."""
     parts = [entries[begin : begin + PART] for begin in range(0, len(entries), PART)]
     with ProcessPoolExecutor(2, get_context("spawn"), _open, (config,)) as pool:
@@ -139,7 +139,7 @@ def drawn(config: RigConfig, entries: Sequence[Arrival]) -> list[Frame]:
 _drive: RigDrive | None = None
 
 
-def _open(config: RigConfig) -> None:
+def _open(config: RigDriveConfig) -> None:
     global _drive  # one drive per process, as the pool's initializer gives it
     _drive = config.drive()
 

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_humble as ros
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
-from bags import a_joint
+from bags import transform_message
 from coec.adapters.ros import outgoing
 from coec.adapters.zenoh.player import Frame
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
@@ -145,5 +145,5 @@ def camera_info(camera: cameras.Camera, frame_id: str) -> bytes:
 
 def transforms(*joints: tuple[str, str, NDArray[np.float64]]) -> bytes:
     """Parent, child and the child's pose, by `rosbags`."""
-    message = ros.tf2_msgs__msg__TFMessage([a_joint(*joint) for joint in joints])
+    message = ros.tf2_msgs__msg__TFMessage([transform_message(*joint) for joint in joints])
     return bytes(STORE.serialize_cdr(message, "tf2_msgs/msg/TFMessage"))

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 import rmw_zenoh_defaults
-from coec.adapters.zenoh.client import ask_one
+from coec.adapters.zenoh.client import query_one
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.errors import RemoteError
 from coec.geometry import se3
@@ -62,14 +62,14 @@ def drive() -> Drive:
 @pytest.fixture(scope="module")
 def router() -> Iterator[Router]:
     endpoint = free_endpoint()
-    with rmw_zenoh_defaults.router(endpoint) as session:
+    with rmw_zenoh_defaults.rmw_router(endpoint) as session:
         yield Router(session, endpoint)
 
 
 @pytest.fixture
 def driver(router: Router) -> Iterator[zenoh.Session]:
     """A session of the vehicle's own."""
-    with rmw_zenoh_defaults.node(router.endpoint) as session:
+    with rmw_zenoh_defaults.rmw_node(router.endpoint) as session:
         yield session
 
 
@@ -196,7 +196,7 @@ def test_rubbish_and_a_flood_keep_a_pair_waiting_and_no_other(
         assert (health["state"], health["level"]) == ("unknown", 3)
         assert refused(running, keys.extrinsic("front"))[0] == "awaiting"
         assert running.ask(keys.extrinsic("rear")) == rear
-        assert b'pair="front"' in ask_one(running.session, keys.metrics, PATIENCE_S).payload
+        assert b'pair="front"' in query_one(running.session, keys.metrics, PATIENCE_S).payload
 
         for name in ("camera", "lidar", "ego"):
             of_stream = {"camera": CameraFrame, "lidar": LidarFrame, "ego": EgoMotion}[name]

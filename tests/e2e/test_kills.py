@@ -17,7 +17,7 @@ import pytest
 from coec.adapters.mcap.windows import read_window
 from coec.adapters.zenoh.cadence import repeated
 from coec.adapters.zenoh.client import is_alive
-from coec.adapters.zenoh.player import Player, Streams, shifted
+from coec.adapters.zenoh.player import Player, StreamKeys, shifted
 from coec.config import (
     CalibrationConfig,
     Config,
@@ -78,7 +78,7 @@ class Told:
 @contextmanager
 def driving(drive: Drive, router: Router) -> Iterator[None]:
     """The drive on the bus, over and over, whether somebody listens or not; sensor time never steps back."""
-    player = Player(router.session, Streams.default(drive.recording.rig.pair), "msgpack")
+    player = Player(router.session, StreamKeys.default(drive.recording.rig.pair), "msgpack")
     stop = threading.Event()
     frames = repeated(lambda: drive.frames, shifted, 0, NS_PER_S, forever=True)
     thread = threading.Thread(target=player.play, args=(frames, SPEED, stop, lambda *_: None))

@@ -16,17 +16,17 @@ import pytest
 from ruamel.yaml import YAML
 
 from certificates import TestAuthority, make_authority
-from coec.adapters.tls.conversation import Speaker
+from coec.adapters.tls.conversation import CommandSender
 from coec.adapters.zenoh.bus import JSON, open_session
-from coec.adapters.zenoh.client import ask_one
-from coec.adapters.zenoh.proven import give
+from coec.adapters.zenoh.client import query_one
+from coec.adapters.zenoh.proven import send_authenticated
 from coec.cli.check_config import template
 from coec.cli.doctor import examine
 from coec.config import LimitsConfig, SenderConfig, ZenohConfig, load_config
 from coec.errors import NotProvenError, RemoteError
 from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment
 from fakes import wait_until
-from open_metrics import parse
+from open_metrics import parse_open_metrics
 from ports import free_port
 
 PAIR = "front"
@@ -124,10 +124,10 @@ def test_who_may_give_commands_is_read_again(
         def may_hold(by: TestAuthority | None) -> bool:
             try:
                 if by is None:
-                    ask_one(router.session, hold, PATIENCE_S)
+                    query_one(router.session, hold, PATIENCE_S)
                 else:
-                    speaker = Speaker(by.credentials("operator"), "vehicle")
-                    give(router.session, hold, None, PATIENCE_S, speaker, JSON)
+                    speaker = CommandSender(by.credentials("operator"), "vehicle")
+                    send_authenticated(router.session, hold, None, PATIENCE_S, speaker, JSON)
             except (NotProvenError, RemoteError):
                 return False
             return True
@@ -170,7 +170,7 @@ def _reload(running: Service, path: Path, endpoint: str, port: int) -> None:
     assert status["config_hash"] in entry["text"]
 
     told, text = page(port, "/metrics")
-    families = parse(text)
+    families = parse_open_metrics(text)
     assert told == 200
     assert families["coec_query_seconds"].value("_count", resource="status") > 0
     assert page(port, "/live")[0] == 200

@@ -14,7 +14,7 @@ from coec.calibration.types import CameraFrame
 from e2e.drives import SHORT, Drive, rendered
 from e2e.processes import Router, Service, by_topics, coec, service, write_configuration
 from fakes import wait_until
-from ros_nodes import HASHES, Driver, cdr
+from ros_nodes import HASHES, RosDriver, cdr_message
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -43,8 +43,10 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
-def driver(stack: ExitStack, router: Router, topic: str, type_name: str, number: int, node: str = "driver") -> Driver:
-    made = Driver(router.session, topic, type_name, number, node)
+def driver(
+    stack: ExitStack, router: Router, topic: str, type_name: str, number: int, node: str = "driver"
+) -> RosDriver:
+    made = RosDriver(router.session, topic, type_name, number, node)
     stack.callback(made.close)
     return made
 
@@ -55,7 +57,7 @@ def pictures(drive: Drive) -> Iterator[bytes]:
     number = 0
     while True:
         number += 1
-        yield cdr(replace(first, stamp_ns=first.stamp_ns + number * 10**8, depth=None))
+        yield cdr_message(replace(first, stamp_ns=first.stamp_ns + number * 10**8, depth=None))
 
 
 def losses(running: Service) -> Any:

@@ -33,8 +33,8 @@ from e2e.drives import (
     without_depth,
 )
 from e2e.processes import Router, Service, by_topics, coec, service, write_configuration
-from ros_nodes import Sensors
-from tiny_onnx import CARD, first_channel
+from ros_nodes import RosSensors
+from tiny_onnx import MODEL_CARD, first_channel_network
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -194,7 +194,7 @@ def decided_by(
         if middleware == "native":
             running.send(frames)
         else:
-            sensors = Sensors(router.session, TOPICS, middleware)
+            sensors = RosSensors(router.session, TOPICS, middleware)
             running.send_by(sensors.send, frames)
             sensors.close()
         running.rest()
@@ -220,8 +220,8 @@ def test_native_frames_and_topics_of_rmw_zenoh_come_to_the_same(tmp_path: Path, 
     ending = [frame for frame in later(short.frames, SHORT_SLICE_S) if frame.stamp_ns < short.start_ns + OVER_NS]
     frames = without_depth([*short.frames, *ending])
     network = tmp_path / "tiny.onnx"
-    network.write_bytes(first_channel())
-    network.with_suffix(".yaml").write_text(CARD)
+    network.write_bytes(first_channel_network())
+    network.with_suffix(".yaml").write_text(MODEL_CARD)
 
     def configured(name: str) -> Path:
         window = WindowConfig(pairs=SHORT_PAIRS, min_pairs=4, slice_s=SHORT_SLICE_S, min_points_in_view=100)

@@ -11,9 +11,9 @@ import pytest
 from pydantic import BaseModel
 
 from certificates import TestAuthority
-from coec.adapters.tls.conversation import Credentials, Speaker
-from coec.adapters.zenoh.client import JSON, Reply, ask_one
-from coec.adapters.zenoh.proven import give
+from coec.adapters.tls.conversation import CommandSender, Credentials
+from coec.adapters.zenoh.client import JSON, Reply, query_one
+from coec.adapters.zenoh.proven import send_authenticated
 from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.config import Config, DepthConfig, SnippetsConfig, UplinkConfig, load_config
 from coec.errors import RemoteError
@@ -21,7 +21,7 @@ from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
 from e2e.planted import plant, said, written
 from e2e.processes import PATIENCE_S, Router, Service, service
-from readers import opened
+from readers import read_recording
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -46,13 +46,13 @@ def drive() -> Drive:
 
 
 def asked(running: Service, selector: str) -> Reply:
-    return ask_one(running.session, selector, PATIENCE_S)
+    return query_one(running.session, selector, PATIENCE_S)
 
 
 def commanded(running: Service, name: str, credentials: Credentials) -> str:
     """What a proven command comes to."""
-    speaker, selector = Speaker(credentials, running.config.vehicle), running.keys.command(running.pair, name)
-    told = give(running.session, f"{selector}?format=json", None, PATIENCE_S, speaker, JSON)
+    speaker, selector = CommandSender(credentials, running.config.vehicle), running.keys.command(running.pair, name)
+    told = send_authenticated(running.session, f"{selector}?format=json", None, PATIENCE_S, speaker, JSON)
     return str(json.loads(told.payload)["code"])
 
 
@@ -177,7 +177,7 @@ def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path,
         fetched = tmp_path / f"{snippet['snippet_id']}.mcap"
         names = (running.pair, snippet["snippet_id"])
         fetch_window(running.session, running.keys, *names, fetched, PATIENCE_S, PATIENCE_S, lambda *_: None)
-        bag = opened(fetched)
+        bag = read_recording(fetched)
         images = [topic for topic, kind in bag.types.items() if kind == "sensor_msgs/msg/CompressedImage"]
         # Those after the event may never be sent: on a busy machine the drive ends before the check is answered.
         assert bag.counts[images[0]] > 10, "every frame of the seconds before the event"

@@ -16,12 +16,12 @@ from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.inputs import on_key
-from coec.adapters.zenoh.matching import is_heard
+from coec.adapters.zenoh.matching import has_subscribers
 from coec.adapters.zenoh.settings import settings_of
 from coec.config import LimitsConfig, ZenohConfig
 from coec.schemas.replies import StreamStatus
 from fakes import wait_until
-from pair_bench import BEGIN_S, S, pair_at
+from pair_bench import BEGIN_S, NS_PER_S, frame_pair_at
 from ports import free_port
 from vehicles import serving
 
@@ -71,14 +71,14 @@ def test_what_zenoh_drops_is_counted_as_far_as_it_can_be_known(
         for name in counted:
             block = zenoh.CongestionControl.BLOCK
             publishers[name] = session.declare_publisher(f"in/{name}", congestion_control=block)
-        wait_until(lambda: all(map(is_heard, publishers.values())), "the service", PATIENCE_S)
+        wait_until(lambda: all(map(has_subscribers, publishers.values())), "the service", PATIENCE_S)
 
         def told() -> dict[str, StreamStatus]:
             status = vehicle.bench.answers.status()
             return {"camera": status.camera, "lidar": status.lidar}
 
         for number in range(PAIRS):
-            pair, sequence = pair_at(BEGIN_S * S + number * S // 10), number if numbered else None
+            pair, sequence = frame_pair_at(BEGIN_S * NS_PER_S + number * NS_PER_S // 10), number if numbered else None
             frames = {
                 "camera": encode_camera(replace(pair.camera, sequence=sequence)),
                 "lidar": encode_lidar(replace(pair.lidar, sequence=sequence)),

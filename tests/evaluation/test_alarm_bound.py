@@ -9,7 +9,7 @@ from math import exp
 import numpy as np
 import pytest
 
-from coec.evaluation.alarm_bound import MIN_PLACES, Places, bound, tail
+from coec.evaluation.alarm_bound import MIN_PLACES, PlaceChecks, bound, tail
 from coec.schemas.checks import Judged
 from evaluation.test_check_statistics import judged
 
@@ -29,7 +29,7 @@ def farther_than(sigmas: float, checks: Sequence[Judged]) -> bool:
 
 
 def test_places_are_where_clear_checks_put_them() -> None:
-    places = Places.of(
+    places = PlaceChecks.from_drives(
         [displaced(3.0), (judged(9.0, faint=("looks",)),), (*displaced(-2.0), judged(9.0, causes=("dark",)))]
     )
     np.testing.assert_allclose(places.displacement, [3.0, 2.0])
@@ -37,22 +37,22 @@ def test_places_are_where_clear_checks_put_them() -> None:
 
 
 def test_a_check_that_is_off_alone_displaces_no_place() -> None:
-    places = Places.of([(*displaced(1.0), *displaced(1.0), judged(9.0))])
+    places = PlaceChecks.from_drives([(*displaced(1.0), *displaced(1.0), judged(9.0))])
     np.testing.assert_allclose(places.displacement, [1.0])
 
 
 def test_few_checks_do_not_tell_a_place_that_is_off_from_a_bad_check() -> None:
-    assert Places.of([displaced(1.0)[:2], (judged(9.0),)]).checks == ()
+    assert PlaceChecks.from_drives([displaced(1.0)[:2], (judged(9.0),)]).checks == ()
 
 
 def test_a_check_just_after_a_faint_one_may_not_accuse_and_is_of_no_place() -> None:
-    places = Places.of([(judged(9.0, faint=("looks",)), judged(9.0), judged(9.0), *displaced(1.0))])
+    places = PlaceChecks.from_drives([(judged(9.0, faint=("looks",)), judged(9.0), judged(9.0), *displaced(1.0))])
     np.testing.assert_allclose(places.displacement, [1.0])
 
 
 def test_places_count_in_what_their_scene_can_tell() -> None:
     dispersed = tuple(check.model_copy(update={"dispersion": 4.0}) for check in displaced(6.0))
-    np.testing.assert_allclose(Places.of([dispersed]).displacement, [1.5])
+    np.testing.assert_allclose(PlaceChecks.from_drives([dispersed]).displacement, [1.5])
 
 
 def test_a_tail_goes_on_as_what_was_seen_falls_off() -> None:
@@ -73,7 +73,7 @@ def test_few_places_leave_more_to_the_tail_than_many() -> None:
 
 def test_a_detector_that_bears_more_alarms_less() -> None:
     drawn = np.random.default_rng(3).exponential(0.5, 60)
-    places = Places.of([displaced(float(far)) for far in drawn])
+    places = PlaceChecks.from_drives([displaced(float(far)) for far in drawn])
     strict, lenient = (bound(places, 4, 6.0, partial(farther_than, at)) for at in (4.0, 12.0))
     assert strict is not None
     assert lenient is not None
@@ -83,11 +83,11 @@ def test_a_detector_that_bears_more_alarms_less() -> None:
 
 
 def test_a_detector_that_never_alarms_has_no_rate() -> None:
-    places = Places.of([displaced(1.0 + 0.01 * n) for n in range(MIN_PLACES)])
+    places = PlaceChecks.from_drives([displaced(1.0 + 0.01 * n) for n in range(MIN_PLACES)])
     found = bound(places, 4, 6.0, lambda _: False)
     assert found is not None
     assert (found.mean, found.at_most, found.half) == (0.0, 0.0, None)
 
 
 def test_too_few_places_have_no_tail() -> None:
-    assert bound(Places.of([displaced(1.0)] * (MIN_PLACES - 1)), 4, 6.0, lambda _: False) is None
+    assert bound(PlaceChecks.from_drives([displaced(1.0)] * (MIN_PLACES - 1)), 4, 6.0, lambda _: False) is None

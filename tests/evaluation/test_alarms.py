@@ -46,10 +46,10 @@ def test_same_stream_same_evidence() -> None:
 def test_of_a_mount_that_is_wrong_from_the_first_check_a_window_is_wanted_soon(off_deg: float, share: float) -> None:
     """Whether the mount is wrong or the estimator off by half a degree on this rig, checks alone cannot tell for sure:
     a window has to, and soon."""
-    wanted_s = alarms.from_start(CONFIG, off_deg, 40).wanted_s
+    wanted_s = alarms.from_start(CONFIG, off_deg, 40).requested_s
     assert np.median(wanted_s) <= 4 * CONFIG.period_s
     assert np.mean(np.isfinite(wanted_s)) >= share
 
 
 def test_of_most_right_rigs_none_is_wanted_in_their_first_minute() -> None:
-    assert np.mean(np.isfinite(alarms.from_start(CONFIG, 0.0, 20).wanted_s)) <= 0.25
+    assert np.mean(np.isfinite(alarms.from_start(CONFIG, 0.0, 20).requested_s)) <= 0.25

@@ -17,7 +17,7 @@ COVERED = 3.0
 @pytest.mark.slow
 def test_a_parked_vehicle_claims_no_height_that_its_pitch_makes_up_for() -> None:
     """Ten frames of one street through 32 beams: the best pitch and height lie 0.57° and 12 cm beside."""
-    (drive,) = matrix_drives.chosen(1, "street-parked_wide_32_day_none_s2")
+    (drive,) = matrix_drives.selected_drives(1, "street-parked_wide_32_day_none_s2")
     row = matrix_run.run(drive, Settings((6,), 10, CalibrationConfig().depth.model))
     for window in row.windows["6"]:
         for error, sigma in zip(window.error, window.sigma, strict=True):

@@ -11,8 +11,8 @@ import pytest
 
 from coec.calibration.types import Matrix4, Rig
 from coec.errors import UsageError
-from coec.evaluation.closure import Between, Frames, Relation, Solve, between, close
-from coec.evaluation.statistics import Outcome, Trial, score
+from coec.evaluation.closure import Between, FrameChoice, Relation, Solve, between, close
+from coec.evaluation.statistics import SolveOutcome, Trial, score
 from coec.geometry import se3
 from coec.geometry.cameras import build
 from evaluation.test_statistics import _estimate, _xi
@@ -21,7 +21,7 @@ T_A = se3.exp(np.array([1.2, -1.2, 1.2, 0.1, -0.3, 0.8]))
 T_B_A = se3.exp(np.array([0.1, 0.5, -0.2, -0.6, 0.05, 0.1]))
 
 
-def _outcome(T_camera_lidar: Matrix4, sigma: float = 1e-3, accepted: bool = True) -> Outcome:
+def _outcome(T_camera_lidar: Matrix4, sigma: float = 1e-3, accepted: bool = True) -> SolveOutcome:
     estimate = _estimate(np.zeros(6), accepted, sigma)
     estimate = replace(estimate, optimum=replace(estimate.optimum, T_camera_lidar=T_camera_lidar))
     return score(Trial(T_camera_lidar, estimate, 1.0), T_camera_lidar, 6)
@@ -76,13 +76,13 @@ def test_sensors_that_share_nothing_cannot_close() -> None:
         between(_rig(T_A, "a", "top"), _rig(T_A, "b", "front"), None)
 
 
-def _close(pairs: tuple[int, int], dof: int = 6, accepted: bool = True) -> tuple[list[Asked], dict[Frames, float]]:
+def _close(pairs: tuple[int, int], dof: int = 6, accepted: bool = True) -> tuple[list[Asked], dict[FrameChoice, float]]:
     """The frames that were asked of A and B, and the median rotation (rad) of the closure on each kind of frames."""
     known = Between(Relation.CAMERAS, T_B_A)
     asked: list[Asked] = []
 
     def solve(name: str, T: Matrix4) -> Solve:
-        def of(trial: int, frames: Sequence[int] | None) -> Outcome:
+        def of(trial: int, frames: Sequence[int] | None) -> SolveOutcome:
             asked.append((name, trial, frames))
             return _outcome(T, accepted=accepted)
 
@@ -96,7 +96,7 @@ def _close(pairs: tuple[int, int], dof: int = 6, accepted: bool = True) -> tuple
 
 def test_all_frames_the_same_half_and_other_halves() -> None:
     asked, medians = _close((6, 7))
-    assert list(medians) == list(Frames)
+    assert list(medians) == list(FrameChoice)
     assert list(medians.values()) == pytest.approx([radians(0.5)] * 3)
     of_first = [frames for _, trial, frames in asked if trial == 0]
     assert of_first[:2] == [None, None]
@@ -108,7 +108,7 @@ def test_all_frames_the_same_half_and_other_halves() -> None:
 
 def test_one_pair_has_no_halves_and_three_degrees_no_translation() -> None:
     _, medians = _close((1, 1), dof=3)
-    assert list(medians) == [Frames.ALL]
+    assert list(medians) == [FrameChoice.ALL]
 
 
 def test_refused_calibrations_do_not_close() -> None:

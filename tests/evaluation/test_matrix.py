@@ -14,7 +14,7 @@ from coec.schemas.matrix import MatrixRow, SolvedWindow, Watched
 from coec.schemas.replies import Maybe6
 from coec.simulation.faults import parse_fault
 from coec.simulation.lidar import LIDARS
-from coec.simulation.source import NUMBERS, WORDS
+from coec.simulation.source import NUMBERS, TEXT_KEYS
 from coec.sources.spec import parse_spec
 
 DRIVES = matrix_drives.drives(1)
@@ -143,7 +143,7 @@ def test_the_matrix_is_large_and_every_drive_can_be_ordered() -> None:
     assert {drive.seed for drive in DRIVES} == set(range(FIRST_SEED, FIRST_SEED + SEEDS))
     for drive in DRIVES:
         query = parse_spec(drive.source(40.0, 0.5, depth=False)).query
-        assert set(query) <= {*NUMBERS, *WORDS}
+        assert set(query) <= {*NUMBERS, *TEXT_KEYS}
         assert query["lidar"] in LIDARS
         for fault in filter(None, query.get("faults", "").split(";")):
             parse_fault(fault)
@@ -164,17 +164,17 @@ def test_faults_of_scene_light_and_fault_go_together() -> None:
 
 
 def test_drives_are_chosen_by_their_name() -> None:
-    night = matrix_drives.chosen(1, "*_night_*")
+    night = matrix_drives.selected_drives(1, "*_night_*")
     assert night
     assert all(drive.light == "night" for drive in night)
-    assert matrix_drives.chosen(1, None) == DRIVES
-    assert matrix_drives.chosen(1, "moon") == ()
+    assert matrix_drives.selected_drives(1, None) == DRIVES
+    assert matrix_drives.selected_drives(1, "moon") == ()
     assert CalibrationConfig().search.rotation_deg >= 10.0  # the box holds the farthest start
 
 
 def test_a_start_is_off_by_what_is_searched_and_what_is_held_by_what_the_budget_says() -> None:
-    held = np.array([matrix_run.drawn_start(drive.name, 0, 3, 0.01) for drive in DRIVES])
-    searched = np.array([matrix_run.drawn_start(drive.name, 0, 6, 0.01) for drive in DRIVES])
+    held = np.array([matrix_run.sampled_start(drive.name, 0, 3, 0.01) for drive in DRIVES])
+    searched = np.array([matrix_run.sampled_start(drive.name, 0, 6, 0.01) for drive in DRIVES])
     for drawn in (held, searched):
         turned = np.degrees(np.linalg.norm(drawn[:, :3], axis=1))
         assert (turned >= 2.0).all()
@@ -183,4 +183,4 @@ def test_a_start_is_off_by_what_is_searched_and_what_is_held_by_what_the_budget_
     shifted = np.linalg.norm(searched[:, 3:], axis=1)
     assert shifted.max() <= 0.1
     assert shifted.mean() > 0.03
-    np.testing.assert_array_equal(held[0], matrix_run.drawn_start(DRIVES[0].name, 0, 3, 0.01))
+    np.testing.assert_array_equal(held[0], matrix_run.sampled_start(DRIVES[0].name, 0, 3, 0.01))

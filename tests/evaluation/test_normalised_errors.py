@@ -19,7 +19,7 @@ from coec.evaluation.normalised_errors import (
     of_outcomes,
     within,
 )
-from coec.evaluation.statistics import Outcome, Trial, score
+from coec.evaluation.statistics import SolveOutcome, Trial, score
 from coec.geometry import se3
 from evaluation.test_statistics import FAR, REFERENCE, _estimate, _xi
 
@@ -29,7 +29,7 @@ def _claims(errors: list[list[float]], sigma: float | list[float]) -> Claims:
     return Claims(np.array(errors), np.tile(covariance, (len(errors), 1, 1)), refused=0)
 
 
-def _ended(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> Outcome:
+def _ended(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> SolveOutcome:
     return score(Trial(FAR, _estimate(_xi(*deg), accepted, radians(sigma_deg)), 1.0), REFERENCE, 3)
 
 

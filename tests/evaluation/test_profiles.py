@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.types import Matrix4
-from coec.evaluation.profiles import NARROW, WIDE, Span, scan, views
+from coec.evaluation.profiles import NARROW, WIDE, ScanSpan, scan, views
 from coec.geometry import se3
 
 REFERENCE = se3.exp(np.array([1.2, -1.2, 1.2, 0.1, -0.3, 0.8]))
@@ -30,7 +30,7 @@ SUMMIT = np.array([radians(1.0), radians(-1.0), radians(0.4), 0.05, -0.08, 0.02]
 
 @pytest.mark.parametrize("span", [WIDE, NARROW])
 @pytest.mark.parametrize("axes", [3, 6])
-def test_scan_finds_the_summit_on_every_axis(span: Span, axes: int) -> None:
+def test_scan_finds_the_summit_on_every_axis(span: ScanSpan, axes: int) -> None:
     scans = scan(_Hill(SUMMIT), REFERENCE, axes, span)
     assert [one.axis for one in scans] == list(range(axes))
     for one in scans:

@@ -13,9 +13,9 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 from coec.calibration.types import Matrix4
 from coec.evaluation import knocked_drive
 from coec.evaluation.check_drives import CHECK_PAIRS
-from coec.evaluation.knocked_drive import FIRST_SEED, LIDAR, KnockedDrive
-from coec.evaluation.rig_drive_statistics import KNOCKS, Knock, moves_of, report
-from coec.evaluation.rig_drive_windows import answer_ns, asked_ns, variant
+from coec.evaluation.knocked_drive import FIRST_SEED, LIDAR, DisplacedRigDrive
+from coec.evaluation.rig_drive_statistics import DISPLACEMENTS, SensorDisplacement, moves_of, report
+from coec.evaluation.rig_drive_windows import answer_ns, request_stamps_ns, variant
 from coec.evaluation.rig_drives import driven
 from coec.evaluation.rig_looks import PERIOD_S, TURN_S, due
 from coec.geometry import se3
@@ -28,7 +28,7 @@ CAMERA = "fisheye1400"
 NOISE = np.array([radians(0.05)] * 3 + [0.015] * 3)
 SIGMA = np.array([radians(0.14)] * 3 + [0.033] * 3)
 PLACE = np.array([radians(0.06)] * 3 + [0.01] * 3)
-NOBODY, ONE_CAMERA, THE_LIDAR, TWO_CAMERAS = KNOCKS
+NOBODY, ONE_CAMERA, THE_LIDAR, TWO_CAMERAS = DISPLACEMENTS
 
 
 def six(values: np.ndarray) -> Vector6:
@@ -36,9 +36,9 @@ def six(values: np.ndarray) -> Vector6:
     return rx, ry, rz, tx, ty, tz
 
 
-def truth(drive: KnockedDrive, camera: str, mounts: Mounts, stamp_ns: int) -> Matrix4:
+def truth(drive: DisplacedRigDrive, camera: str, mounts: Mounts, stamp_ns: int) -> Matrix4:
     def pose(sensor: str, mount: Mounts) -> Matrix4:
-        of: RigDrive = drive.knocked if mounts is mount else drive.right
+        of: RigDrive = drive.displaced if mounts is mount else drive.right
         return of.T_sensor_ego(sensor, stamp_ns)
 
     return np.asarray(pose(camera, Mounts.CAMERA) @ se3.inverse(pose(LIDAR, Mounts.LIDAR)))
@@ -46,7 +46,7 @@ def truth(drive: KnockedDrive, camera: str, mounts: Mounts, stamp_ns: int) -> Ma
 
 def drawn(number: int) -> RigDriveRow:
     """Looks as those of a drive that was rendered: at the truth, but for noise."""
-    drive, rng, looks = KnockedDrive(number, CAMERA), np.random.default_rng(number), []
+    drive, rng, looks = DisplacedRigDrive(number, CAMERA), np.random.default_rng(number), []
     for turn in range(CHECK_PAIRS, round((drive.at_s + 30.0) / TURN_S)):
         stamps_ns = tuple(START_NS + round((turn - k) * TURN_S * 1e9) for k in range(CHECK_PAIRS, 0, -1))
         for camera in due(turn, drive.right.cameras):
@@ -70,7 +70,7 @@ def flagged(row: RigDriveRow, edge: str, *, weak: bool = False) -> RigDriveRow:
 
     def told(look: RigLook) -> RigLook:
         moved = look.edge == edge and look.mounts is Mounts.CAMERA
-        late = look.pair_stamps_ns[0] - START_NS > KnockedDrive(1, CAMERA).at_s * 1e9
+        late = look.pair_stamps_ns[0] - START_NS > DisplacedRigDrive(1, CAMERA).at_s * 1e9
         return look.model_copy(update={"flagged": True, "weak": weak, "distance2": 40.0}) if moved and late else look
 
     return row.model_copy(update={"looks": tuple(map(told, row.looks))})
@@ -112,7 +112,7 @@ def test_those_that_were_knocked_are_named_fault_by_fault(rows: list[RigDriveRow
 
 def test_a_sensor_that_stood_still_and_is_named_counts_as_wrong(rows: list[RigDriveRow]) -> None:
     """The looks of a knocked camera, told as those of a drive on which nobody was."""
-    drive = KnockedDrive(1, CAMERA)
+    drive = DisplacedRigDrive(1, CAMERA)
     edge = f"{drive.cameras[0]}-{LIDAR}"
     swapped = tuple(
         look.model_copy(update={"mounts": Mounts.AS_BUILT})
@@ -126,25 +126,25 @@ def test_a_sensor_that_stood_still_and_is_named_counts_as_wrong(rows: list[RigDr
 
 
 def test_one_that_nothing_tells_of_is_not_named(rows: list[RigDriveRow]) -> None:
-    drive = KnockedDrive(1, CAMERA)
+    drive = DisplacedRigDrive(1, CAMERA)
     blind = tuple(look for look in rows[0].looks if not look.edge.startswith(drive.cameras[0]))
-    told = moves_of(rows[0].model_copy(update={"looks": blind}), Knock("one camera", cameras=1))
+    told = moves_of(rows[0].model_copy(update={"looks": blind}), SensorDisplacement("one camera", cameras=1))
     assert (told.named_s, told.wrong) == (None, ())
 
 
 def test_a_pair_that_suspects_a_move_asks_for_windows_and_not_again_before_the_answer(rows: list[RigDriveRow]) -> None:
-    drive = KnockedDrive(1, CAMERA)
+    drive = DisplacedRigDrive(1, CAMERA)
     knock_ns, period_ns = START_NS + drive.at_s * 1e9, PERIOD_S * 1e9
     edge = f"{drive.cameras[0]}-{LIDAR}"
     looks, late_ns = flagged(rows[0], edge).looks, answer_ns(Mounts.CAMERA)
-    assert list(asked_ns(drive.served[edge], variant(looks, edge, Mounts.AS_BUILT), late_ns)) == []
-    first, *others = asked_ns(drive.served[edge], variant(looks, edge, Mounts.CAMERA), late_ns)
+    assert list(request_stamps_ns(drive.served[edge], variant(looks, edge, Mounts.AS_BUILT), late_ns)) == []
+    first, *others = request_stamps_ns(drive.served[edge], variant(looks, edge, Mounts.CAMERA), late_ns)
     assert knock_ns < first < knock_ns + 4 * period_ns
     assert all(later - earlier >= late_ns for earlier, later in pairwise([first, *others]))
 
 
 def test_where_looks_are_too_faint_an_accepted_window_names_the_camera(rows: list[RigDriveRow]) -> None:
-    drive = KnockedDrive(1, CAMERA)
+    drive = DisplacedRigDrive(1, CAMERA)
     edge = f"{drive.cameras[0]}-{LIDAR}"
     faint = flagged(rows[0], edge, weak=True)
     begin_ns = START_NS + round((drive.at_s + 8.0) * 1e9)
@@ -170,7 +170,7 @@ def test_a_drive_is_drawn_and_looked_at_pair_by_pair(monkeypatch: pytest.MonkeyP
     """As small and short as it goes: what the looks say of so few pixels is of no interest."""
     monkeypatch.setattr(knocked_drive, "AT_S", (6.5, 6.6))
     monkeypatch.setattr(knocked_drive, "AFTER_S", 2.0)
-    drive = KnockedDrive(0, "fisheye64")
+    drive = DisplacedRigDrive(0, "fisheye64")
     row = driven(drive)
     assert row.failure is None
     assert (row.name, row.seed) == (f"fisheye64_{FIRST_SEED}", FIRST_SEED)

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from coec.calibration.rig import lidar_looks
 from coec.evaluation.rig_evidence import (
-    APART,
     FULL,
+    LIDAR_CHECK,
     LIDAR_LATE_S,
-    LIDAR_LOOK,
     LIDAR_PERIOD_S,
     NS_PER_S,
+    UNLINKED,
     Happening,
-    Heard,
     Lasting,
-    looks,
+    TimedEvidence,
+    simulate_checks,
     windows,
 )
 from coec.geometry import se3
@@ -27,7 +27,7 @@ from coec.geometry import se3
 STILL = Happening(FULL.poses, FULL.poses, None, 0.0, 1500.0)
 
 
-def scattered(heard: list[Heard], name: str) -> NDArray[np.float64]:
+def scattered(heard: list[TimedEvidence], name: str) -> NDArray[np.float64]:
     """(N, 6) of the looks at an edge, about their middle: its bias is drawn once."""
     edge = FULL.graph.edge[name]
     offsets = np.array([se3.difference(look.T_a_b, edge.T_a_b) for _, look in heard if look.edge == name])
@@ -35,7 +35,7 @@ def scattered(heard: list[Heard], name: str) -> NDArray[np.float64]:
 
 
 def test_looks_at_two_lidars_come_in_their_time_and_scatter_as_those_on_streets() -> None:
-    heard = looks(FULL, STILL, np.random.default_rng(4))
+    heard = simulate_checks(FULL, STILL, np.random.default_rng(4))
     assert heard == sorted(heard, key=lambda one: one[0])
     of_lidars = [(at_s, look) for at_s, look in heard if look.edge in FULL.graph.of_lidars]
     assert all(at_s - look.stamp_ns / NS_PER_S == pytest.approx(LIDAR_LATE_S) for at_s, look in of_lidars)
@@ -43,15 +43,15 @@ def test_looks_at_two_lidars_come_in_their_time_and_scatter_as_those_on_streets(
     np.testing.assert_allclose(spaced, np.round(spaced))
     offsets = np.concatenate([scattered(heard, name) for name in sorted(FULL.graph.of_lidars)])
     middle = np.median(np.abs(offsets), axis=0) / 0.6745  # of a normal variable, its standard deviation
-    expected = np.hypot(LIDAR_LOOK, lidar_looks.PLACE)
+    expected = np.hypot(LIDAR_CHECK, lidar_looks.PLACE)
     assert ((middle > 0.6 * expected) & (middle < 1.5 * expected)).all()
     assert np.abs(offsets).max() > 20.0 * expected.max(), "some are bad"
 
 
 def test_a_rig_whose_lidars_are_not_looked_at_has_no_such_looks() -> None:
-    assert not APART.graph.of_lidars
-    seen = Counter(look.edge for _, look in looks(APART, STILL, np.random.default_rng(4)))
-    assert set(seen) <= set(APART.graph.edge)
+    assert not UNLINKED.graph.of_lidars
+    seen = Counter(look.edge for _, look in simulate_checks(UNLINKED, STILL, np.random.default_rng(4)))
+    assert set(seen) <= set(UNLINKED.graph.edge)
 
 
 def test_what_lasts_is_in_every_window_of_a_rig() -> None:
@@ -63,4 +63,4 @@ def test_what_lasts_is_in_every_window_of_a_rig() -> None:
         offsets.append([se3.difference(told[n].T_camera_lidar, FULL.graph.edge[n].T_a_b) for n in lasting.between])
     mean = np.mean(offsets, axis=0)
     for place, name in enumerate(lasting.between):
-        np.testing.assert_allclose(mean[place], lasting.between[name], atol=5.0 * LIDAR_LOOK.max() / np.sqrt(60.0))
+        np.testing.assert_allclose(mean[place], lasting.between[name], atol=5.0 * LIDAR_CHECK.max() / np.sqrt(60.0))

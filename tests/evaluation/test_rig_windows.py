@@ -6,21 +6,21 @@ from math import radians
 
 import numpy as np
 
-from coec.evaluation.rig_evidence import FOUR, NS_PER_S, Happening, Heard, Lasting, looks, moved
-from coec.evaluation.rig_windows import SLICE_S, TAKES_S, hurried
+from coec.evaluation.rig_evidence import FOUR, NS_PER_S, Happening, Lasting, TimedEvidence, moved, simulate_checks
+from coec.evaluation.rig_windows import SLICE_S, TAKES_S, urgent_evidence
 from coec.geometry import se3
 
 AT_S, UNTIL_S = 100.0, 1000.0
 DRIVES = 12
 
 
-def driven(number: int) -> tuple[Happening, list[Heard], list[Heard]]:
+def driven(number: int) -> tuple[Happening, list[TimedEvidence], list[TimedEvidence]]:
     """One whose front camera is knocked by 1°: what happens, the looks, and the windows."""
     rng = np.random.default_rng([41, number])
     after = moved(FOUR.poses, ("front",), radians(1.0), rng)
     drive = Happening(FOUR.poses, after, None, AT_S, UNTIL_S)
-    looked = looks(FOUR, drive, rng)
-    return drive, looked, hurried(FOUR, drive, looked, Lasting.of(FOUR, rng), rng)
+    looked = simulate_checks(FOUR, drive, rng)
+    return drive, looked, urgent_evidence(FOUR, drive, looked, Lasting.of(FOUR, rng), rng)
 
 
 def test_the_pair_that_was_knocked_has_windows_of_after_it_and_these_are_right() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coec.evaluation.split_halves import compare, split
-from coec.evaluation.statistics import Outcome, Trial, score
+from coec.evaluation.statistics import SolveOutcome, Trial, score
 from evaluation.test_statistics import FAR, REFERENCE, _estimate, _xi
 
 
@@ -33,7 +33,7 @@ def test_one_frame_has_no_halves() -> None:
         split(1, 0)
 
 
-def _ended(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> Outcome:
+def _ended(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> SolveOutcome:
     estimate = _estimate(_xi(*deg), accepted, radians(sigma_deg))
     return score(Trial(FAR, estimate, 1.0), REFERENCE, 3)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coec.calibration.types import Decision, Estimate, Optimum, StopReason, Uncertainty, Verdict
 from coec.evaluation.statistics import (
     NOT_SOLVED,
-    Outcome,
+    SolveOutcome,
     Trial,
     frames_point,
     score,
@@ -64,7 +64,9 @@ def _estimate(error: NDArray[np.float64], accepted: bool, sigma: float = np.nan)
     )
 
 
-def _outcome(*deg_m: float, accepted: bool = True, dof: int = 3, solve_s: float = 1.0, sigma: float = 0.1) -> Outcome:
+def _outcome(
+    *deg_m: float, accepted: bool = True, dof: int = 3, solve_s: float = 1.0, sigma: float = 0.1
+) -> SolveOutcome:
     return score(Trial(FAR, _estimate(_xi(*deg_m), accepted, sigma), solve_s), REFERENCE, dof)
 
 

@@ -29,9 +29,9 @@ from coec.calibration.types import (
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.evaluation import steps
-from coec.evaluation.steps import Knock, KnockRow, TriedKnock, try_knocks
+from coec.evaluation.steps import MountStep, MountStepRow, MountStepTrial, try_mount_steps
 from coec.geometry import se3
-from estimates import RIG, estimate
+from estimates import ESTIMATE_RIG, estimate
 
 CONFIG = CalibrationConfig()
 
@@ -47,7 +47,7 @@ def street() -> Window:
         sweep = LidarFrame(stamp_ns, "lidar", xyz_m, time_offset_s=np.linspace(-0.1, 0.0, 50, dtype=np.float32))
         motion = EgoMotion(stamp_ns, "ego", (8.0, 0.0, 0.0), (0.0, 0.0, 0.2))
         pairs.append(FramePair(CameraFrame(stamp_ns, "camera", image), sweep, motion))
-    return Window("front-0", RIG, RIG.T_camera_lidar_nominal, tuple(pairs))
+    return Window("front-0", ESTIMATE_RIG, ESTIMATE_RIG.T_camera_lidar_nominal, tuple(pairs))
 
 
 class Solver:
@@ -79,16 +79,16 @@ def refused(window: Window, first_late: int) -> Estimate:
 
 
 def tried(
-    monkeypatch: pytest.MonkeyPatch, street: Window, solver: Solver, *knocks: Knock, trials: int = 3
-) -> list[TriedKnock]:
+    monkeypatch: pytest.MonkeyPatch, street: Window, solver: Solver, *knocks: MountStep, trials: int = 3
+) -> list[MountStepTrial]:
     monkeypatch.setattr(steps, "calibrate", solver)
     unused: Any = None
-    return try_knocks(street, unused, unused, CONFIG, trials, knocks, lambda _: None)
+    return try_mount_steps(street, unused, unused, CONFIG, trials, knocks, lambda _: None)
 
 
 def test_late_sweeps_are_as_if_the_mount_had_moved(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     solver = Solver(lambda window: at(window, 0.0))
-    tried(monkeypatch, street, solver, Knock("none", 0.0), Knock("2 deg", radians(2.0)), trials=4)
+    tried(monkeypatch, street, solver, MountStep("none", 0.0), MountStep("2 deg", radians(2.0)), trials=4)
     still, *knocked = solver.windows
     T = street.T_camera_lidar_start
     for before, pair in zip(street.pairs, still.pairs, strict=True):
@@ -114,12 +114,12 @@ def test_late_sweeps_are_as_if_the_mount_had_moved(street: Window, monkeypatch: 
 def test_what_is_accepted_elsewhere_than_at_the_end_is_wrong(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     for sigma_deg, wrong in ((0.01, True), (0.6, False)):
         solver = Solver(lambda window, sigma_deg=sigma_deg: at(window, 0.0, sigma_deg))
-        told = tried(monkeypatch, street, solver, Knock("none", 0.0), Knock("2 deg", radians(2.0)))
+        told = tried(monkeypatch, street, solver, MountStep("none", 0.0), MountStep("2 deg", radians(2.0)))
         assert [one.wrong for one in told] == [False, wrong, wrong, wrong]
 
 
 def test_the_time_of_a_step_is_known_where_its_place_is(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
-    knock = Knock("1 deg", radians(1.0))
+    knock = MountStep("1 deg", radians(1.0))
     solver = Solver(lambda window: refused(window, 1))
     told = tried(monkeypatch, street, solver, knock, trials=12)
     spacing_s = (street.pairs[1].stamp_ns - street.pairs[0].stamp_ns) / 1e9
@@ -132,20 +132,20 @@ def test_the_time_of_a_step_is_known_where_its_place_is(street: Window, monkeypa
 
 
 def test_the_table_has_a_row_for_each_knock_in_their_order() -> None:
-    def one(name: str, **told: Any) -> TriedKnock:
+    def one(name: str, **told: Any) -> MountStepTrial:
         plain = {"accepted": False, "wrong": False, "moved": False, "off_s": None, "told_s": None, "holds": None}
-        return TriedKnock(name, **{**plain, "late": 0.5, **told})
+        return MountStepTrial(name, **{**plain, "late": 0.5, **told})
 
     told = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0, told_s=2.5, holds=True)]
     told += [one("1 deg", accepted=True, wrong=True), one("1 deg, slowly", moved=True)]
     assert steps.table(told) == (
-        KnockRow("none", 1, 1.0, 0.0, 0.0, None, None, None, None),
-        KnockRow("1 deg", 2, 0.5, 0.5, 0.5, 0.5, 1.0, 2.5, 1.0),
-        KnockRow("1 deg, slowly", 1, 0.0, 0.0, 1.0, None, None, None, None),
+        MountStepRow("none", 1, 1.0, 0.0, 0.0, None, None, None, None),
+        MountStepRow("1 deg", 2, 0.5, 0.5, 0.5, 0.5, 1.0, 2.5, 1.0),
+        MountStepRow("1 deg, slowly", 1, 0.0, 0.0, 1.0, None, None, None, None),
     )
 
 
 def test_a_window_of_one_pair_has_no_time_for_a_knock(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     one = replace(street, pairs=street.pairs[:1])
     with pytest.raises(CalibrationError, match="between two pairs"):
-        tried(monkeypatch, one, Solver(lambda window: at(window, 0.0)), Knock("none", 0.0))
+        tried(monkeypatch, one, Solver(lambda window: at(window, 0.0)), MountStep("none", 0.0))

@@ -7,17 +7,17 @@ import pytest
 from coec.fleet.alarms import false_alarms
 from coec.schemas.last_word import LastWord
 from coec.schemas.replies import Alarms
-from last_words import a_word
+from last_words import heartbeat
 
 
 def _told(vehicle: str, hours: float, confirmed: int, withdrawn: int) -> LastWord:
-    return a_word(
+    return heartbeat(
         vehicle, alarms=Alarms(watched_s=3600.0 * hours, confirmed=confirmed, withdrawn=withdrawn, open=False)
     )
 
 
 def test_a_rate_with_its_bound_and_the_pairs_that_have_most() -> None:
-    told = false_alarms([_told("v1", 150, 2, 0), _told("v2", 30, 0, 1), _told("v3", 20, 1, 2), a_word("v4")])
+    told = false_alarms([_told("v1", 150, 2, 0), _told("v2", 30, 0, 1), _told("v3", 20, 1, 2), heartbeat("v4")])
     assert (told.pairs, told.watched_h, told.confirmed, told.withdrawn) == (3, 200.0, 3, 3)
     assert told.per_100_h == pytest.approx(1.5)
     # Three events are at most 7.75 in one draw of twenty (tables of the Poisson distribution).
@@ -32,5 +32,5 @@ def test_hours_without_an_alarm_bound_the_rate() -> None:
 
 
 def test_nobody_watched() -> None:
-    told = false_alarms([a_word("v1")])
+    told = false_alarms([heartbeat("v1")])
     assert (told.pairs, told.per_100_h, told.per_100_h_at_most) == (0, None, None)

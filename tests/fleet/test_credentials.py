@@ -11,7 +11,7 @@ import pytest
 
 from coec.errors import SourceError
 from coec.fleet.credentials import GOOGLE, MAX_FILE_BYTES, StoreCredentials, redacted
-from coec.fleet.places import Job, StoreError, fetched, stores_of
+from coec.fleet.places import Job, StoreError, fetched_window, stores_of
 
 SECRET = "wJalrXUtnFEMI/K7MDENG"
 AWS = {"AWS_ACCESS_KEY_ID": "AKIDEXAMPLE", "AWS_SECRET_ACCESS_KEY": SECRET, "AWS_REGION": "eu-central-1"}
@@ -79,7 +79,7 @@ def test_no_secret_gets_into_a_text(monkeypatch: pytest.MonkeyPatch) -> None:
         raise PermissionError(f"refused: {SECRET}")
 
     monkeypatch.setattr(fsspec.core, "url_to_fs", fail)
-    with pytest.raises(StoreError) as raised, fetched("s3://a/1.mcap"):
+    with pytest.raises(StoreError) as raised, fetched_window("s3://a/1.mcap"):
         pass
     assert SECRET not in str(raised.value)
     assert "AWS_SECRET_ACCESS_KEY" in str(raised.value)

@@ -11,11 +11,11 @@ import pytest
 from coec.adapters.mcap.windows import read_result, read_vehicle
 from coec.config import CalibrationConfig
 from coec.errors import ConfigError, UsageError
-from coec.fleet.desk import Desk
+from coec.fleet.desk import WindowEvaluator
 from coec.fleet.places import Job
-from coec.fleet.terms import Terms, terms_of
+from coec.fleet.terms import ReplaySettings, load_settings
 from coec.schemas.base import to_json
-from fleet_windows import CONFIGURATION
+from fleet_windows import WINDOW_CONFIGURATION
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def window(recorded: Path) -> Path:
 
 
 def test_the_decision_is_that_of_the_vehicle_to_the_byte(window: Path) -> None:
-    row = Desk(Terms()).row(Job(str(window)))
+    row = WindowEvaluator(ReplaySettings()).row(Job(str(window)))
     result = read_result(window)
     assert result is not None
     assert row.result is not None
@@ -42,8 +42,8 @@ def test_a_window_says_whose_it_is_without_a_result(window: Path) -> None:
 
 
 def test_another_configuration_decides_for_the_pair_that_it_names_or_for_all_if_it_names_one(window: Path) -> None:
-    other = CONFIGURATION.model_copy(update={"motion_compensation": False})
-    desk = Desk(Terms(calibrations={"elsewhere": other}, any_pair=other))
+    other = WINDOW_CONFIGURATION.model_copy(update={"motion_compensation": False})
+    desk = WindowEvaluator(ReplaySettings(calibrations={"elsewhere": other}, any_pair=other))
     row = desk.row(Job(str(window)))
     assert row.result is not None
     assert row.decided != row.recorded
@@ -51,7 +51,7 @@ def test_another_configuration_decides_for_the_pair_that_it_names_or_for_all_if_
 
 
 def test_a_configuration_that_does_not_know_the_pair_is_an_error_of_the_window(window: Path) -> None:
-    desk = Desk(Terms(calibrations={"left": CalibrationConfig(), "right": CalibrationConfig()}))
+    desk = WindowEvaluator(ReplaySettings(calibrations={"left": CalibrationConfig(), "right": CalibrationConfig()}))
     row = desk.row(Job(str(window)))
     assert row.error_code == ConfigError.reply_code
     assert "left, right" in str(row.error)
@@ -66,12 +66,12 @@ def test_another_rig_decides_for_its_pair(window: Path, tmp_path: Path) -> None:
     document["camera"]["cx"] += 3.0
     path = tmp_path / "rig.json"
     path.write_text(json.dumps(document))
-    row = Desk(terms_of(None, path, None)).row(Job(str(window)))
+    row = WindowEvaluator(load_settings(None, path, None)).row(Job(str(window)))
     assert row.result is not None
     assert row.decided != row.recorded
 
     path.write_text(json.dumps({**document, "pair": "another"}))
-    same = Desk(terms_of(None, path, None)).row(Job(str(window)))
+    same = WindowEvaluator(load_settings(None, path, None)).row(Job(str(window)))
     assert same.decided == same.recorded
 
 
@@ -81,7 +81,7 @@ def test_a_rig_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "rig.json"
     path.write_text(text)
     with pytest.raises(UsageError, match=r"rig\.json"):
-        terms_of(None, path, None)
+        load_settings(None, path, None)
 
 
 @pytest.mark.fault(
@@ -92,7 +92,7 @@ def test_what_cannot_be_judged_is_a_row(window: Path, tmp_path: Path) -> None:
     cut, flipped = tmp_path / "cut.mcap", tmp_path / "flipped.mcap"
     cut.write_bytes(whole[: len(whole) // 2])
     flipped.write_bytes(whole[:4000] + bytes([whole[4000] ^ 1]) + whole[4001:])
-    desk = Desk(Terms())
+    desk = WindowEvaluator(ReplaySettings())
     codes = {
         job.url: desk.row(job).error_code
         for job in (
@@ -114,6 +114,6 @@ def test_a_fault_of_ours_is_a_row_as_well(window: Path, monkeypatch: pytest.Monk
         raise ZeroDivisionError("no such thing")
 
     monkeypatch.setattr("coec.fleet.desk.calibrate", broken)
-    row = Desk(Terms()).row(Job(str(window)))
+    row = WindowEvaluator(ReplaySettings()).row(Job(str(window)))
     assert (row.error_code, row.error) == ("internal", "ZeroDivisionError: no such thing")
     assert row.sha256 is not None

@@ -13,14 +13,14 @@ import psutil
 import pytest
 
 from coec.adapters.mcap.windows import read_result
-from coec.fleet.engines.engine import DEADLINE, PROCESS_DIED, TOO_LARGE, Bounds, Engine
+from coec.fleet.engines.engine import DEADLINE, PROCESS_DIED, TOO_LARGE, Engine, WorkerLimits
 from coec.fleet.engines.local import LocalEngine
 from coec.fleet.places import Job
-from coec.fleet.terms import Terms
+from coec.fleet.terms import ReplaySettings
 from coec.schemas.base import to_json
 
 MIB = 2**20
-BOUNDS = Bounds(120.0, 4096 * MIB)
+BOUNDS = WorkerLimits(120.0, 4096 * MIB)
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def _reads(child: psutil.Process, path: Path) -> bool:
 
 def decided(engine: Engine, jobs: list[Job]) -> dict[str, str | None]:
     """Decision or code of the error, by window."""
-    return {row.url: row.decided or row.error_code for row in engine.rows(jobs, Terms())}
+    return {row.url: row.decided or row.error_code for row in engine.rows(jobs, ReplaySettings())}
 
 
 def expected(recorded: Path) -> dict[str, str | None]:
@@ -85,12 +85,12 @@ def test_time_and_memory_are_bounded(recorded: Path, tmp_path: Path) -> None:
     endless = tmp_path / "endless.mcap"
     os.mkfifo(endless)  # that nobody writes
     one = next(iter(expected(recorded)))
-    assert decided(LocalEngine(1, Bounds(1.0, 4096 * MIB)), [Job(str(endless))]) == {str(endless): DEADLINE}
-    assert decided(LocalEngine(1, Bounds(120.0, MIB)), [Job(one)]) == {one: TOO_LARGE}
+    assert decided(LocalEngine(1, WorkerLimits(1.0, 4096 * MIB)), [Job(str(endless))]) == {str(endless): DEADLINE}
+    assert decided(LocalEngine(1, WorkerLimits(120.0, MIB)), [Job(one)]) == {one: TOO_LARGE}
 
 
 def test_no_windows_need_no_process() -> None:
-    assert list(LocalEngine(2, BOUNDS).rows([], Terms())) == []
+    assert list(LocalEngine(2, BOUNDS).rows([], ReplaySettings())) == []
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import fsspec
 import pytest
 
 from coec.errors import SourceError, UsageError
-from coec.fleet.places import Job, fetched, jobs_of
+from coec.fleet.places import Job, fetched_window, jobs_of
 
 DATA = b"a window"
 SHA256 = hashlib.sha256(DATA).hexdigest()
@@ -52,7 +52,7 @@ def test_the_same_behind_urls(store: str) -> None:
         jobs = jobs_of([pattern])
         assert [job.url.rpartition("windows/")[2] for job in jobs] == ALL
     for job in jobs:
-        with fetched(job.url) as path:
+        with fetched_window(job.url) as path:
             assert path.read_bytes() == DATA
         assert not path.exists()
 

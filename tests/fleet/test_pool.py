@@ -10,14 +10,22 @@ from dataclasses import dataclass, field
 import pytest
 
 from coec.errors import ModelError
-from coec.fleet.engines.engine import DEADLINE, NODE_LOST, PROCESS_DIED, Bounds, FleetError
-from coec.fleet.engines.pool import START_S, Ended, Event, Judged, Pool, Started, Worker
+from coec.fleet.engines.engine import DEADLINE, NODE_LOST, PROCESS_DIED, FleetError, WorkerLimits
+from coec.fleet.engines.pool import (
+    START_S,
+    PoolWorker,
+    WindowEvaluated,
+    WorkerEvent,
+    WorkerPool,
+    WorkerStarted,
+    WorkerStopped,
+)
 from coec.fleet.engines.queue import MAX_LOSSES
 from coec.fleet.places import Job, StoreError
-from coec.fleet.trouble import begun, lost
+from coec.fleet.trouble import empty_row, lost_row
 from coec.schemas.fleet import WindowRow
 
-BOUNDS = Bounds(600.0, 2**30)
+BOUNDS = WorkerLimits(600.0, 2**30)
 
 DIED, LOST = "it ended", "the node that had it was lost"
 
@@ -41,7 +49,7 @@ class FakeWorker:
     """A process. `behave` returns what it does when it is polled."""
 
     number: int
-    behave: Callable[[FakeWorker], list[Event]]
+    behave: Callable[[FakeWorker], list[WorkerEvent]]
     started: bool = False
     closed: bool = False
     jobs: deque[Job] = field(default_factory=deque)
@@ -59,74 +67,74 @@ class FakeWorker:
 class FakeWorkers:
     """Starts processes, of which each behaves as the list says; further ones as the last."""
 
-    def __init__(self, clock: Clock, *behaviours: Callable[[FakeWorker], list[Event]]) -> None:
+    def __init__(self, clock: Clock, *behaviours: Callable[[FakeWorker], list[WorkerEvent]]) -> None:
         self._clock = clock
         self._behaviours = behaviours
         self.all: list[FakeWorker] = []
 
-    def start(self) -> Worker:
+    def start(self) -> PoolWorker:
         number = len(self.all)
         self.all.append(FakeWorker(number, self._behaviours[min(number, len(self._behaviours) - 1)]))
         return self.all[-1]
 
-    def events(self, workers: Sequence[Worker], timeout_s: float) -> Iterator[Event]:
+    def events(self, workers: Sequence[PoolWorker], timeout_s: float) -> Iterator[WorkerEvent]:
         events = [event for worker in self.all if worker in workers for event in worker.behave(worker)]
         if not events:
             self._clock.now_s += timeout_s
         yield from events
 
 
-def judge(worker: FakeWorker) -> list[Event]:
+def judge(worker: FakeWorker) -> list[WorkerEvent]:
     """Starts, then judges a window at a time."""
     if not worker.started:
         worker.started = True
-        return [Started(worker)]
-    return [Judged(worker, begun(worker.jobs.popleft(), {}))] if worker.jobs else []
+        return [WorkerStarted(worker)]
+    return [WindowEvaluated(worker, empty_row(worker.jobs.popleft(), {}))] if worker.jobs else []
 
 
-def never_placed(_: FakeWorker) -> list[Event]:
+def never_placed(_: FakeWorker) -> list[WorkerEvent]:
     return []
 
 
-def fail_alike(code: str, text: str) -> Callable[[FakeWorker], list[Event]]:
+def fail_alike(code: str, text: str) -> Callable[[FakeWorker], list[WorkerEvent]]:
     """Every window fails at once."""
 
-    def behave(worker: FakeWorker) -> list[Event]:
+    def behave(worker: FakeWorker) -> list[WorkerEvent]:
         if not worker.started:
             return judge(worker)
-        events: list[Event] = [Judged(worker, lost(job, code, text)) for job in worker.jobs]
+        events: list[WorkerEvent] = [WindowEvaluated(worker, lost_row(job, code, text)) for job in worker.jobs]
         worker.jobs.clear()
         return events
 
     return behave
 
 
-def end(*, blame: bool, text: str = DIED) -> Callable[[FakeWorker], list[Event]]:
+def end(*, blame: bool, text: str = DIED) -> Callable[[FakeWorker], list[WorkerEvent]]:
     """Ends as soon as it has windows."""
 
-    def behave(worker: FakeWorker) -> list[Event]:
+    def behave(worker: FakeWorker) -> list[WorkerEvent]:
         if not worker.started or not worker.jobs:
             return judge(worker) if not worker.started else []
-        return [Ended(worker, PROCESS_DIED if blame else NODE_LOST, text, blame=blame)]
+        return [WorkerStopped(worker, PROCESS_DIED if blame else NODE_LOST, text, blame=blame)]
 
     return behave
 
 
-def hang(worker: FakeWorker) -> list[Event]:
+def hang(worker: FakeWorker) -> list[WorkerEvent]:
     return [] if worker.started else judge(worker)
 
 
-def no_start(worker: FakeWorker) -> list[Event]:
-    return [Ended(worker, PROCESS_DIED, "no module named coec")]
+def no_start(worker: FakeWorker) -> list[WorkerEvent]:
+    return [WorkerStopped(worker, PROCESS_DIED, "no module named coec")]
 
 
 def run(
-    count: int, cores: int, *behaviours: Callable[[FakeWorker], list[Event]], bounds: Bounds = BOUNDS
+    count: int, cores: int, *behaviours: Callable[[FakeWorker], list[WorkerEvent]], bounds: WorkerLimits = BOUNDS
 ) -> tuple[dict[str, str | None], FakeWorkers, Clock]:
     """Error code by window (None: judged); no window has two rows."""
     clock = Clock()
     workers = FakeWorkers(clock, *behaviours)
-    rows = list(Pool(workers, bounds, clock).rows(jobs(count), cores))
+    rows = list(WorkerPool(workers, bounds, clock).rows(jobs(count), cores))
     assert len({row.url for row in rows}) == len(rows)
     assert all(worker.closed for worker in workers.all)
     return {row.url: row.error_code for row in rows}, workers, clock
@@ -155,17 +163,17 @@ def test_a_process_that_is_never_placed_holds_no_window() -> None:
 def test_when_no_process_is_ever_placed_the_batch_ends() -> None:
     clock = Clock()
     with pytest.raises(FleetError, match="1024 MiB"):
-        list(Pool(FakeWorkers(clock, never_placed), BOUNDS, clock).rows(jobs(3), 2))
+        list(WorkerPool(FakeWorkers(clock, never_placed), BOUNDS, clock).rows(jobs(3), 2))
     assert START_S < clock.now_s < START_S + 2.0
 
 
 def test_a_late_place_is_used() -> None:
     polls = iter(range(1000))
 
-    def late(worker: FakeWorker) -> list[Event]:
+    def late(worker: FakeWorker) -> list[WorkerEvent]:
         return judge(worker) if worker.started or next(polls) > 20 else []
 
-    codes, workers, _ = run(9, 2, hang, late, bounds=Bounds(1.0, 2**30))
+    codes, workers, _ = run(9, 2, hang, late, bounds=WorkerLimits(1.0, 2**30))
     assert workers.all[1].started
     # The first window of the process that hangs is tried again, and hangs nowhere else.
     assert codes == all_judged(9)
@@ -190,18 +198,18 @@ def test_a_process_that_hangs_costs_its_deadline_and_the_window_is_tried_by_anot
 def test_late_and_repeated_answers_are_dropped() -> None:
     left: list[WindowRow] = []
 
-    def lost_node(worker: FakeWorker) -> list[Event]:
+    def lost_node(worker: FakeWorker) -> list[WorkerEvent]:
         if not worker.started or not worker.jobs:
             return judge(worker)
-        left.extend(begun(job, {}) for job in worker.jobs)
+        left.extend(empty_row(job, {}) for job in worker.jobs)
         return [
-            Ended(worker, NODE_LOST, LOST, blame=False),
-            *(Judged(worker, row) for row in left),
-            Ended(worker, NODE_LOST, LOST, blame=False),
+            WorkerStopped(worker, NODE_LOST, LOST, blame=False),
+            *(WindowEvaluated(worker, row) for row in left),
+            WorkerStopped(worker, NODE_LOST, LOST, blame=False),
         ]
 
-    def stutter(worker: FakeWorker) -> list[Event]:
-        late: list[Event] = [Judged(worker, row) for row in left]  # from elsewhere
+    def stutter(worker: FakeWorker) -> list[WorkerEvent]:
+        late: list[WorkerEvent] = [WindowEvaluated(worker, row) for row in left]  # from elsewhere
         return [event for event in judge(worker) for _ in range(2)] + (late if worker.started else [])
 
     codes, _, _ = run(9, 2, lost_node, stutter)
@@ -222,7 +230,7 @@ def test_a_failure_of_every_window_stops_the_batch_without_rows(cores: int, code
     workers = FakeWorkers(clock, fail_alike(code, text))
     rows: list[WindowRow] = []
     with pytest.raises(FleetError) as raised:
-        rows.extend(Pool(workers, BOUNDS, clock).rows(jobs(61), cores))
+        rows.extend(WorkerPool(workers, BOUNDS, clock).rows(jobs(61), cores))
     assert rows == []
     assert len(workers.all) == cores
     for part in (text, advice, "--resume", "--keep-going"):
@@ -231,7 +239,7 @@ def test_a_failure_of_every_window_stops_the_batch_without_rows(cores: int, code
 
 def test_with_keep_going_every_failure_is_a_row() -> None:
     code = StoreError.reply_code
-    codes, _, _ = run(9, 2, fail_alike(code, "away"), bounds=Bounds(600.0, 2**30, alike=None))
+    codes, _, _ = run(9, 2, fail_alike(code, "away"), bounds=WorkerLimits(600.0, 2**30, alike=None))
     assert codes == {job.url: code for job in jobs(9)}
 
 
@@ -245,9 +253,9 @@ def test_a_process_that_fails_every_window_does_not_eat_the_batch() -> None:
 def test_a_store_that_was_away_for_a_moment_costs_no_window() -> None:
     fails = deque([True, False, True, True])
 
-    def blink(worker: FakeWorker) -> list[Event]:
+    def blink(worker: FakeWorker) -> list[WorkerEvent]:
         if worker.started and worker.jobs and fails and fails.popleft():
-            return [Judged(worker, lost(worker.jobs.popleft(), StoreError.reply_code, "away"))]
+            return [WindowEvaluated(worker, lost_row(worker.jobs.popleft(), StoreError.reply_code, "away"))]
         return judge(worker)
 
     codes, _, _ = run(9, 1, blink)
@@ -273,16 +281,16 @@ def test_processes_that_cannot_start() -> None:
 def test_whatever_happens_each_window_has_one_row(seed: int) -> None:
     rng = random.Random(seed)
 
-    def anything(worker: FakeWorker) -> list[Event]:
+    def anything(worker: FakeWorker) -> list[WorkerEvent]:
         if not worker.started:
             return judge(worker) if rng.random() < 0.5 else []
         dice = rng.random()
         if dice < 0.05:
-            return [Ended(worker, PROCESS_DIED, DIED)]
+            return [WorkerStopped(worker, PROCESS_DIED, DIED)]
         if dice < 0.1:
-            return [Ended(worker, NODE_LOST, LOST, blame=False)]
+            return [WorkerStopped(worker, NODE_LOST, LOST, blame=False)]
         if dice < 0.15 and worker.jobs:
-            return [Judged(worker, lost(worker.jobs.popleft(), "bad_window", "rubbish"))]
+            return [WindowEvaluated(worker, lost_row(worker.jobs.popleft(), "bad_window", "rubbish"))]
         return judge(worker) if dice < 0.6 else []
 
     codes, _, _ = run(40, rng.randrange(1, 6), anything)

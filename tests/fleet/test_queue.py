@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from coec.fleet.engines.queue import AHEAD, Queue
+from coec.fleet.engines.queue import WINDOWS_PER_WORKER, WindowQueue
 from coec.fleet.places import Job
 
 TROUBLE = ("process_died", "it ended")
@@ -17,23 +17,23 @@ def jobs(count: int) -> list[Job]:
 
 
 def test_a_process_has_one_window_ahead_and_no_more() -> None:
-    queue = Queue(jobs(5))
+    queue = WindowQueue(jobs(5))
     has: list[Job] = []
     while (job := queue.next_for(has)) is not None:
         has.append(job)
-    assert has == jobs(5)[:AHEAD]
+    assert has == jobs(5)[:WINDOWS_PER_WORKER]
     assert queue
 
 
 def test_after_an_end_each_window_is_tried_by_itself_and_the_second_end_is_its_own() -> None:
     one, two, three = jobs(3)
-    queue = Queue([one, two, three])
+    queue = WindowQueue([one, two, three])
     assert [queue.next_for([]), queue.next_for([one])] == [one, two]
-    assert list(queue.give_back([one, two], *TROUBLE)) == []
+    assert list(queue.retry_alone([one, two], *TROUBLE)) == []
     assert queue.next_for([three]) is None  # a process that has others gets no suspected one
     assert queue.next_for([]) == one
     assert queue.next_for([one]) is None  # nor does one that has it get others
-    (row,) = queue.give_back([one], *TROUBLE)
+    (row,) = queue.retry_alone([one], *TROUBLE)
     assert (row.url, row.error_code, row.error) == (one.url, *TROUBLE)
     assert [queue.next_for([]), queue.next_for([])] == [two, three]
 
@@ -44,7 +44,7 @@ def test_whoever_is_poisoned_nobody_else_is_lost(seed: int) -> None:
     rng = random.Random(seed)
     everything = jobs(rng.randrange(1, 30))
     poisoned = set(rng.sample(everything, rng.randrange(len(everything) + 1)))
-    queue = Queue(everything)
+    queue = WindowQueue(everything)
     seats: list[list[Job]] = [[] for _ in range(rng.randrange(1, 5))]
     judged: list[Job] = []
     lost: list[str] = []
@@ -55,7 +55,7 @@ def test_whoever_is_poisoned_nobody_else_is_lost(seed: int) -> None:
         has = rng.choice([has for has in seats if has])
         job = rng.choice(has)
         if job in poisoned:
-            lost += [row.url for row in queue.give_back(has, *TROUBLE)]
+            lost += [row.url for row in queue.retry_alone(has, *TROUBLE)]
             has.clear()
         else:
             has.remove(job)

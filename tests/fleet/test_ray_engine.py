@@ -18,13 +18,13 @@ from coec import __version__
 from coec.errors import SourceError
 from coec.fleet.credentials import StoreCredentials
 from coec.fleet.engines import ray as engine_module
-from coec.fleet.engines.engine import NODE_LOST, NOT_ON_NODE, Bounds, FleetError
+from coec.fleet.engines.engine import NODE_LOST, NOT_ON_NODE, FleetError, WorkerLimits
 from coec.fleet.engines.ray import NODE_DIED, SILENCE_S, RayEngine
 from coec.fleet.places import Job
-from coec.fleet.terms import Terms
-from coec.fleet.trouble import begun, failed
+from coec.fleet.terms import ReplaySettings
+from coec.fleet.trouble import empty_row, failed_row
 
-BOUNDS = Bounds(600.0, 2**30)
+BOUNDS = WorkerLimits(600.0, 2**30)
 GIB = 2.0**30
 
 
@@ -154,9 +154,9 @@ class FakeRay(ModuleType):
         if name == "ping":
             return None
         (job,) = arguments
-        row = begun(job, {}).model_copy(update={"sha256": "0" * 64})
+        row = empty_row(job, {}).model_copy(update={"sha256": "0" * 64})
         if not node.shares:
-            row = failed(begun(job, {}), SourceError.reply_code, "cannot read it")
+            row = failed_row(empty_row(job, {}), SourceError.reply_code, "cannot read it")
         return row.model_dump_json()
 
     def get(self, reference: Reference, timeout: float) -> Any:
@@ -198,8 +198,10 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
     return make
 
 
-def judged(count: int = 6, jobs: Sequence[Job] | None = None, bounds: Bounds = BOUNDS) -> dict[str, str | None]:
-    rows = list(RayEngine(None, bounds).rows(jobs or [Job(f"{index}.mcap") for index in range(count)], Terms()))
+def judged(count: int = 6, jobs: Sequence[Job] | None = None, bounds: WorkerLimits = BOUNDS) -> dict[str, str | None]:
+    rows = list(
+        RayEngine(None, bounds).rows(jobs or [Job(f"{index}.mcap") for index in range(count)], ReplaySettings())
+    )
     assert len({row.url for row in rows}) == len(rows)
     return {row.url: row.error_code for row in rows}
 
@@ -255,7 +257,7 @@ def test_an_address_at_which_nobody_listens_is_an_error(
 def test_a_cluster_whose_nodes_are_too_small_is_refused_at_once(cluster: Cluster) -> None:
     cluster(Node(), Node())
     with pytest.raises(FleetError, match=r"4096 MiB.*--memory"):
-        RayEngine(None, Bounds(600.0, 2**32))
+        RayEngine(None, WorkerLimits(600.0, 2**32))
     assert RayEngine(None, BOUNDS).cores == 2
     assert RayEngine(1, BOUNDS).cores == 1
 
@@ -278,7 +280,7 @@ def test_paths_that_exist_only_here_stop_the_batch(cluster: Cluster, tmp_path: P
     with pytest.raises(FleetError, match="every node mounts"):
         judged(jobs=jobs)
     cluster(Node(shares=False))
-    codes = judged(jobs=jobs, bounds=Bounds(600.0, 2**30, alike=None))
+    codes = judged(jobs=jobs, bounds=WorkerLimits(600.0, 2**30, alike=None))
     assert set(codes.values()) == {NOT_ON_NODE}
     # A path that does not exist here either is the window's own fault.
     assert judged(1) == {"0.mcap": SourceError.reply_code}
@@ -292,7 +294,7 @@ def test_credentials_are_an_argument_and_not_in_the_runtime_environment(
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "the-secret")
     for send in (True, False):
         fake = cluster(Node())
-        list(RayEngine(None, BOUNDS, send_credentials=send).rows([Job("s3://a/0.mcap")], Terms()))
+        list(RayEngine(None, BOUNDS, send_credentials=send).rows([Job("s3://a/0.mcap")], ReplaySettings()))
         ((_, credentials),) = fake.arguments
         assert isinstance(credentials, StoreCredentials)
         assert ("the-secret" in credentials.values.values()) == send

@@ -14,13 +14,13 @@ from coec.errors import UsageError
 from coec.fleet import questions, tables
 from coec.fleet.report import report
 from coec.reports import fleet_page
-from coec.reports.page import Verdict, render
-from coec.reports.provenance import Made
+from coec.reports.page import VerdictBanner, render
+from coec.reports.provenance import Provenance
 from coec.schemas.fleet import FleetReport, WindowRow
 from coec.schemas.fleet_now import FleetNow, PairNow
 from coec.schemas.replies import Alarms, CalibrationResult
-from fleets import FAILED, REFUSED, SIGMA, fleet
-from last_words import a_word
+from fleets import FAILED_SHARE, REFUSED_SHARE, WINDOW_SIGMA, fleet_rows
+from last_words import heartbeat
 
 VEHICLES, WINDOWS = 12, 40
 DRIFTS = {3: (1, 1.2), 7: (3, 0.15)}
@@ -36,13 +36,13 @@ def pattern(recorded: Path) -> CalibrationResult:
 
 @pytest.fixture(scope="module")
 def rows(pattern: CalibrationResult) -> list[WindowRow]:
-    return list(fleet(pattern, VEHICLES, WINDOWS, DRIFTS, 1))
+    return list(fleet_rows(pattern, VEHICLES, WINDOWS, DRIFTS, 1))
 
 
 @pytest.fixture(scope="module")
 def results(rows: list[WindowRow], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
-    tables.write(folder, rows, "part-1")
+    tables.write_tables(folder, rows, "part-1")
     return folder
 
 
@@ -69,8 +69,8 @@ def test_counts_are_those_of_the_rows(told: FleetReport, rows: list[WindowRow]) 
     assert (told.windows, told.accepted) == (len(rows), len(accepted))
     assert told.refusals == {"sigma_deg": len(results) - len(accepted)}
     assert told.errors == {"bad_window": len(rows) - len(results)}
-    assert len(results) < len(rows) * (1.0 - FAILED / 4.0)
-    assert len(results) - len(accepted) > len(rows) * REFUSED / 4.0
+    assert len(results) < len(rows) * (1.0 - FAILED_SHARE / 4.0)
+    assert len(results) - len(accepted) > len(rows) * REFUSED_SHARE / 4.0
     # Windows that could not be read have no vehicle; they are no vehicle's drift either.
     assert {pair.vehicle for pair in told.pairs} == {*(f"v{index:03}" for index in range(VEHICLES)), "unknown"}
     (first_ns, last_ns) = min(r.data_stamp_ns for r in results), max(r.data_stamp_ns for r in results)
@@ -98,11 +98,11 @@ def test_an_axis_that_no_window_tells_has_no_drift(rows: list[WindowRow], tmp_pa
         for row in rows[:WINDOWS]
         if row.result is not None
     ]
-    tables.write(tmp_path, blind, "part-1")
+    tables.write_tables(tmp_path, blind, "part-1")
     (pair,) = report(tmp_path, None).pairs
     assert pair.drift[5] is None
     assert pair.latest[5] is None
-    assert pair.latest[4] == pytest.approx(0.0, abs=40.0 * SIGMA[4])
+    assert pair.latest[4] == pytest.approx(0.0, abs=40.0 * WINDOW_SIGMA[4])
     assert all(day.middle[5] is None for day in pair.days)
 
 
@@ -123,7 +123,7 @@ def test_what_another_batch_decided_otherwise(results: Path, rows: list[WindowRo
         update={"result": None, "decided": None, "error_code": "deadline", "error": "late"}
     )
     for name, batch in (("before", before), ("now", now)):
-        tables.write(tmp_path / name, [*batch, batch[0].model_copy(update={"url": "a copy of it"})], "part-1")
+        tables.write_tables(tmp_path / name, [*batch, batch[0].model_copy(update={"url": "a copy of it"})], "part-1")
     changes = report(tmp_path / "now", tmp_path / "before").changes
     assert changes is not None
     assert (changes.both, changes.identical) == (len(rows), len(rows) - 2)
@@ -138,8 +138,8 @@ def test_what_another_batch_decided_otherwise(results: Path, rows: list[WindowRo
 
 
 def test_every_example_of_a_query_answers(results: Path) -> None:
-    connection = questions.ask(results)
-    for question, query in questions.EXAMPLES.items():
+    connection = questions.connect(results)
+    for question, query in questions.EXAMPLE_QUERIES.items():
         rows = connection.execute(query).fetchall()
         assert rows or "otherwise" in question, question
     assert dict(questions.columns(results))["correlation"] == "DOUBLE[]"
@@ -147,14 +147,14 @@ def test_every_example_of_a_query_answers(results: Path) -> None:
 
 def test_the_view_that_is_printed_is_the_one_that_is_asked(rows: list[WindowRow], tmp_path: Path) -> None:
     """A vehicle whose name is a number keeps its zeros."""
-    tables.write(tmp_path, [row.model_copy(update={"vehicle": "007"}) for row in rows[:2]], "part-1")
+    tables.write_tables(tmp_path, [row.model_copy(update={"vehicle": "007"}) for row in rows[:2]], "part-1")
     connection = duckdb.connect()
-    connection.execute(questions.statement("mine", tmp_path))
+    connection.execute(questions.view_statement("mine", tmp_path))
     assert connection.execute("SELECT DISTINCT vehicle FROM mine").fetchall() == [("007",)]
 
 
 def test_false_alarms_of_vehicles_stand_on_the_page(results: Path) -> None:
-    word = a_word("<v>", alarms=Alarms(watched_s=180_000.0, confirmed=2, withdrawn=1, open=False))
+    word = heartbeat("<v>", alarms=Alarms(watched_s=180_000.0, confirmed=2, withdrawn=1, open=False))
     pair = PairNow(word=word, standing="live", said_s=1.0, looked_s=1.0, worst=None, urgency=0.0)
     now = FleetNow(vehicles=1, known=1, states={}, matching=1, pairs=(pair,), refused={})
     text = render(fleet_page.page(report(results, None, now), "fleet", MADE))
@@ -164,12 +164,12 @@ def test_false_alarms_of_vehicles_stand_on_the_page(results: Path) -> None:
 
 
 def test_a_drift_that_one_window_cannot_tell_is_not_denied(rows: list[WindowRow], tmp_path: Path) -> None:
-    tables.write(
+    tables.write_tables(
         tmp_path, [next(row for row in rows if row.result and row.result.verdict.decision == "accepted")], "part-1"
     )
     told = report(tmp_path, None)
     (verdict,) = fleet_page.page(told, "fleet", MADE).opening
-    assert isinstance(verdict, Verdict)
+    assert isinstance(verdict, VerdictBanner)
     assert (verdict.tone, verdict.word) == ("none", "Drift not known.")
     assert fleet_page.sentence(told).startswith("1 vehicle, 1 window on 20")
     assert fleet_page.sentence(told).endswith("too few accepted windows to tell a drift: 1.")
@@ -180,7 +180,7 @@ def test_a_folder_without_tables_is_told(tmp_path: Path) -> None:
         report(tmp_path, None)
 
 
-MADE = Made("coec fleet report tables", 0, {"coec": "0"}, "Linux")
+MADE = Provenance("coec fleet report tables", 0, {"coec": "0"}, "Linux")
 
 
 class Page(HTMLParser):

@@ -13,18 +13,18 @@ import pytest
 from coec.adapters.files import durable
 from coec.errors import OutputError, SourceError, UsageError
 from coec.fleet import batch, results, tables
-from coec.fleet.desk import Desk
+from coec.fleet.desk import WindowEvaluator
 from coec.fleet.engines.engine import FleetError
 from coec.fleet.places import Job
-from coec.fleet.results import Results
-from coec.fleet.terms import Terms
-from coec.fleet.trouble import begun, lost
+from coec.fleet.results import BatchFolder
+from coec.fleet.terms import ReplaySettings
+from coec.fleet.trouble import empty_row, lost_row
 from coec.schemas.fleet import WindowRow
 
 
 @pytest.fixture(scope="module")
 def row(recorded: Path) -> WindowRow:
-    return Desk(Terms()).row(Job(str(recorded / "one" / "one-1.mcap")))
+    return WindowEvaluator(ReplaySettings()).row(Job(str(recorded / "one" / "one-1.mcap")))
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +33,7 @@ def small_files(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def rows(count: int) -> Iterator[WindowRow]:
-    return (begun(Job(f"{index}.mcap"), {}) for index in range(count))
+    return (empty_row(Job(f"{index}.mcap"), {}) for index in range(count))
 
 
 def asked(folder: Path, query: str) -> list[tuple[Any, ...]]:
@@ -43,7 +43,7 @@ def asked(folder: Path, query: str) -> list[tuple[Any, ...]]:
 
 
 def test_a_row_holds_everything_that_was_decided(tmp_path: Path, row: WindowRow) -> None:
-    tables.write(tmp_path, [row, lost(Job("gone.mcap"), "process_died", "it ended")], "part-1")
+    tables.write_tables(tmp_path, [row, lost_row(Job("gone.mcap"), "process_died", "it ended")], "part-1")
     result = row.result
     assert result is not None
     ((url, vehicle, date, accepted, rx, sigma, figures, pitch_height, text),) = asked(
@@ -63,7 +63,9 @@ def test_a_row_holds_everything_that_was_decided(tmp_path: Path, row: WindowRow)
 
 def test_a_vehicle_of_any_name_has_a_folder_within_the_folder(tmp_path: Path) -> None:
     for index, vehicle in enumerate(["../../etc", "a/b", "x=1", "", "Ä ö"]):
-        tables.write(tmp_path, [begun(Job(f"{index}"), {}).model_copy(update={"vehicle": vehicle})], f"part-{index}")
+        tables.write_tables(
+            tmp_path, [empty_row(Job(f"{index}"), {}).model_copy(update={"vehicle": vehicle})], f"part-{index}"
+        )
     assert len(list(tmp_path.glob("date=unknown/vehicle=*/*.parquet"))) == 5
     assert {name for (name,) in asked(tmp_path, "SELECT vehicle FROM TABLE")} >= {"../../etc", "a/b", "x=1", "Ä ö"}
 
@@ -71,26 +73,26 @@ def test_a_vehicle_of_any_name_has_a_folder_within_the_folder(tmp_path: Path) ->
 @pytest.mark.fault("a batch is stopped at any point", "no finished row is lost, and none is written twice")
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 9])
 def test_a_batch_that_ends_anywhere_is_gone_on_with(tmp_path: Path, count: int) -> None:
-    first = Results(tmp_path, Terms(), resume=False)
+    first = BatchFolder(tmp_path, ReplaySettings(), resume=False)
     for row in rows(count):
         first.add(row)
     # It is gone without a word.
-    second = Results(tmp_path, Terms(), resume=True)
+    second = BatchFolder(tmp_path, ReplaySettings(), resume=True)
     assert second.urls == {row.url for row in rows(count)}
     for row in rows(11):
         if row.url not in second.urls:
             second.add(row)
     second.finish()
     assert asked(tmp_path, "SELECT count(*), count(DISTINCT url) FROM TABLE") == [(11, 11)]
-    assert Results(tmp_path, Terms(), resume=True).urls == {row.url for row in rows(11)}
+    assert BatchFolder(tmp_path, ReplaySettings(), resume=True).urls == {row.url for row in rows(11)}
 
 
 def test_rows_are_the_same_whether_a_batch_was_stopped_or_not(tmp_path: Path, row: WindowRow) -> None:
-    whole, stopped = (Results(tmp_path / name, Terms(), resume=False) for name in ("whole", "stopped"))
+    whole, stopped = (BatchFolder(tmp_path / name, ReplaySettings(), resume=False) for name in ("whole", "stopped"))
     for each in (whole, stopped):
         each.add(row)
     whole.finish()
-    Results(tmp_path / "stopped", Terms(), resume=True).finish()
+    BatchFolder(tmp_path / "stopped", ReplaySettings(), resume=True).finish()
     (one,), (other,) = (list((tmp_path / name).rglob("*.parquet")) for name in ("whole", "stopped"))
     assert one.read_bytes() == other.read_bytes()
 
@@ -98,41 +100,41 @@ def test_rows_are_the_same_whether_a_batch_was_stopped_or_not(tmp_path: Path, ro
 def test_tables_that_were_made_before_the_journal_was_emptied_are_not_made_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = Results(tmp_path, Terms(), resume=False)
+    first = BatchFolder(tmp_path, ReplaySettings(), resume=False)
     with monkeypatch.context() as patch:
 
         def gone(*_: object) -> None:
             raise KeyboardInterrupt
 
-        patch.setattr(durable.Log, "renew", gone)
+        patch.setattr(durable.LineLog, "renew", gone)
         *before, last = rows(4)
         for row in before:
             first.add(row)
         with pytest.raises(KeyboardInterrupt):
             first.add(last)
-    second = Results(tmp_path, Terms(), resume=True)
+    second = BatchFolder(tmp_path, ReplaySettings(), resume=True)
     assert len(second.urls) == 4
     second.finish()
     assert asked(tmp_path, "SELECT count(*) FROM TABLE") == [(4,)]
 
 
 def test_a_torn_or_damaged_line_of_the_journal_costs_its_own_window(tmp_path: Path) -> None:
-    first = Results(tmp_path, Terms(), resume=False)
+    first = BatchFolder(tmp_path, ReplaySettings(), resume=False)
     for row in rows(3):
         first.add(row)
-    journal = tmp_path / results.JOURNAL
+    journal = tmp_path / results.JOURNAL_FILE
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(lines[0] + b'{"url": 3}\n' + lines[2][:-20])
-    assert Results(tmp_path, Terms(), resume=True).urls == {"0.mcap"}
+    assert BatchFolder(tmp_path, ReplaySettings(), resume=True).urls == {"0.mcap"}
 
 
 def test_a_folder_with_a_batch_is_gone_on_with_only_if_asked_and_on_the_same_terms(tmp_path: Path) -> None:
-    batch = Results(tmp_path, Terms(), resume=True)
+    batch = BatchFolder(tmp_path, ReplaySettings(), resume=True)
     batch.add(next(rows(1)))
     with pytest.raises(UsageError, match="--resume"):
-        Results(tmp_path, Terms(), resume=False)
+        BatchFolder(tmp_path, ReplaySettings(), resume=False)
     with pytest.raises(UsageError, match="another configuration"):
-        Results(tmp_path, Terms(depth="street"), resume=True)
+        BatchFolder(tmp_path, ReplaySettings(depth="street"), resume=True)
 
 
 class FailingEngine:
@@ -143,7 +145,7 @@ class FailingEngine:
     def __init__(self, count: int) -> None:
         self._count = count
 
-    def rows(self, jobs: Sequence[Job], terms: Terms) -> Iterator[WindowRow]:  # noqa: ARG002 - as the engines
+    def rows(self, jobs: Sequence[Job], terms: ReplaySettings) -> Iterator[WindowRow]:  # noqa: ARG002 - as the engines
         yield from rows(self._count)
         raise FleetError("the cluster cannot be reached")
 
@@ -151,20 +153,20 @@ class FailingEngine:
         """It holds nothing."""
 
 
-def run(folder: Path, terms: Terms, engine: FailingEngine) -> None:
+def run(folder: Path, terms: ReplaySettings, engine: FailingEngine) -> None:
     batch.run([Job("0.mcap")], terms, engine, folder, lambda _: None, resume=False)
 
 
 @pytest.mark.fault("a batch fails before its first window is judged", "the same command can be given again")
 def test_a_batch_without_a_row_leaves_nothing_that_refuses_the_next(tmp_path: Path) -> None:
     folder = tmp_path / "results"
-    for terms in (Terms(), Terms(depth="street")):
+    for terms in (ReplaySettings(), ReplaySettings(depth="street")):
         with pytest.raises(FleetError):
             run(folder, terms, FailingEngine(0))
     with pytest.raises(FleetError):
-        run(folder, Terms(), FailingEngine(1))
+        run(folder, ReplaySettings(), FailingEngine(1))
     with pytest.raises(UsageError, match="--resume"):
-        run(folder, Terms(), FailingEngine(1))
+        run(folder, ReplaySettings(), FailingEngine(1))
 
 
 @pytest.mark.fault("a batch fails before its first row", "its folder does not refuse the next try, on whatever terms")
@@ -174,28 +176,28 @@ def test_a_folder_without_a_row_holds_no_batch(tmp_path: Path, monkeypatch: pyte
         patch.setitem(sys.modules, "pyarrow", None)  # as if not installed
         patch.setitem(sys.modules, "pyarrow.parquet", None)
         with pytest.raises(SourceError, match=r"coec\[fleet\]"):
-            Results(folder, Terms(), resume=False)
+            BatchFolder(folder, ReplaySettings(), resume=False)
     assert not folder.exists()
-    Results(folder, Terms(), resume=False).finish()
-    Results(folder, Terms(depth="street"), resume=False).add(next(rows(1)))
+    BatchFolder(folder, ReplaySettings(), resume=False).finish()
+    BatchFolder(folder, ReplaySettings(depth="street"), resume=False).add(next(rows(1)))
     with pytest.raises(UsageError, match="another configuration"):
-        Results(folder, Terms(), resume=True)
+        BatchFolder(folder, ReplaySettings(), resume=True)
 
 
 @pytest.mark.fault(
     "tables of a batch are damaged, its folder cannot be written", "the message says which file, and what to do"
 )
 def test_what_cannot_be_read_or_written_is_told(tmp_path: Path) -> None:
-    begun_batch = Results(tmp_path / "batch", Terms(), resume=False)
+    begun_batch = BatchFolder(tmp_path / "batch", ReplaySettings(), resume=False)
     for row in rows(4):
         begun_batch.add(row)
     (table,) = (tmp_path / "batch").glob("date=*/vehicle=*/*.parquet")
     table.write_bytes(b"PAR1 rubbish PAR1")
     with pytest.raises(SourceError, match="judged again"):
-        Results(tmp_path / "batch", Terms(), resume=True)
-    (tmp_path / "batch" / results.TERMS).write_text("[")
+        BatchFolder(tmp_path / "batch", ReplaySettings(), resume=True)
+    (tmp_path / "batch" / results.SETTINGS_FILE).write_text("[")
     with pytest.raises(UsageError, match="another folder"):
-        Results(tmp_path / "batch", Terms(), resume=True)
+        BatchFolder(tmp_path / "batch", ReplaySettings(), resume=True)
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
-        Results(tmp_path / "file", Terms(), resume=False)
+        BatchFolder(tmp_path / "file", ReplaySettings(), resume=False)

@@ -9,27 +9,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coec.errors import UsageError
-from coec.fleet.roster import RANKS, Filter, Roster, of_states
+from coec.fleet.roster import RANKS, FleetFilter, FleetState, parse_states
 from coec.schemas.keys import Keys
-from last_words import SAID_NS, a_word, packed
+from last_words import SENT_NS, heartbeat, packed_heartbeat
 
 S = 1_000_000_000
 
 
-def said(roster: Roster, at_s: float, vehicle: str, pair: str = "front", **told: Any) -> None:
-    roster.hear(Keys("coec", vehicle).last(pair), packed(a_word(vehicle, pair, **told)), at_s)
+def said(roster: FleetState, at_s: float, vehicle: str, pair: str = "front", **told: Any) -> None:
+    roster.on_heartbeat(Keys("coec", vehicle).last(pair), packed_heartbeat(heartbeat(vehicle, pair, **told)), at_s)
 
 
-def kept(roster: Roster, at_s: float, wall_ns: int, vehicle: str, **told: Any) -> None:
-    roster.recall(Keys("coec", vehicle).last("front"), packed(a_word(vehicle, **told)), at_s, wall_ns)
+def kept(roster: FleetState, at_s: float, wall_ns: int, vehicle: str, **told: Any) -> None:
+    roster.restore(Keys("coec", vehicle).last("front"), packed_heartbeat(heartbeat(vehicle, **told)), at_s, wall_ns)
 
 
-def order(roster: Roster, now_s: float, chosen: Filter | None = None) -> list[str]:
-    return [pair.word.vehicle for pair in roster.now(now_s, chosen or Filter()).pairs]
+def order(roster: FleetState, now_s: float, chosen: FleetFilter | None = None) -> list[str]:
+    return [pair.word.vehicle for pair in roster.now(now_s, chosen or FleetFilter()).pairs]
 
 
 def test_the_most_urgent_comes_first() -> None:
-    roster = Roster()
+    roster = FleetState()
     said(roster, 0.0, "parked", service="stopping")
     said(roster, 0.0, "well")
     said(roster, 0.0, "drifting", drift=(0.0, 0.4, 0.0, 0.0, 0.0, 0.0))
@@ -49,24 +49,24 @@ def test_the_most_urgent_comes_first() -> None:
 
 @pytest.mark.fault("a vehicle that says nothing any more", "its last state is shown as old, never as live")
 def test_silence_never_reads_as_healthy() -> None:
-    roster = Roster()
+    roster = FleetState()
     said(roster, 0.0, "a", period_s=10.0)
     said(roster, 0.0, "b", period_s=10.0)
     assert roster.now(24.9).states == {"healthy": 2}
     assert roster.now(25.1).states == {"silent": 2}
     assert roster.overdue(25.1, 1) == [("a", "front")]
-    roster.present("b", "front", is_there=False)
+    roster.on_liveliness("b", "front", is_there=False)
     assert roster.now(1.0).states == {"silent": 1, "healthy": 1}, "its token has gone"
-    roster.present("b", "front", is_there=True)
+    roster.on_liveliness("b", "front", is_there=True)
     assert roster.now(1.0).states == {"silent": 1, "healthy": 1}, "it is there, and has said nothing"
     said(roster, 2.0, "b", period_s=10.0)
     assert roster.now(3.0).states == {"healthy": 2}
 
 
 def test_who_took_his_leave_is_parked_however_long_ago() -> None:
-    roster = Roster()
-    kept(roster, 100.0, SAID_NS + 86_400 * S, "a", service="stopping", state="degraded")
-    roster.present("a", "front", is_there=False)
+    roster = FleetState()
+    kept(roster, 100.0, SENT_NS + 86_400 * S, "a", service="stopping", state="degraded")
+    roster.on_liveliness("a", "front", is_there=False)
     (pair,) = roster.now(100.0).pairs
     assert (pair.standing, pair.word.state) == ("parked", "degraded")
     assert pair.said_s == pytest.approx(86_400.0)
@@ -74,33 +74,33 @@ def test_who_took_his_leave_is_parked_however_long_ago() -> None:
 
 
 def test_a_parked_vehicle_that_was_red_stays_in_front() -> None:
-    roster = Roster()
+    roster = FleetState()
     said(roster, 0.0, "well", state="suspect")
     said(roster, 0.0, "parked", service="stopping", state="miscalibrated")
     assert order(roster, 1.0) == ["parked", "well"]
 
 
 def test_a_kept_word_does_not_replace_a_newer_one_and_a_clock_that_is_ahead_makes_no_age() -> None:
-    roster = Roster()
-    said(roster, 10.0, "a", state="suspect", said_ns=SAID_NS + S)
-    kept(roster, 11.0, SAID_NS, "a", state="healthy")
+    roster = FleetState()
+    said(roster, 10.0, "a", state="suspect", said_ns=SENT_NS + S)
+    kept(roster, 11.0, SENT_NS, "a", state="healthy")
     assert roster.now(11.0).states == {"suspect": 1}
-    kept(roster, 11.0, SAID_NS, "a", state="unknown", said_ns=SAID_NS + 3600 * S)
+    kept(roster, 11.0, SENT_NS, "a", state="unknown", said_ns=SENT_NS + 3600 * S)
     (pair,) = roster.now(12.0).pairs
     assert pair.word.state == "unknown"
     assert pair.said_s == pytest.approx(1.0)
 
 
 def test_a_word_as_it_is_said_stands_whatever_the_clock_of_its_vehicle_says() -> None:
-    roster = Roster()
-    said(roster, 10.0, "a", state="suspect", said_ns=SAID_NS)
-    said(roster, 11.0, "a", state="healthy", said_ns=SAID_NS - 3600 * S)
+    roster = FleetState()
+    said(roster, 10.0, "a", state="suspect", said_ns=SENT_NS)
+    said(roster, 11.0, "a", state="healthy", said_ns=SENT_NS - 3600 * S)
     assert roster.now(11.0).states == {"healthy": 1}
 
 
 @pytest.mark.fault("a flood of invented vehicles", "a bounded number is kept, the rest counted")
 def test_who_floods_takes_no_more_memory_than_a_fleet_does() -> None:
-    roster = Roster(most=3)
+    roster = FleetState(most=3)
     for index in range(10):
         said(roster, 0.0, f"v{index}")
     said(roster, 1.0, "v0", state="suspect")
@@ -111,9 +111,9 @@ def test_who_floods_takes_no_more_memory_than_a_fleet_does() -> None:
 
 @pytest.mark.fault("a flood of words of the largest size", "their bytes are bounded as their number is")
 def test_words_of_the_largest_size_take_no_more_memory_than_a_fleet_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    size = len(packed(a_word("v0", "front")))
+    size = len(packed_heartbeat(heartbeat("v0", "front")))
     monkeypatch.setattr("coec.fleet.roster.MAX_WORD_BYTES", 3 * size)
-    roster = Roster()
+    roster = FleetState()
     for index in range(10):
         said(roster, 0.0, f"v{index}")
     said(roster, 1.0, "v0")
@@ -123,29 +123,29 @@ def test_words_of_the_largest_size_take_no_more_memory_than_a_fleet_does(monkeyp
 
 
 def test_what_is_no_word_is_counted() -> None:
-    roster = Roster()
-    roster.hear("coec/@v1/a/last/front", b"\xc1", 0.0)
-    roster.recall("coec/@v1/b/last/front", packed(a_word("a")), 0.0, SAID_NS)
+    roster = FleetState()
+    roster.on_heartbeat("coec/@v1/a/last/front", b"\xc1", 0.0)
+    roster.restore("coec/@v1/b/last/front", packed_heartbeat(heartbeat("a")), 0.0, SENT_NS)
     assert roster.now(0.0).refused == {"word_malformed": 1, "word_of_another": 1}
     assert roster.now(0.0).known == 0
 
 
 def test_a_filter_looks_at_what_is_shown() -> None:
-    roster = Roster()
+    roster = FleetState()
     said(roster, -1000.0, "truck-1")
     said(roster, 0.0, "truck-2")
     said(roster, 0.0, "car-1", pair="rear")
-    assert order(roster, 0.0, Filter(frozenset({"healthy"}))) == ["car-1", "truck-2"]
-    assert order(roster, 0.0, Filter(text="truck")) == ["truck-1", "truck-2"]
-    assert order(roster, 0.0, Filter(text="1/rear")) == ["car-1"]
-    now = roster.now(0.0, Filter(text="truck"), most=1)
+    assert order(roster, 0.0, FleetFilter(frozenset({"healthy"}))) == ["car-1", "truck-2"]
+    assert order(roster, 0.0, FleetFilter(text="truck")) == ["truck-1", "truck-2"]
+    assert order(roster, 0.0, FleetFilter(text="1/rear")) == ["car-1"]
+    now = roster.now(0.0, FleetFilter(text="truck"), most=1)
     assert (now.known, now.matching, len(now.pairs)) == (3, 2, 1)
 
 
 def test_a_filter_names_states_that_there_are() -> None:
-    assert of_states(["silent", "healthy"], UsageError) == {"silent", "healthy"}
+    assert parse_states(["silent", "healthy"], UsageError) == {"silent", "healthy"}
     with pytest.raises(UsageError, match="'well' is no state"):
-        of_states(["well"], UsageError)
+        parse_states(["well"], UsageError)
 
 
 @settings(max_examples=50)
@@ -163,7 +163,7 @@ def test_a_filter_names_states_that_there_are() -> None:
 def test_whatever_comes_everybody_is_told_once_and_in_the_order_of_ranks(
     words: list[tuple[str, str, float, float]],
 ) -> None:
-    roster = Roster()
+    roster = FleetState()
     for index, (state, service, at_s, drift) in enumerate(words):
         six = (drift, 0.0, 0.0, 0.0, 0.0, 0.0)
         said(roster, at_s, f"v{index}", state=state, service=service, drift=six)

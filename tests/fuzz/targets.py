@@ -27,18 +27,18 @@ from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import camera_of, rig_of, rig_to_json
 from coec.adapters.frames.msgpack_frames import decode_camera, decode_ego, decode_lidar
 from coec.adapters.images.codec import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
-from coec.adapters.mcap.files import Message, read_records
+from coec.adapters.mcap.files import McapMessage, read_records
 from coec.adapters.mcap.snippet_file import salvage_snippet
 from coec.adapters.mcap.windows import PART_SUFFIX, is_window, read_result, read_window, salvage
 from coec.adapters.ros import incoming, messages, outgoing
-from coec.adapters.ros.camera_info import decode_info, lens_of
+from coec.adapters.ros.camera_info import decode_info, intrinsics_of_info
 from coec.adapters.ros.images import ENCODINGS
 from coec.adapters.ros.moving_frames import MovingFrame, frames_in
-from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
+from coec.adapters.ros.static_transforms import StaticTransforms, decode_static_transforms
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.settings import mode_of, settings_of
 from coec.calibration.lidar_to_lidar.types import RangeBias
-from coec.calibration.lifecycle import Rules, after_estimate, initial_state, restored
+from coec.calibration.lifecycle import PairRules, after_estimate, initial_state, restored
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.config import (
     CalibrationConfig,
@@ -60,21 +60,21 @@ from coec.runtime.api.extrinsic import extrinsic_of
 from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.decisions.stored_pair import Clocks
-from coec.runtime.nominal.findings import Found
-from coec.runtime.nominal.kept import NOMINAL_FILE, KeptNominals
+from coec.runtime.nominal.findings import DiscoveredPair
+from coec.runtime.nominal.kept import NOMINAL_FILE, DiscoveryStore
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.answers import MalformedAnswerError, number_of, pack_answer, read_answer
-from coec.runtime.worker.jobs import Drawn, Kind, Registered, Solved
-from coec.runtime.worker.link import Link, NoMessageError
+from coec.runtime.worker.jobs import Kind, Registered, RenderedImage, Solved
+from coec.runtime.worker.link import Link, MalformedMessageError
 from coec.schemas import keys
 from coec.schemas.base import to_json
-from coec.schemas.commands import NAMES
+from coec.schemas.commands import COMMAND_NAMES
 from coec.schemas.replies import CalibrationResult
 from coec.sources import open_source
 from coec.sources.clouds import load_cloud
 from coec.sources.kitti_files import read_numbers, read_stamps
-from coec.sources.recording import Recording
-from estimates import RIG, estimate
+from coec.sources.recording import RecordingSource
+from estimates import ESTIMATE_RIG, estimate
 from fuzz.formats import (
     attachment,
     behind,
@@ -94,18 +94,18 @@ from fuzz.formats import (
     with_checksum,
 )
 from fuzz.loop import Target
-from pair_bench import InstantScribe
+from pair_bench import InstantDiskWriter
 from ros_messages import (
     JPEG,
-    STAMP,
+    STAMP_NS,
     Columns,
     Packer,
     cloud,
-    compressed,
-    image,
+    compressed_image,
     imu,
     odometry,
-    packed,
+    packed_cloud,
+    raw_image,
     transforms,
     twist,
     twist_with_covariance,
@@ -193,8 +193,8 @@ def _transforms(data: bytes, folder: Path) -> None:
 
 def _transforms_seeds() -> list[bytes]:
     begin, end = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.2, 0.0, 0.0, 0.0, 0.0, 0.1, 1.0)
-    vehicle = [("odom", "base_link", STAMP + k * 20_000_000, pose) for k, pose in enumerate((begin, end))]
-    wheel = ("base_link", "wheel", STAMP, end)
+    vehicle = [("odom", "base_link", STAMP_NS + k * 20_000_000, pose) for k, pose in enumerate((begin, end))]
+    wheel = ("base_link", "wheel", STAMP_NS, end)
     return [transforms(), transforms(*vehicle), transforms(vehicle[0], wheel, vehicle[1])]
 
 
@@ -205,15 +205,15 @@ XYZ: Columns = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])
 def _cdr_seeds() -> list[bytes]:
     doubles: Columns = [(name, "<f8", values) for name, _, values in XYZ]
     messages = [
-        (0, compressed()),
-        (0, compressed(GREY, "png")),
-        (1, image("rgb8", 2, 2, 8, bytes(16))),
-        (1, image("mono8", 4, 3, 4, bytes(12))),
-        *((1, image(name, 8, 8, 64, bytes(range(256)) * 2, big=True)) for name in ENCODINGS),
-        (2, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 99_000_000])])),
-        (2, packed([*XYZ, ("intensity", "u1", [7, 8]), ("t", "<i4", [-99_000, 0])], big=True)),
-        (2 + 2**7, packed([*XYZ, ("t", "<f8", [STAMP * 1e-3, STAMP * 1e-3 + 9])])),
-        (2, packed([*doubles, ("ring", "<u2", [1, 2]), ("timestamp", "<f8", [1.7e9, 1.7e9 + 0.1])])),
+        (0, compressed_image()),
+        (0, compressed_image(GREY, "png")),
+        (1, raw_image("rgb8", 2, 2, 8, bytes(16))),
+        (1, raw_image("mono8", 4, 3, 4, bytes(12))),
+        *((1, raw_image(name, 8, 8, 64, bytes(range(256)) * 2, big=True)) for name in ENCODINGS),
+        (2, packed_cloud([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 99_000_000])])),
+        (2, packed_cloud([*XYZ, ("intensity", "u1", [7, 8]), ("t", "<i4", [-99_000, 0])], big=True)),
+        (2 + 2**7, packed_cloud([*XYZ, ("t", "<f8", [STAMP_NS * 1e-3, STAMP_NS * 1e-3 + 9])])),
+        (2, packed_cloud([*doubles, ("ring", "<u2", [1, 2]), ("timestamp", "<f8", [1.7e9, 1.7e9 + 0.1])])),
         (2, cloud([("x", 0, 7), ("y", 4, 7), ("z", 8, 7)], bytes(96), 2, 16, height=2, row_step=48)),
         (3, odometry()),
         (4, twist()),
@@ -281,7 +281,7 @@ def _manifest(data: bytes, folder: Path) -> None:
     _played(open_source(str(path)))
 
 
-def _played(recording: Recording) -> None:
+def _played(recording: RecordingSource) -> None:
     for message in recording.messages():
         _inspected(message)
 
@@ -331,17 +331,17 @@ def _nominal(data: bytes, folder: Path) -> None:
         info = decode_info(body)
         for rectified in (False, True):
             with suppress(SourceError):
-                camera = camera_of(lens_of(info, rectified=rectified).intrinsics)
+                camera = camera_of(intrinsics_of_info(info, rectified=rectified).intrinsics)
                 assert np.isfinite(project_point(camera, 0.1, -0.1, 1.0)[:2]).all()
     elif kind == b"t":
         transforms = StaticTransforms()
-        transforms.take(decode_joints(body))
+        transforms.add(decode_static_transforms(body))
         found = transforms.transform("camera", "lidar")
         transforms.doubts("camera", "lidar")
         assert found is None or np.isfinite(found).all()
     else:
         (folder / NOMINAL_FILE).write_bytes(body)
-        for kept in KeptNominals(folder).found(AWAITING).values():
+        for kept in DiscoveryStore(folder).load(AWAITING).values():
             rig_of(kept.pair)
 
 
@@ -358,8 +358,8 @@ def _nominal_seeds() -> list[bytes]:
         {"name": "front", "camera": camera, "lidar": lidar, "T_camera_lidar": np.eye(4).tolist()}
     )
     with tempfile.TemporaryDirectory() as folder:
-        kept = KeptNominals(Path(folder))
-        kept.keep(Found(pair, {"T_camera_lidar": "/tf_static"}), AWAITING.awaited[0], AWAITING, 5)
+        kept = DiscoveryStore(Path(folder))
+        kept.update(DiscoveredPair(pair, {"T_camera_lidar": "/tf_static"}), AWAITING.awaited[0], AWAITING, 5)
         kept.flush()
         state = (Path(folder) / NOMINAL_FILE).read_bytes()
     return [b"i" + _camera_info(), b"t" + _tf(), b"k" + state]
@@ -378,7 +378,7 @@ def _tf() -> bytes:
     return packer.done()
 
 
-SWEEP = packed([*XYZ, ("time", "<f4", [0, 0.01])])
+SWEEP = packed_cloud([*XYZ, ("time", "<f4", [0, 0.01])])
 
 
 def _recorded(topics: Sequence[tuple[str, str, bytes]], sequence: int = 0) -> list[tuple[int, bytes]]:
@@ -399,7 +399,7 @@ def _recorded(topics: Sequence[tuple[str, str, bytes]], sequence: int = 0) -> li
 
 def _bag_seeds() -> list[bytes]:
     topics = [
-        ("/image", messages.COMPRESSED_IMAGE, compressed()),
+        ("/image", messages.COMPRESSED_IMAGE, compressed_image()),
         ("/points", messages.POINT_CLOUD, SWEEP),
         ("/odom", messages.ODOMETRY, odometry()),
         ("/info", messages.CAMERA_INFO, _camera_info()),
@@ -408,7 +408,9 @@ def _bag_seeds() -> list[bytes]:
     header = (Opcode.HEADER, struct.pack("<I", 5) + b"ros2\0" + bytes(4))
     records = _recorded(topics)
     twisted = _recorded([topics[0], topics[1], ("/twist", messages.TWIST, twist()), *topics[3:]])
-    poses = [("odom", "base_link", STAMP + k * 50_000_000, (0.2 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) for k in range(2)]
+    poses = [
+        ("odom", "base_link", STAMP_NS + k * 50_000_000, (0.2 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) for k in range(2)
+    ]
     moved = _recorded(
         [*topics[:2], ("/tf", messages.TF, transforms(*poses)), ("/imu", messages.IMU, imu()), *topics[3:]]
     )
@@ -431,7 +433,7 @@ def _window(data: bytes, folder: Path) -> None:
     finished = salvage_snippet(snippet, lambda: None)
     if finished is not None:
         with finished.path.open("rb") as stream:
-            assert any(isinstance(record, Message) for record in read_records(stream))
+            assert any(isinstance(record, McapMessage) for record in read_records(stream))
     salvaged = salvage(part, lambda: None)
     if salvaged is not None:
         read_window(salvaged.path)
@@ -448,17 +450,21 @@ def _window(data: bytes, folder: Path) -> None:
 
 def _window_seeds() -> list[bytes]:
     camera = build("pinhole", width=64, height=48, fx=30.0, fy=30.0, cx=31.5, cy=23.5)
-    rig = replace(RIG, camera=camera)
+    rig = replace(ESTIMATE_RIG, camera=camera)
     start = rig.T_camera_lidar_nominal.tolist()
     head = {"window_id": "front-1", "T_camera_lidar_start": start, "rig": rig_to_json(rig)}
     metadata = struct.pack("<I", 4) + b"coec" + struct.pack("<I", 0)
-    result = to_json(result_of(estimate(1), RIG, VEHICLE))
+    result = to_json(result_of(estimate(1), ESTIMATE_RIG, VEHICLE))
     mask = encode_png(np.full((48, 64), 255, np.uint8))
     topics = [
         ("/coec/front/lidar/points", messages.POINT_CLOUD, SWEEP),
         ("/coec/front/odometry", messages.ODOMETRY, odometry()),
-        ("/coec/front/camera/depth/compressed", messages.COMPRESSED_IMAGE, compressed(DEPTH, outgoing.DEPTH_FORMAT)),
-        ("/coec/front/camera/image/compressed", messages.COMPRESSED_IMAGE, compressed()),
+        (
+            "/coec/front/camera/depth/compressed",
+            messages.COMPRESSED_IMAGE,
+            compressed_image(DEPTH, outgoing.DEPTH_FORMAT),
+        ),
+        ("/coec/front/camera/image/compressed", messages.COMPRESSED_IMAGE, compressed_image()),
     ]
     attachments = [("rig.json", canonical(head)), ("configuration.json", to_json(CalibrationConfig()))]
     first = [(int(Opcode.ATTACHMENT), attachment(name, data)) for name, data in attachments]
@@ -517,13 +523,13 @@ def _selector_seeds() -> list[bytes]:
 def _command(data: bytes, folder: Path) -> None:
     """The first byte chooses the command, the second says how much of the rest is the sender's attachment."""
     del folder
-    name = (*NAMES, "other")[data[0] % (len(NAMES) + 1) if data else 0]
+    name = (*COMMAND_NAMES, "other")[data[0] % (len(COMMAND_NAMES) + 1) if data else 0]
     cut = 2 + data[1] if len(data) > 1 else 2
     sender = payloads.sender_of(data[2:cut])
     assert sender.isascii()
     assert sender.isprintable()
     assert len(sender) <= payloads.MAX_SENDER
-    for told in payloads.parse(name, data[cut:]).values():
+    for told in payloads.parse_payload(name, data[cut:]).values():
         to_json_of(told)
 
 
@@ -544,7 +550,7 @@ def _command_seeds() -> list[bytes]:
 
 # --- what lies on the disk --------------------------------------------------------------------------------------------
 
-RULES = Rules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
+RULES = PairRules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
 
 
 def _state(data: bytes, folder: Path) -> None:
@@ -558,34 +564,34 @@ def _state(data: bytes, folder: Path) -> None:
 def _started(folder: Path) -> None:
     config = StateConfig(directory=folder)
     store = PairStore(
-        RIG,
+        ESTIMATE_RIG,
         VEHICLE,
         config,
         StateStore(folder, VEHICLE),
-        InstantScribe(folder),
+        InstantDiskWriter(folder),
         WindowStore(folder / "windows", config),
         LossCounter(LOG, "front"),
     )
     state = store.state
-    accepted = None if state.accepted is None else result_of(state.accepted, RIG, VEHICLE)
-    to_json(extrinsic_of(VEHICLE, RIG, state, accepted, 0.0, "0"))
-    for kept in store.told().entries:
+    accepted = None if state.accepted is None else result_of(state.accepted, ESTIMATE_RIG, VEHICLE)
+    to_json(extrinsic_of(VEHICLE, ESTIMATE_RIG, state, accepted, 0.0, "0"))
+    for kept in store.publishable_records().entries:
         to_json(kept.chained)
-    for check in store.told().checks:
+    for check in store.publishable_records().checks:
         to_json(check)
-    for result in store.told().results:
-        to_json(result_of(estimate_of(result), RIG, VEHICLE))
+    for result in store.publishable_records().results:
+        to_json(result_of(estimate_of(result), ESTIMATE_RIG, VEHICLE))
     store.save()
 
 
 def _state_seeds() -> list[bytes]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        state = initial_state(RIG)
+        state = initial_state(ESTIMATE_RIG)
         for window in (1, 2):
             state = after_estimate(state, estimate(window), 0, RULES)
         store = StateStore(folder, VEHICLE)
-        store.remember(RIG, restored(state), Clocks(77, 88, 99), lambda: {"results": f"3 {'a' * 64}"})
+        store.update(ESTIMATE_RIG, restored(state), Clocks(77, 88, 99), lambda: {"results": f"3 {'a' * 64}"})
         store.flush()
         return [(folder / "state.json").read_bytes(), with_checksum(b'{"pairs":{}}')]
 
@@ -608,7 +614,7 @@ def _books(data: bytes, folder: Path) -> None:
 
 
 def _books_seeds() -> list[bytes]:
-    result = json.loads(to_json(result_of(estimate(1), RIG, VEHICLE)))
+    result = json.loads(to_json(result_of(estimate(1), ESTIMATE_RIG, VEHICLE)))
     entry = {
         "sequence": 0,
         "previous_sha256": "",
@@ -729,8 +735,8 @@ def _worker(data: bytes, folder: Path) -> None:
 
 
 def _worker_seeds() -> list[bytes]:
-    result: CalibrationResult = result_of(estimate(1), RIG, VEHICLE)
-    answers = [(0, pack_answer(3, Solved(result, None))), (2, pack_answer(4, Drawn(b"jpeg")))]
+    result: CalibrationResult = result_of(estimate(1), ESTIMATE_RIG, VEHICLE)
+    answers = [(0, pack_answer(3, Solved(result, None))), (2, pack_answer(4, RenderedImage(b"jpeg")))]
     refused: dict[str, Any] = {"id": 5, "refused": {"code": "bad_window", "text": "damaged"}}
     pose = msgpack.ExtType(1, msgpack.packb([[4, 4], np.eye(4).tobytes()]))
     learned = {"id": 1, "result": {"pose": pose, "baseline_hash": "a", "windows": 2, "pairs": 40}}
@@ -802,7 +808,11 @@ TARGETS: Final = {
         Target("zenoh", _zenoh, _zenoh_seeds, (in_json,), (b"endpoints", b"peer:", b"//", b"/*", *JSON_WORDS)),
         Target("model_card", _model_card, _model_card_seeds, (in_yaml,), YAML_WORDS),
         Target(
-            "worker", _worker, _worker_seeds, (behind(1, in_msgpack),), refusals=(MalformedAnswerError, NoMessageError)
+            "worker",
+            _worker,
+            _worker_seeds,
+            (behind(1, in_msgpack),),
+            refusals=(MalformedAnswerError, MalformedMessageError),
         ),
     )
 }

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from coec.adapters.files.state_file import StateFile
-from coec.adapters.mcap.files import McapDamaged, read_records
+from coec.adapters.mcap.files import McapDamagedError, read_records
 from coec.errors import SourceError
-from coec.runtime.decisions.chain import Chain
+from coec.runtime.decisions.chain import HashChain
 from fuzz import loop
 from fuzz.formats import chained, checksummed, in_archive, in_json, in_records, in_yaml
 from fuzz.loop import Finding, Fuzzer, Report, Target, smallest_with_all_arcs, tried
@@ -120,7 +120,7 @@ def test_a_forged_history_has_the_right_hashes(tmp_path: Path) -> None:
     sound = 0
     for seed in SEEDS:
         (tmp_path / "h").write_bytes(chained(Random(seed), whole))
-        chain = Chain(tmp_path / "h", 10)
+        chain = HashChain(tmp_path / "h", 10)
         sound += chain.damage is None and len(chain.entries()) == 2
     assert sound > len(SEEDS) / 10
 
@@ -129,7 +129,7 @@ def test_forged_records_make_a_whole_file() -> None:
     whole = TARGETS["bag"].seeds()[0]
     sound = 0
     for seed in SEEDS:
-        with suppress(McapDamaged):
+        with suppress(McapDamagedError):
             sound += len(list(read_records(io.BytesIO(in_records(Random(seed), whole))))) > 1
     assert sound > len(SEEDS) / 4
 

@@ -18,7 +18,7 @@ def test_all_agree_with_lapack(n: int) -> None:
     a, right = _stack(n), np.random.default_rng(0).normal(size=(3, 4, n, 2))
     factor = dense.cholesky(a)
     np.testing.assert_allclose(factor, np.linalg.cholesky(a), atol=1e-10)
-    np.testing.assert_allclose(dense.solved(factor, right), np.linalg.solve(a, right), rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(dense.cholesky_solve(factor, right), np.linalg.solve(a, right), rtol=1e-7, atol=1e-8)
     np.testing.assert_allclose(dense.log_determinant(factor), np.linalg.slogdet(a)[1], rtol=1e-10)
     np.testing.assert_allclose(dense.inverse(a), np.linalg.inv(a), rtol=1e-6, atol=1e-7)
     x = right[..., 0]

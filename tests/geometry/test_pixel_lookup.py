@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build, in_image
-from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, certain_pixels, exact_pixel, filter_of
+from coec.geometry.pixel_lookup import NOT_IN_IMAGE, UNSURE, certain_pixels, exact_pixel, filter_of
 from coec.geometry.projection import project, unproject
 
 SENSOR = {"width": 640, "height": 480, "fx": 200.0, "fy": 190.0, "cx": 321.3, "cy": 239.6}
@@ -41,7 +41,7 @@ def double_precision(camera: Camera, pose: NDArray[np.float64], xyz: NDArray[np.
         p_camera = xyz.T.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     uv_px, valid = project(camera, p_camera)
     column, row = np.floor(uv_px.T + 0.5).astype(np.int64)
-    return np.where(valid & in_image(camera, uv_px), row * camera.width + column, OUTSIDE)
+    return np.where(valid & in_image(camera, uv_px), row * camera.width + column, NOT_IN_IMAGE)
 
 
 def cloud(seed: int, points: int, scale_m: float) -> NDArray[np.float32]:

@@ -15,13 +15,13 @@ from coec.adapters.files.baseline_file import BASELINES, baseline_hash, load_bas
 from coec.adapters.files.rig import rig_from_json
 from coec.calibration.rig.types import RigGraph
 from coec.config import Config
-from coec.runtime.decisions.history import History
+from coec.runtime.decisions.history import PairHistory
 from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.nominal.kept import KeptNominals
-from coec.runtime.rig.rig_file import RigFile
-from driven_rig import Drive
+from coec.runtime.nominal.kept import DiscoveryStore
+from coec.runtime.rig.rig_file import RigStore
+from driven_rig import RigDrive
 from golden.reference import DATA, plain, read
-from rigs import POSES, with_moved
+from rigs import POSES, moved_poses
 from upgrade import read_state, write_state
 
 STATE, EXPECTED, VALUES = DATA / "state", DATA / "state_expected.json", DATA / "state_values.json"
@@ -32,14 +32,14 @@ RIG_FOLDER, RIG_AGAIN = "moved", "moved_again"
 def write_all(folder: Path) -> dict[str, Any]:
     """Every file of a vehicle. Returns what stands in them, as `read_state` wants to know it."""
     expected = write_state.write(folder)
-    drive = Drive(RIG)
-    drive.looks(POSES, 6)
-    drive.lidars(EDGE, POSES)
-    drive.looks(with_moved("roof"), 6)
+    drive = RigDrive(RIG)
+    drive.add_checks(POSES, 6)
+    drive.add_lidar_check(EDGE, POSES)
+    drive.add_checks(moved_poses("roof"), 6)
     assert drive.state.event is not None
     (folder / RIG_FOLDER).mkdir()
-    book = RigFile(folder / RIG_FOLDER)
-    book.remember(drive.state)
+    book = RigStore(folder / RIG_FOLDER)
+    book.update(drive.state)
     book.flush()
     _write_rig_again(folder, folder)
     return expected
@@ -54,8 +54,8 @@ def _rig_of(folder: Path) -> RigGraph:
 
 def _write_rig_again(folder: Path, to: Path) -> None:
     (to / RIG_AGAIN).mkdir()
-    book = RigFile(to / RIG_AGAIN)
-    book.remember(RigFile(folder / RIG_FOLDER).recalled(Drive(_rig_of(folder)).state))
+    book = RigStore(to / RIG_AGAIN)
+    book.update(RigStore(folder / RIG_FOLDER).restored(RigDrive(_rig_of(folder)).state))
     book.flush()
 
 
@@ -68,10 +68,10 @@ def values(folder: Path) -> dict[str, Any]:
     """What is read of a state directory, in readable form."""
     expected = read(EXPECTED)
     config = Config.model_validate(expected["nominal"])
-    found = KeptNominals(folder).found(config)
+    found = DiscoveryStore(folder).load(config)
     baselines = load_baselines(folder / BASELINES)
-    rig = RigFile(folder / RIG_FOLDER)
-    recalled = rig.recalled(Drive(_rig_of(folder)).state)
+    rig = RigStore(folder / RIG_FOLDER)
+    recalled = rig.restored(RigDrive(_rig_of(folder)).state)
     return {
         "state": read_state.read(folder, expected),
         "history": {pair: _history(folder, pair) for pair in expected["pairs"]},
@@ -84,7 +84,7 @@ def values(folder: Path) -> dict[str, Any]:
 
 
 def _history(folder: Path, pair: str) -> list[Any]:
-    books = History(folder, pair, 1000, {})
+    books = PairHistory(folder, pair, 1000, {})
     return [one.entry.model_dump(mode="json") for one in books.entries()]
 
 
@@ -95,13 +95,13 @@ def write_again(folder: Path, to: Path) -> None:
     read_store, store = StateStore(folder, write_state.VEHICLE), StateStore(to, write_state.VEHICLE)
     for document in expected["pairs"].values():
         rig = rig_from_json(document["rig"], None)
-        remembered = read_store.recall(rig)
+        remembered = read_store.load(rig)
         assert remembered is not None
         heads: Callable[[], dict[str, str]] = partial(dict, remembered.history_heads)
-        store.remember(rig, remembered.state, remembered.clocks, heads, remembered.commissioned_from)
+        store.update(rig, remembered.state, remembered.clocks, heads, remembered.commissioned_from)
     store.flush()
     for baseline in load_baselines(folder / BASELINES).values():
         save_baseline(to / BASELINES, baseline)
     (to / "nominal.json").write_bytes((folder / "nominal.json").read_bytes())
-    KeptNominals(to).flush()
+    DiscoveryStore(to).flush()
     _write_rig_again(folder, to)

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from calibration.rig.test_objections import EDGE, RIG
-from coec.calibration.frames.window import SliceEnded
-from coec.calibration.rig.objections import objections
+from coec.calibration.frames.window import SliceClosed
+from coec.calibration.rig.objections import rig_alarms
 from coec.calibration.types import Matrix4
-from driven_rig import Drive
+from driven_rig import RigDrive
 from golden.reference import plain
 from lidar_bench import LidarBench
-from pair_bench import BEGIN_S, END_S, Bench, KnowingWorker
-from rigs import POSES, with_moved
+from pair_bench import BEGIN_S, DRIVE_END_S, OracleWorker, PairBench
+from rigs import POSES, moved_poses
 from runtime import test_pair_disturbed as pair_drive
 from runtime.edges.test_stream import KNOCKED_S, knocked
 
@@ -29,7 +29,7 @@ def _matrix(data: bytes) -> list[float]:
     return [float(value) for value in np.frombuffer(data)[:12]]
 
 
-def entries(bench: Bench) -> list[dict[str, Any]]:
+def entries(bench: PairBench) -> list[dict[str, Any]]:
     """What the history says of states and extrinsics, without the clock on the wall and what hangs on it."""
     changed = {"wall_ns": 0, "previous_sha256": "", "sequence": 0}
     return [entry.model_copy(update=changed).model_dump(mode="json") for entry in bench.entries("state", "extrinsic")]
@@ -40,7 +40,7 @@ def _windows(events: list[Any]) -> Iterator[dict[str, Any]]:
     stamps: list[int] = []
     poses: list[list[float]] = []
     for event in events:
-        if isinstance(event, SliceEnded):
+        if isinstance(event, SliceClosed):
             yield {"window": plain(event), "stamps_ns": stamps, "poses": poses}
             stamps, poses = [], []
         else:
@@ -70,7 +70,7 @@ def of_pair(watched: pair_drive.Watched) -> tuple[list[dict[str, Any]], list[dic
 
 def undisturbed(folder: Path) -> pair_drive.Watched:
     """The drive in the order of its stamps, before a worker that answers at once."""
-    watched = pair_drive.Watched(folder, KnowingWorker)
+    watched = pair_drive.Watched(folder, OracleWorker)
     frames = [frame for stream in pair_drive.streams().values() for frame in stream]
     for frame in sorted(frames, key=lambda frame: frame.stamp_ns):
         watched.push(frame)
@@ -80,9 +80,9 @@ def undisturbed(folder: Path) -> pair_drive.Watched:
 
 def driven(folder: Path, apply: str) -> list[dict[str, Any]]:
     """A drive over the step that reads its state again on the way."""
-    bench = Bench(folder, apply=apply)
+    bench = PairBench(folder, apply=apply)
     checked: list[tuple[int, ...]] = []
-    for begin_s, end_s in ((BEGIN_S, BEGIN_S + 70), (BEGIN_S + 70, BEGIN_S + 130), (BEGIN_S + 130, END_S)):
+    for begin_s, end_s in ((BEGIN_S, BEGIN_S + 70), (BEGIN_S + 70, BEGIN_S + 130), (BEGIN_S + 130, DRIVE_END_S)):
         bench.drive(begin_s, end_s)
         checked += bench.worker.checked
         bench.restart()
@@ -116,14 +116,14 @@ def _by_name(parts: list[dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
 
 def rig_of_two_lidars(knocked_lidar: str) -> list[dict[str, Any]]:
     """Three cameras and two LiDARs, one of which is knocked, named, and put right in all of its pairs at once."""
-    drive = Drive(RIG)
+    drive = RigDrive(RIG)
     lines: list[dict[str, Any]] = []
     corrections: list[object] = [None]
 
     def note() -> None:
         state = drive.state
         health = {name: of.value for name, of in sorted(drive.health().items())}
-        against = {name: of.value for name, of in sorted(objections(state).items())}
+        against = {name: of.value for name, of in sorted(rig_alarms(state).items())}
         lines.append({"at_s": drive.at_s, "health": health, "against": against})
         if state.correction is not corrections[-1]:
             corrections.append(state.correction)
@@ -131,19 +131,19 @@ def rig_of_two_lidars(knocked_lidar: str) -> list[dict[str, Any]]:
 
     def turn(poses: Mapping[str, Matrix4], rounds: int) -> None:
         for _ in range(rounds):
-            drive.looks(poses, 1)
+            drive.add_checks(poses, 1)
             note()
-        drive.lidars(EDGE, poses)
+        drive.add_lidar_check(EDGE, poses)
         note()
 
     turn(POSES, 3)
     turn(POSES, 3)
-    poses, knocked_s = with_moved(knocked_lidar), drive.at_s
+    poses, knocked_s = moved_poses(knocked_lidar), drive.at_s
     turn(poses, 3)
     turn(poses, 3)
     for edge in RIG.edges:
         if knocked_lidar in (edge.a, edge.b) and edge.name != EDGE:
-            drive.window(edge.name, poses, knocked_s + 1.0)
+            drive.add_window(edge.name, poses, knocked_s + 1.0)
             note()
     turn(poses, 3)
     return lines

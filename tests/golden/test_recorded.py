@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import coec
-from coec.cli import main
+from coec.cli.main import main
 from golden.recorded import FILE, WINDOWS, content, path_of, record
 from golden.reference import Tolerance, canonical, differences, is_identical, read, sha256, write
 from golden.test_windows import LOOSE

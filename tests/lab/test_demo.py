@@ -26,7 +26,7 @@ from coec_lab.demo.pair_client import Moment, PairOutcome, Snapshot, outcome_of,
 from coec_lab.demo.pair_drive import LEAD_NS, NS_PER_S, STEP_NS, Pace, at_rest, paced
 from coec_lab.demo.pair_report import demo_page
 from reports.pages import MADE
-from statuses import a_status
+from statuses import status_reply
 
 KNOCK_S, MAX_ERROR_DEG = pair_drive.KNOCK_S, pair_drive.MAX_ERROR_DEG
 
@@ -290,7 +290,7 @@ def test_the_knock_is_noticed_and_repaired(coec: Coec, tmp_path: Path) -> None:
 
 def seen_with(worker: str, t_s: float) -> Snapshot:
     """What a client sees while the worker of the service is in this state."""
-    status = a_status(
+    status = status_reply(
         worker=replies.WorkerStatus.model_validate({"state": worker}), pairs=(replies.PairStatus(name="sim"),)
     )
     health: Any = SimpleNamespace(reasons=(), metrics={})

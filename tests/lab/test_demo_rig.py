@@ -16,10 +16,10 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 from dataclasses import replace
 
 from cli.conftest import Coec
-from coec.reports.rig_plot import EdgeSeen
+from coec.reports.rig_plot import PlottedEdge
 from coec.simulation import drawing
 from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigConfig, RigDrive
+from coec.simulation.rig_drive import RigDrive, RigDriveConfig
 from coec_lab.demo import rig
 from coec_lab.demo.pair_drive import NS_PER_S
 from coec_lab.demo.rig_drive import (
@@ -35,7 +35,7 @@ from coec_lab.demo.rig_drive import (
     outcome_of,
     snapshot_of,
 )
-from rig_replies import knocked, untold
+from rig_replies import moved_lidar_reply, reply_before_checks
 from runtime.api.test_metrics import a_health
 
 LIDAR, CAMERA = SCENARIO.acts
@@ -51,7 +51,7 @@ def told(second: float, *moved: str) -> RigSnapshot:
             name, kind, state, 0.99 if name in moved else 0.001, 1.0 if name in moved else None, "<why>"
         )
 
-    edges = {f"{name}-roof": EdgeSeen(name, "roof", 0.1, 0.1) for name in SENSORS[:-1]}
+    edges = {f"{name}-roof": PlottedEdge(name, "roof", 0.1, 0.1) for name in SENSORS[:-1]}
     return RigSnapshot(second, "front-roof", {name: sensor(name) for name in SENSORS}, edges)
 
 
@@ -69,8 +69,8 @@ class AtOnce(Executor):
 
 
 def vehicle_of(executor: Executor, scenario: Scenario) -> RigVehicle:
-    drawing.begin(tuple(scenario.drive_config(act) for act in (None, *scenario.acts)))
-    return RigVehicle(drawing.Drawers(executor), scenario)
+    drawing.prepare_process(tuple(scenario.drive_config(act) for act in (None, *scenario.acts)))
+    return RigVehicle(drawing.FrameRenderers(executor), scenario)
 
 
 QUIET, NAMED = told(KNOCK_S - 9.0), told(KNOCK_S + 14.0, "left")
@@ -105,7 +105,7 @@ def test_only_what_is_new_is_told(tmp_path: Path) -> None:
     heard = [QUIET, told(KNOCK_S - 4.0), NAMED, replace(NAMED, second=KNOCK_S + 16.0)]
     assert rig.changes(heard) == [QUIET, NAMED]
     performances = [(outcome_of(LIDAR, [QUIET], KNOCK_S), [QUIET]), (outcome_of(CAMERA, heard, KNOCK_S), heard)]
-    files = rig.write(tmp_path, RigDrive(RigConfig(seconds=1.0, camera="fisheye64")), performances, SCENARIO)
+    files = rig.write(tmp_path, RigDrive(RigDriveConfig(seconds=1.0, camera="fisheye64")), performances, SCENARIO)
     assert [path.name for path in files] == ["lidar_knocked.png", "camera_knocked.png", "report.html"]
     page = files[-1].read_text()
     assert page.count('src="data:image/png;base64,') == page.count("src=") == 2
@@ -144,7 +144,7 @@ def test_what_the_service_says_is_told_as_it_is() -> None:
     check = taken.model_copy(update={"offset": offset, "sigma": (0.1, 0.1, None, 0.01, 0.01, None)})
     blind = taken.model_copy(update={"offset": (None,) * 6, "sigma": (None,) * 6})
     sensors_of = {"front": ("front", "roof"), "left": ("left", "roof")}
-    reply = knocked()
+    reply = moved_lidar_reply()
     said = snapshot_of(reply, START_NS + 9 * NS_PER_S, ["front", "left"], {"front": check, "left": blind}, sensors_of)
     assert said.second == 9.0
     assert said.checked == "front, left"
@@ -155,7 +155,7 @@ def test_what_the_service_says_is_told_as_it_is() -> None:
     assert said.edges["front"].deg == pytest.approx(0.5)
     assert said.edges["front"].sigmas == pytest.approx(5.0)
     assert said.edges["left"].sigmas == 0.0, "a pair that cannot tell is no evidence"
-    unknown = snapshot_of(untold(), START_NS, [], {}, sensors_of)
+    unknown = snapshot_of(reply_before_checks(), START_NS, [], {}, sensors_of)
     assert (unknown.sensors["roof"].state, unknown.sensors["roof"].probability, unknown.edges) == ("unknown", 0.0, {})
 
 

@@ -21,11 +21,11 @@ from coec.calibration.commissioning import learning
 from coec.calibration.types import LidarFrame
 from coec.evaluation import experiments, steps
 from coec.evaluation.starts import perturbations
-from coec.evaluation.statistics import Outcome
+from coec.evaluation.statistics import SolveOutcome
 from coec.geometry import se3
 from coec.schemas.evaluation import ClosureReport, ComparisonReport, EvaluationReport
 from coec.sources.recording import FramewiseRecording
-from drives import drawn
+from drives import rendered_drive
 
 CONTRACT = {
     "starts", "hits", "hit_rate", "rotation_deg", "translation_m", "bias", "std", "solve_s", "classified_correctly",
@@ -140,7 +140,7 @@ def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
 
 
 def test_methods_side_by_side_in_words(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.simulation.source.open_sim", lambda query: without_intensity(drawn(query)))
+    monkeypatch.setattr("coec.simulation.source.open_sim", lambda query: without_intensity(rendered_drive(query)))
     outcome = coec(
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--frames", "2",
         "--objective", "all", "--halves", "1",
@@ -216,7 +216,7 @@ def test_what_was_finished_before_ctrl_c_is_printed_and_written(
 ) -> None:
     solve, solved = experiments.Bench.solve, count()
 
-    def interrupted(self: experiments.Bench, *arguments: Any) -> Outcome:
+    def interrupted(self: experiments.Bench, *arguments: Any) -> SolveOutcome:
         if next(solved) == 3:  # of the reference, and two starts
             raise KeyboardInterrupt
         return solve(self, *arguments)
@@ -263,7 +263,7 @@ def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.Monk
 
 
 def test_knocks_are_laid_into_the_recording(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(experiments, "KNOCKS", (steps.Knock("none", 0.0), steps.Knock("3 deg", radians(3.0))))
+    monkeypatch.setattr(experiments, "MOUNT_STEPS", (steps.MountStep("none", 0.0), steps.MountStep("3 deg", radians(3.0))))
     outcome = coec("evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--steps", "2")
     assert outcome.status == 0
     assert "accepted and wrong" in " ".join(outcome.out.split())
@@ -298,7 +298,7 @@ def test_a_simulated_drive_is_held_against_its_truth(coec: Coec, monkeypatch: py
             return se3.perturb(self.rig.T_camera_lidar_nominal, np.radians([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
     def known(query: dict[str, str]) -> FramewiseRecording:
-        recording = drawn(query)
+        recording = rendered_drive(query)
         return Known(recording.name, recording.rig, recording.T_camera_lidar_start, recording.frames, recording.motions)
 
     monkeypatch.setattr("coec.simulation.source.open_sim", known)

@@ -102,10 +102,10 @@ def test_a_failed_drive_of_a_rig_does_not_refuse_the_next(
     def full_disk(path: Path, data: bytes) -> Path:
         if path.name == "rear.yaml":
             raise OutputError(f"cannot write {path}: No space left on device")
-        return output.write(path, data)
+        return output.write_output(path, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr("coec_lab.commands.drive_bags.write", full_disk)
+        patch.setattr("coec_lab.commands.drive_bags.write_output", full_disk)
         assert coec(*words).status == 1
     assert list(folder.iterdir()) == []
     assert coec(*words).status == 0

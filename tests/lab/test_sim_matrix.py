@@ -34,7 +34,7 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_a_drive_that_has_a_result_is_not_run_again(coec: Coec, tmp_path: Path, ran: list[str]) -> None:
-    chosen = [drive.name for drive in matrix_drives.chosen(1, PAIR)]
+    chosen = [drive.name for drive in matrix_drives.selected_drives(1, PAIR)]
     first = coec("sim", "matrix", "--output", tmp_path, "--only", PAIR, "--dof", 3, "--jobs", 1, "--json")
     assert (first.status, ran, first.document["drives"]) == (0, chosen, len(chosen))
     assert (tmp_path / "normalised.png").read_bytes()[:4] == b"\x89PNG"

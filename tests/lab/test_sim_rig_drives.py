@@ -10,7 +10,7 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from cli.conftest import Coec
 from coec.evaluation import rig_drives
-from coec.evaluation.knocked_drive import FIRST_SEED, KnockedDrive
+from coec.evaluation.knocked_drive import FIRST_SEED, DisplacedRigDrive
 from coec.schemas.rig import RigDriveRow, RigDrivesReport
 
 
@@ -19,7 +19,7 @@ def test_what_was_drawn_is_kept_and_what_is_damaged_is_drawn_again(
 ) -> None:
     drawn: list[str] = []
 
-    def driven(drive: KnockedDrive) -> RigDriveRow:
+    def driven(drive: DisplacedRigDrive) -> RigDriveRow:
         drawn.append(drive.name)
         return RigDriveRow(name=drive.name, seed=FIRST_SEED + drive.number, camera=drive.camera)
 

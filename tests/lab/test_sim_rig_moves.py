@@ -7,14 +7,14 @@ import pytest
 from cli.conftest import Coec
 from coec.evaluation import rig_moves
 from coec.evaluation.rig_evidence import FOUR
-from coec.evaluation.rig_moves import Fault
+from coec.evaluation.rig_moves import RigFault
 from coec.schemas.rig import RigMovesReport
 
 
 def test_a_knocked_camera_is_named_on_drawn_drives_and_told_in_tables(
     coec: Coec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rig_moves, "FAULTS", ((FOUR, Fault("one camera 1°", cameras=1)),))
+    monkeypatch.setattr(rig_moves, "FAULTS", ((FOUR, RigFault("one camera 1°", cameras=1)),))
     outcome = coec("sim", "rig-moves", "--drives", 1, "--rigs", 1, "--json")
     report = RigMovesReport.model_validate(outcome.document)
     assert (report.moves[0].right, report.moves[0].undecided, report.moves[0].wrong) == (1, 0, 0)

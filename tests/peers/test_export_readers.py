@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coec.adapters.exports import FORMATS
-from exported import extrinsic
+from exported import exported_extrinsic
 from peers.environments import Peer, peer
 
 TOLERANCE = 1e-12
@@ -26,6 +26,6 @@ def readers() -> Iterator[Peer]:
 @pytest.mark.parametrize("name", sorted(FORMATS.keys() - OURS))
 def test_others_read_the_same_transform(readers: Peer, name: str) -> None:
     for seed in range(20):
-        told = extrinsic(np.random.default_rng(seed).uniform(-2.0, 2.0, 6))
+        told = exported_extrinsic(np.random.default_rng(seed).uniform(-2.0, 2.0, 6))
         read = readers.ask(format=name, text=FORMATS[name].text(told, None))
         np.testing.assert_allclose(read["T_child_parent"], told.T_child_parent, atol=TOLERANCE, rtol=0)

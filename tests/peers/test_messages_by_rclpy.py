@@ -15,29 +15,31 @@ from rosbags.typesys import Stores, get_typestore
 
 from coec.adapters.mcap.windows import WindowWriter
 from coec.adapters.ros import incoming, messages, outgoing
-from coec.adapters.ros.diagnostics import Level, Status
+from coec.adapters.ros.diagnostics import DiagnosticLevel, DiagnosticStatus
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry.cameras import MODELS, build
 from peers.environments import Peer, peer
-from ros_messages import JPEG, STAMP
+from ros_messages import JPEG, STAMP_NS
 
 LIMITS = LimitsConfig()
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 T_CAMERA_LIDAR = np.array([[0, -1, 0, 0.1], [0, 0, -1, 0.2], [1, 0, 0, 0.3], [0, 0, 0, 1]], dtype=np.float64)
 SWEEP = LidarFrame(
-    STAMP,
+    STAMP_NS,
     "lidar",
     np.random.default_rng(3).normal(size=(101, 3)).astype(np.float32),
     intensity=np.linspace(0, 1, 101, dtype=np.float32),
     ring=np.arange(101, dtype=np.uint16),
     time_offset_s=np.linspace(-0.1, 0, 101, dtype=np.float32),
 )
-MOTION = EgoMotion(STAMP, "base_link", (12.5, -1e-9, 0.0), (1 / 3, 0.0, -0.25))
+MOTION = EgoMotion(STAMP_NS, "base_link", (12.5, -1e-9, 0.0), (1 / 3, 0.0, -0.25))
 STATUSES = [
-    Status(Level.OK, "coec: front_calibration", "", "camera-7", {}),
-    Status(Level.STALE, "coec: rear_calibration", "σ ± 0.1°", "", {"mi": "0.5", "drift": "", "ß": "0"}),
+    DiagnosticStatus(DiagnosticLevel.OK, "coec: front_calibration", "", "camera-7", {}),
+    DiagnosticStatus(
+        DiagnosticLevel.STALE, "coec: rear_calibration", "σ ± 0.1°", "", {"mi": "0.5", "drift": "", "ß": "0"}
+    ),
 ]
 
 FRAMES = {messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY, messages.IMU}
@@ -80,14 +82,14 @@ def rig(model: str) -> Rig:
 def written() -> list[tuple[str, bytes]]:
     """One or more of each type that coec writes."""
     return [
-        *(outgoing.encode_image(CameraFrame(STAMP, "camera", image)) for image in IMAGES),
-        (messages.COMPRESSED_IMAGE, outgoing.encode_depth(STAMP, "camera", IMAGES[0])),
+        *(outgoing.encode_image(CameraFrame(STAMP_NS, "camera", image)) for image in IMAGES),
+        (messages.COMPRESSED_IMAGE, outgoing.encode_depth(STAMP_NS, "camera", IMAGES[0])),
         (messages.POINT_CLOUD, outgoing.encode_cloud(SWEEP)),
         *(outgoing.encode_motion(motion) for motion in (MOTION, replace(MOTION, linear_mps=None))),
-        *((messages.CAMERA_INFO, outgoing.encode_camera_info(rig(model), STAMP)) for model in MODELS),
-        (messages.TF, outgoing.encode_tf_static(rig("pinhole"), T_CAMERA_LIDAR, STAMP)),
-        (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP, STATUSES)),
-        (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP, [])),
+        *((messages.CAMERA_INFO, outgoing.encode_camera_info(rig(model), STAMP_NS)) for model in MODELS),
+        (messages.TF, outgoing.encode_tf_static(rig("pinhole"), T_CAMERA_LIDAR, STAMP_NS)),
+        (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP_NS, STATUSES)),
+        (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP_NS, [])),
     ]
 
 
@@ -152,7 +154,7 @@ def test_every_message_of_a_window_is_read_by_rclpy(rclpy: Peer, tmp_path: Path)
     path = tmp_path / "front-1.mcap"
     writer = WindowWriter(path, rig("double_sphere"), T_CAMERA_LIDAR, "front-1", CalibrationConfig(), {})
     for number, image in enumerate(IMAGES):
-        stamp_ns = STAMP + number * 10**9
+        stamp_ns = STAMP_NS + number * 10**9
         camera = CameraFrame(stamp_ns, "camera", image, depth=IMAGES[0])
         writer.add(FramePair(camera, replace(SWEEP, stamp_ns=stamp_ns), replace(MOTION, stamp_ns=stamp_ns)))
     writer.finish()

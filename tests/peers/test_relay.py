@@ -7,14 +7,14 @@ import zenoh
 from coec.adapters.ros import messages
 from e2e.processes import routing
 from peers.nodes import Inbox, Topic, node, relay
-from ros_messages import compressed, twist
+from ros_messages import compressed_image, twist
 
 IMAGE, SPEED = "/front/image/compressed", "/speed"
 WITHIN_S = 60.0
 
 
 def test_messages_go_both_ways() -> None:
-    image, speed = compressed(), twist()
+    image, speed = compressed_image(), twist()
     inbox, keys = Inbox(), Inbox()
     with routing() as router:
 

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from fleet_windows import recorded_windows
-from ray_cluster import MISSING, Nodes, batch_command, two_nodes
+from ray_cluster import RAY_MISSING, RayNodes, batch_command, two_nodes
 
 pytestmark = pytest.mark.slow
 
@@ -35,12 +35,12 @@ def windows(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def nodes() -> Iterator[Nodes]:
+def nodes() -> Iterator[RayNodes]:
     with two_nodes() as nodes:
         yield nodes
 
 
-def frozen(nodes: Nodes) -> Callable[[], None]:
+def frozen(nodes: RayNodes) -> Callable[[], None]:
     """The second node falls silent; the call ends its processes."""
     stopped = nodes.freeze_second()
 
@@ -52,7 +52,7 @@ def frozen(nodes: Nodes) -> Callable[[], None]:
     return end
 
 
-def killed(nodes: Nodes) -> Callable[[], None]:
+def killed(nodes: RayNodes) -> Callable[[], None]:
     nodes.kill_second()
     return lambda: None
 
@@ -62,7 +62,7 @@ def killed(nodes: Nodes) -> Callable[[], None]:
     "a Ray node is killed, or falls silent, while it judges a window", "its windows are judged elsewhere within 60 s"
 )
 def test_windows_of_a_lost_node_are_judged_elsewhere_once_each(
-    nodes: Nodes, windows: Path, tmp_path: Path, lose: Callable[[Nodes], Callable[[], None]]
+    nodes: RayNodes, windows: Path, tmp_path: Path, lose: Callable[[RayNodes], Callable[[], None]]
 ) -> None:
     folder = tmp_path / "results"
     arguments = (windows, "--output", folder, "--engine", "ray", "--ray-address", nodes.address, "--json")
@@ -87,7 +87,7 @@ def test_windows_of_a_lost_node_are_judged_elsewhere_once_each(
 
 
 def test_without_a_cluster_none_is_started(windows: Path, tmp_path: Path) -> None:
-    pytest.importorskip("ray", reason=MISSING)
+    pytest.importorskip("ray", reason=RAY_MISSING)
     before = {process.pid for process in psutil.process_iter()}
     environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
     command = batch_command(windows, "--output", tmp_path / "results", "--engine", "ray")

@@ -178,7 +178,7 @@ def test_a_vehicle_of_another_client(python: Path, tmp_path: Path, drive: Drive,
     with started(config) as process:
         wait_until(lambda: f"no router at {endpoint}, trying again" in log.read_text(), "the complaint", LONG_S)
         assert process.poll() is None
-        with rmw_zenoh_defaults.router(endpoint) as router, vehicle(python, tmp_path, endpoint) as ros:
+        with rmw_zenoh_defaults.rmw_router(endpoint) as router, vehicle(python, tmp_path, endpoint) as ros:
             running = Service(process, router, load_config(config), log)
             wait_until(lambda: STALE in ros.levels(), "/diagnostics before anything was checked", LONG_S)
             running.until(running.status, lambda status: status["state"] == "running", "the worker")

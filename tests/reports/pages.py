@@ -29,21 +29,21 @@ from coec.calibration.types import (
     Window,
 )
 from coec.evaluation import paper_published
-from coec.evaluation.paper import MOVES_DEG, Figures
+from coec.evaluation.paper import MOVES_DEG, FailureFigures
 from coec.evaluation.profiles import Scan, Views
-from coec.evaluation.starts import directions
-from coec.evaluation.statistics import HIT_RAD, Outcome, Trial
+from coec.evaluation.starts import sphere_directions
+from coec.evaluation.statistics import HIT_RAD, SolveOutcome, Trial
 from coec.reports import evaluation_charts, evaluation_page, fleet_page, incident_page, paper_charts
 from coec.reports.baseline_page import baselines_page
 from coec.reports.bullseye import bullseye
 from coec.reports.calibration_page import calibration_page
 from coec.reports.check_page import check_page, detection_page
-from coec.reports.incident_page import Story
+from coec.reports.incident_page import FetchedIncident
 from coec.reports.page import Compare, Page, Pictures
 from coec.reports.page_parts import file_picture
 from coec.reports.paper_page import Plots, paper_page
 from coec.reports.pictures import slid_pictures
-from coec.reports.provenance import Made
+from coec.reports.provenance import Provenance
 from coec.schemas.evaluation import (
     ComparisonReport,
     DetectionReport,
@@ -72,10 +72,10 @@ from coec_lab.demo import rig as rig_of_demo
 from coec_lab.demo import rig_drive
 from coec_lab.demo.pair_client import Moment, outcome_of
 from coec_lab.demo.pair_report import demo_page
-from estimates import RIG, estimate
+from estimates import ESTIMATE_RIG, estimate
 
 EVIL = "<script>alert(1)</script>'\"><img src=http://evil/x onerror=alert(2)>"
-MADE = Made("coec calibrate window.mcap --output out", 1_760_000_000 * 10**9, {"coec": "0.1.0"}, "Linux x86_64")
+MADE = Provenance("coec calibrate window.mcap --output out", 1_760_000_000 * 10**9, {"coec": "0.1.0"}, "Linux x86_64")
 S = 1_000_000_000
 HASH = "3f786850e387550fdab836ed7e6dc881de23001b3f786850e387550fdab836ed"
 
@@ -103,7 +103,7 @@ def window() -> Window:
         )
         for stamp in (S, 2 * S)
     )
-    return Window("front-2", RIG, RIG.T_camera_lidar_nominal, pairs)
+    return Window("front-2", ESTIMATE_RIG, ESTIMATE_RIG.T_camera_lidar_nominal, pairs)
 
 
 def metrics_of(*, accepted: bool) -> tuple[Metric, ...]:
@@ -119,7 +119,7 @@ def result(*, accepted: bool = True, vehicle: str = "truck") -> CalibrationResul
     reasons = () if accepted else tuple(Reason(m.name, f"{m.name} says no") for m in metrics if not m.passed)
     decision = Decision.ACCEPTED if accepted else Decision.FAILED
     verdict = replace(made.verdict, decision=decision, metrics=metrics, reasons=reasons)
-    return result_of(replace(made, verdict=verdict), RIG, vehicle)
+    return result_of(replace(made, verdict=verdict), ESTIMATE_RIG, vehicle)
 
 
 def calibration_report(*, accepted: bool = True, vehicle: str = "truck") -> CalibrationReport:
@@ -168,13 +168,13 @@ DETECTION = DetectionReport(
 
 
 OUTCOMES = [
-    Outcome(Trial(np.eye(4), None, 1.0), np.eye(4), np.array([*error, 0.0, 0.0, 0.0]), float(np.linalg.norm(error)),
+    SolveOutcome(Trial(np.eye(4), None, 1.0), np.eye(4), np.array([*error, 0.0, 0.0, 0.0]), float(np.linalg.norm(error)),
             0.0, float(np.linalg.norm(error)) / HIT_RAD, bool(accepted))
     for error, accepted in zip(
         np.radians(np.random.default_rng(2).normal(0.0, 0.4, (12, 3))), (True, False) * 6, strict=True
     )
 ]  # fmt: skip
-ENDS = bullseye({"": OUTCOMES}, {"rotation vectors of the starts": directions(12)})
+ENDS = bullseye({"": OUTCOMES}, {"rotation vectors of the starts": sphere_directions(12)})
 SCANS = tuple(Scan(axis, np.linspace(-0.1, 0.1, 21), np.cos(np.linspace(-2.0, 2.0, 21))) for axis in range(6))
 VIEWS = Views(SCANS, SCANS)
 
@@ -238,7 +238,7 @@ def paper(folder: Path) -> Page:
     }
     del folder
     rng = np.random.default_rng(4)
-    figures_at = [Figures(moved, *rng.normal(5.0 - moved, 1.0, 3)) for moved in MOVES_DEG for _ in range(20)]
+    figures_at = [FailureFigures(moved, *rng.normal(5.0 - moved, 1.0, 3)) for moved in MOVES_DEG for _ in range(20)]
     plots = Plots(
         paper_charts.failure_figures(figures_at, PaperLimits(3.0, 4.0, 5.0)),
         ENDS,
@@ -310,7 +310,7 @@ def incident(_: Path, vehicle: str = "truck") -> Page:
         window_id="front-7", sha256=HASH, size_bytes=20_000_000, pairs=12, decision="accepted", in_history=False
     )
     absent = (Absent(what="status.json", why="it did not answer"),)
-    story = Story(event, history, None, None, None, (fetched,), absent, False, ("front-7.snippet",))
+    story = FetchedIncident(event, history, None, None, None, (fetched,), absent, False, ("front-7.snippet",))
     return incident_page.page(story, {"before.jpg": png(320, 180), "after.jpg": png(320, 180, 1)}, MADE)
 
 

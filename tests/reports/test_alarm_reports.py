@@ -7,12 +7,12 @@ from math import inf
 import pytest
 
 from coec.config import MonitorConfig
-from coec.evaluation.alarms import Alarms, Creep, Delay, FalseAlarms, FromStart
+from coec.evaluation.alarms import AlarmExperiments, Creep, Delay, FalseAlarmCount, FromStart
 from coec.reports import alarm_reports
 
-ALARMS = Alarms(
+ALARMS = AlarmExperiments(
     MonitorConfig(),
-    (FalseAlarms(10.0, 5.0, 1),),
+    (FalseAlarmCount(10.0, 5.0, 1),),
     (Delay(0.1, (inf, 5.0), (inf, inf)), Delay(1.0, (5.0, 10.0, 10.0), (10.0, 15.0, 20.0))),
     Creep(0.1, (2.0, 3.0, 4.0), (3.0, 4.0, inf)),
     (FromStart(0.5, (10.0, 10.0, 15.0, inf)),),

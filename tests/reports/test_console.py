@@ -15,7 +15,7 @@ import coec
 from coec.reports import console
 from coec.reports.progress import Bars, PlainColumn
 from coec.schemas.replies import MetricReply
-from hostile import HOSTILE, obeyed
+from hostile import HOSTILE, obeyed_characters
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_whatever_rich_is_given_it_sends_a_terminal_its_own_sequences_only(capsy
         bars.refresh()
     written = capsys.readouterr().out
     assert "\x1b[1;31m" in written, "its own styles are there"
-    assert obeyed(written, styled=True) == ""
+    assert obeyed_characters(written, styled=True) == ""
     assert "[red]" in written, "markup is text"
 
 
@@ -95,7 +95,7 @@ def test_what_the_interpreter_prints_by_itself_is_escaped() -> None:
     assert ended.returncode == 1
     assert ended.stderr.count(r"ValueError: \x1b[35;45m\x9b\r") == 2
     assert ended.stderr.count(r"\x1b[35;45m\x9b\r") == 3
-    assert obeyed(ended.stderr) == ""
+    assert obeyed_characters(ended.stderr) == ""
     assert logging.lastResort is not None
 
 

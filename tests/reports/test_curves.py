@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from coec.evaluation.profiles import Scan, Views
-from coec.evaluation.statistics import FramesPoint, SlicePoint, Spread
+from coec.evaluation.statistics import FrameCountStatistics, SliceStatistics, SpreadStatistics
 from coec.reports import curves
 
-FLAT = Spread(0.01, 0.02, 0.03)
-EXACT = Spread(0.0, 0.0, 0.0)
+FLAT = SpreadStatistics(0.01, 0.02, 0.03)
+EXACT = SpreadStatistics(0.0, 0.0, 0.0)
 
 
 def _size(png: bytes) -> tuple[int, int]:
@@ -40,16 +40,16 @@ def test_flat_landscape() -> None:
 
 @pytest.mark.parametrize("with_translation", [False, True])
 @pytest.mark.parametrize("errors", [FLAT, EXACT])
-def test_error_against_frames(with_translation: bool, errors: Spread) -> None:
-    points = [FramesPoint(frames, 5, 0.8, errors, errors, np.nan) for frames in (1, 2, 5)]
+def test_error_against_frames(with_translation: bool, errors: SpreadStatistics) -> None:
+    points = [FrameCountStatistics(frames, 5, 0.8, errors, errors, np.nan) for frames in (1, 2, 5)]
     _size(curves.error_against_frames(points, with_translation, "title"))
 
 
 def test_error_against_one_number_of_frames() -> None:
-    _size(curves.error_against_frames([FramesPoint(1, 1, 1.0, FLAT, FLAT, 0.01)], False, "title"))
+    _size(curves.error_against_frames([FrameCountStatistics(1, 1, 1.0, FLAT, FLAT, 0.01)], False, "title"))
 
 
 @pytest.mark.parametrize("with_translation", [False, True])
 def test_error_against_slice(with_translation: bool) -> None:
-    points = [SlicePoint(length, 5, 2.0, 20, 0.8, FLAT, FLAT, 0.02) for length in (7.5, 15.0, 120.0)]
+    points = [SliceStatistics(length, 5, 2.0, 20, 0.8, FLAT, FLAT, 0.02) for length in (7.5, 15.0, 120.0)]
     _size(curves.error_against_slice(points, with_translation, "title"))

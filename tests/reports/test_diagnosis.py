@@ -67,7 +67,7 @@ def test_a_right_one_says_what_would_not_be_seen(capsys: pytest.CaptureFixture[s
     assert "faint" in shown
 
 
-MEASURED = diagnosis.Measured(
+MEASURED = diagnosis.SolvedOffset(
     (-1.02, 0.01, 0.02, 0.0, 0.0, 0.0), (0.05, 0.04, 0.06, None, None, None), accepted=True, reasons=(), pairs=25
 )
 OFF = (-0.7, 0.0, 0.1, 0.0, 0.0, 0.0)

@@ -11,7 +11,7 @@ from types import MappingProxyType
 import pytest
 
 from coec.cli.fetch import chain_holds
-from coec.reports.incident_page import Story, page, sentences
+from coec.reports.incident_page import FetchedIncident, page, sentences
 from coec.reports.page import render
 from coec.runtime.decisions.chain import GENESIS
 from coec.schemas.base import to_json
@@ -28,7 +28,7 @@ from coec.schemas.replies import (
     StatusReply,
     Transform,
 )
-from hostile import HOSTILE, hostile, obeyed
+from hostile import HOSTILE, hostile_message, obeyed_characters
 from reports.pages import EVIL, MADE, png
 from reports.test_page import Read
 
@@ -54,10 +54,10 @@ EVENT = EvidenceEvent(
         for at in range(80, 120, 5)
     ),
 )
-STORY = Story(EVENT, None, None, None, None, (), (), None)
+STORY = FetchedIncident(EVENT, None, None, None, None, (), (), None)
 
 
-def told(story: Story, pictures: Mapping[str, bytes] = MappingProxyType({})) -> str:
+def told(story: FetchedIncident, pictures: Mapping[str, bytes] = MappingProxyType({})) -> str:
     """The document."""
     return render(page(story, pictures, MADE))
 
@@ -100,7 +100,7 @@ def test_what_a_vehicle_says_is_text() -> None:
     history = HistoryReply(
         vehicle="v", pair="p", total=0, results=(), entries=(ChainedEntry(sha256=EVIL, entry=entry),)
     )
-    story = Story(event, history, None, None, None, (), (Absent(what=EVIL, why=EVIL),), False)
+    story = FetchedIncident(event, history, None, None, None, (), (Absent(what=EVIL, why=EVIL),), False)
     text = told(story)
     assert text.count("<script") == 1, "that of the page itself"
     assert "<img" not in text
@@ -113,21 +113,21 @@ def test_what_a_vehicle_says_is_text() -> None:
 )
 def test_no_text_of_any_document_adds_to_the_page_or_reverses_it() -> None:
     def of(text: str) -> str:
-        story = Story(
-            hostile(EvidenceEvent, text=text, stamp_ns=S, wall_ns=S),
-            hostile(HistoryReply, text=text),
-            hostile(HealthReply, text=text),
-            hostile(ExtrinsicReply, text=text),
-            hostile(StatusReply, text=text),
-            (hostile(FetchedWindow, text=text),),
-            (hostile(Absent, text=text),),
+        story = FetchedIncident(
+            hostile_message(EvidenceEvent, text=text, stamp_ns=S, wall_ns=S),
+            hostile_message(HistoryReply, text=text),
+            hostile_message(HealthReply, text=text),
+            hostile_message(ExtrinsicReply, text=text),
+            hostile_message(StatusReply, text=text),
+            (hostile_message(FetchedWindow, text=text),),
+            (hostile_message(Absent, text=text),),
             chain_holds=True,
             snippets=(text,),
         )
         return told(story, {"before.jpg": png()})
 
     shown = of(HOSTILE)
-    assert obeyed(shown) == ""
+    assert obeyed_characters(shown) == ""
     page, harmless = (Read(text) for text in (shown, of("name")))
     assert [(tag, [*attributes]) for tag, attributes in page.tags] == [
         (tag, [*attributes]) for tag, attributes in harmless.tags

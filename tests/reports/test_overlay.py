@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.adapters.images.range_colours import WHOLE, RangeScale
+from coec.adapters.images.range_colours import WHOLE_SCALE, RangeScale
 from coec.geometry.cameras import build
-from coec.reports.overlay import LINE_SHARE, draw, titled
+from coec.reports.overlay import LINE_SHARE, render_points, titled
 
 WIDTH, HEIGHT = 960, 540
 CAMERA = build("pinhole", width=WIDTH, height=HEIGHT, fx=400.0, fy=400.0, cx=480.0, cy=270.0)
@@ -15,11 +15,11 @@ T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 
 
 
 def _drawn(
-    *points: tuple[float, float, float], mask: np.ndarray | None = None, scale: RangeScale | None = WHOLE
+    *points: tuple[float, float, float], mask: np.ndarray | None = None, scale: RangeScale | None = WHOLE_SCALE
 ) -> np.ndarray:
     """The picture without its bar, on black."""
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    picture = draw(image, CAMERA, T_CAMERA_LIDAR, np.array(points, np.float32), mask, scale)
+    picture = render_points(image, CAMERA, T_CAMERA_LIDAR, np.array(points, np.float32), mask, scale)
     assert not image.any()
     return picture[:HEIGHT]
 
@@ -81,6 +81,6 @@ def test_a_point_on_the_edge_is_cut_off() -> None:
 
 def test_small_images_are_enlarged() -> None:
     small = build("pinhole", width=200, height=100, fx=100.0, fy=100.0, cx=99.5, cy=49.5)
-    picture = draw(np.zeros((100, 200, 3), np.uint8), small, T_CAMERA_LIDAR, np.zeros((0, 3)), None)
+    picture = render_points(np.zeros((100, 200, 3), np.uint8), small, T_CAMERA_LIDAR, np.zeros((0, 3)), None)
     assert picture.shape[1] == 1000
     assert picture.shape[0] > 500

@@ -107,16 +107,16 @@ def test_what_is_no_picture_is_refused() -> None:
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(3, 10))
 def test_ticks_are_round_within_and_not_too_many(low: float, length: float, most: int) -> None:
     high = low + length
-    found = ticks.linear(low, high, most)
+    found = ticks.linear_ticks(low, high, most)
     assert 1 <= len(found) <= most
     assert all(low - 1e-6 * length <= tick <= high + 1e-6 * length for tick in found)
     assert found == sorted(set(found))
 
 
 def test_logarithmic_ticks_are_of_one_two_three_and_five() -> None:
-    assert ticks.logarithmic(0.02, 20.0) == pytest.approx([0.1, 1.0, 10.0])
-    assert ticks.logarithmic(0.04, 1.0) == pytest.approx([0.1, 0.3, 1.0])
-    assert ticks.logarithmic(0.3, 0.9) == pytest.approx([0.5])
+    assert ticks.logarithmic_ticks(0.02, 20.0) == pytest.approx([0.1, 1.0, 10.0])
+    assert ticks.logarithmic_ticks(0.04, 1.0) == pytest.approx([0.1, 0.3, 1.0])
+    assert ticks.logarithmic_ticks(0.3, 0.9) == pytest.approx([0.5])
 
 
 @pytest.mark.parametrize("log", [False, True])
@@ -124,7 +124,7 @@ def test_logarithmic_ticks_are_of_one_two_three_and_five() -> None:
 def test_a_plot_of_whatever_lies_within_its_axes(points: list[tuple[float, float]], log: bool) -> None:
     chart = Chart("t", "x", "y", (Series("s", points),), "told", marks=(Mark(0.5, "a mark with a name"),), log_y=log)
     for size in (charts.WIDE, charts.NARROW, charts.SMALL):
-        drawn = charts.drawn(chart, size)
+        drawn = charts.layout(chart, size)
         assert 0 < drawn.left < drawn.right <= size.width
         assert 0 < drawn.top < drawn.bottom <= size.height
         for path in drawn.paths:
@@ -136,9 +136,9 @@ def test_a_plot_of_whatever_lies_within_its_axes(points: list[tuple[float, float
 
 def test_a_line_is_broken_where_there_is_no_value_and_steps_hold() -> None:
     points = [(0.0, 0.0), (1.0, 1.0), (2.0, nan), (3.0, 1.0), (4.0, 2.0)]
-    (line,) = charts.drawn(Chart("t", "x", "y", (Series("s", points),), ""), charts.WIDE).paths
+    (line,) = charts.layout(Chart("t", "x", "y", (Series("s", points),), ""), charts.WIDE).paths
     assert line.d.count("M") == 2
-    (steps,) = charts.drawn(Chart("t", "x", "y", (Series("s", points, "steps"),), ""), charts.WIDE).paths
+    (steps,) = charts.layout(Chart("t", "x", "y", (Series("s", points, "steps"),), ""), charts.WIDE).paths
     assert steps.d.count("H") == steps.d.count("V") == 2
 
 
@@ -146,7 +146,7 @@ def test_names_of_marks_do_not_run_into_each_other() -> None:
     marks = tuple(Mark(at, "a long name") for at in (40.0, 41.0, 60.0, 99.0))
     chart = Chart("t", "x", "y", (Series("s", [(0.0, 0.0), (100.0, 1.0)]),), "", marks=marks)
     for size in (charts.WIDE, charts.NARROW):
-        drawn = charts.drawn(chart, size)
+        drawn = charts.layout(chart, size)
         reach = charts.LETTER_PX * len("a long name")
         spans = [
             (line.row_y, line.at if line.anchor == "start" else line.at - reach)
@@ -229,8 +229,8 @@ def test_the_page_of_a_large_fleet_is_small_and_says_what_it_leaves_out() -> Non
     )  # fmt: skip
     text = render(fleet_page.page(report, "Fleet", pages.MADE))
     assert len(text) < 3_000_000
-    assert text.count('class="trend"') == fleet_page.DRAWN
-    assert text.count("shuttle-of-the-north-") >= fleet_page.DRAWN + fleet_page.LISTED
+    assert text.count('class="trend"') == fleet_page.PLOTTED
+    assert text.count("shuttle-of-the-north-") >= fleet_page.PLOTTED + fleet_page.LISTED
     assert "8900 pairs more are not listed one by one" in text
     assert "coec fleet report RESULTS --sql" in text
     counted = [int(row) for row in re.findall(r'(?:and more|to [\d.]+)</td><td class="n">(\d+)</td>', text)]

@@ -16,7 +16,7 @@ from coec.reports.close_ups import Caption
 from coec.reports.page import Compare, Pictures, Text
 from coec.reports.pictures import Comparison, write_comparison
 
-WINDOW = posts.window((-8.0, 8.0))
+WINDOW = posts.post_window((-8.0, 8.0))
 WINDOW = replace(WINDOW, pairs=WINDOW.pairs * 4)
 
 

@@ -19,7 +19,7 @@ from coec.schemas.replies import (
     StreamStatus,
 )
 from coec.schemas.rig_state import RigReply
-from rig_replies import joint, knocked, untold
+from rig_replies import joint_reply, moved_lidar_reply, reply_before_checks
 from runtime.api.test_metrics import a_busy_status
 
 
@@ -127,7 +127,7 @@ def said_of_rig(capsys: pytest.CaptureFixture[str], reply: RigReply) -> str:
 
 
 def test_of_a_rig_it_is_said_who_moved_and_in_which_pairs_it_was_put_right(capsys: pytest.CaptureFixture[str]) -> None:
-    said = said_of_rig(capsys, knocked())
+    said = said_of_rig(capsys, moved_lidar_reply())
     assert "shuttle-7 by all that was seen until" in said
     assert "lidar_moved" in said
     assert "99.8" in said
@@ -141,15 +141,17 @@ def test_of_a_rig_it_is_said_who_moved_and_in_which_pairs_it_was_put_right(capsy
 
 
 def test_of_a_rig_that_fits_no_loop_is_called_open(capsys: pytest.CaptureFixture[str]) -> None:
-    said = said_of_rig(capsys, knocked(joint=joint(consistent=True, open_loops=(), chi2=4.0, p_value=0.7)))
+    said = said_of_rig(
+        capsys, moved_lidar_reply(joint=joint_reply(consistent=True, open_loops=(), chi2=4.0, p_value=0.7))
+    )
     assert "the pairs fit each other: χ² 4.0 at 6 degrees of freedom, p 0.7" in said
     assert "does not close" not in said
-    without = said_of_rig(capsys, knocked(joint=joint(freedom=0, open_loops=())))
+    without = said_of_rig(capsys, moved_lidar_reply(joint=joint_reply(freedom=0, open_loops=())))
     assert "fit each other" not in without, "nothing closes a loop: nothing is said of it"
 
 
 def test_of_a_rig_that_nobody_looked_at_no_figure_is_made_up(capsys: pytest.CaptureFixture[str]) -> None:
-    said = said_of_rig(capsys, untold())
+    said = said_of_rig(capsys, reply_before_checks())
     assert "shuttle-7 nothing was looked at yet one_pair: One pair cannot tell its camera from its LiDAR." in said
     assert "unknown" in said
     assert "put right" not in said

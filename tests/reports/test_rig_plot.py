@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.reports.rig_plot import EdgeSeen, SensorSeen, rig_from_above, words_of
+from coec.reports.rig_plot import PlottedEdge, PlottedSensor, label_of, rig_from_above
 
 
 def placed(x_m: float, y_m: float) -> NDArray[np.float64]:
@@ -18,13 +18,13 @@ def placed(x_m: float, y_m: float) -> NDArray[np.float64]:
     return transform
 
 
-FRONT = SensorSeen("front", "camera", placed(2.0, 0.0), 190.0, "calibrated", 0.002)
-LEFT = SensorSeen("left", "camera", placed(1.0, 0.8), 190.0, "calibrated", 0.002)
-ROOF = SensorSeen("roof", "lidar", placed(1.0, 0.0), 360.0, "calibrated", 0.002)
-EDGES = (EdgeSeen("front", "roof", 0.02, 0.1), EdgeSeen("left", "roof", 0.02, 0.1))
+FRONT = PlottedSensor("front", "camera", placed(2.0, 0.0), 190.0, "calibrated", 0.002)
+LEFT = PlottedSensor("left", "camera", placed(1.0, 0.8), 190.0, "calibrated", 0.002)
+ROOF = PlottedSensor("roof", "lidar", placed(1.0, 0.0), 360.0, "calibrated", 0.002)
+EDGES = (PlottedEdge("front", "roof", 0.02, 0.1), PlottedEdge("left", "roof", 0.02, 0.1))
 
 
-def pixels(*sensors: SensorSeen, edges: tuple[EdgeSeen, ...] = EDGES) -> NDArray[np.int64]:
+def pixels(*sensors: PlottedSensor, edges: tuple[PlottedEdge, ...] = EDGES) -> NDArray[np.int64]:
     picture = cv2.imdecode(np.frombuffer(rig_from_above(sensors, edges, "title"), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     return picture.astype(np.int64)
@@ -49,25 +49,25 @@ def test_who_moved_is_marked_in_red_where_it_sits() -> None:
 
 
 def test_an_edge_is_red_when_it_is_sure_and_not_when_it_cannot_tell() -> None:
-    def red(edge: EdgeSeen) -> int:
+    def red(edge: PlottedEdge) -> int:
         return int(strong(pixels(FRONT, LEFT, ROOF, edges=(edge, EDGES[1])), 2).sum())
 
-    sure, faint = EdgeSeen("front", "roof", 1.0, 0.1), EdgeSeen("front", "roof", 1.0, 2.0)
+    sure, faint = PlottedEdge("front", "roof", 1.0, 0.1), PlottedEdge("front", "roof", 1.0, 2.0)
     assert red(sure) > red(faint) + 200
-    for nothing in (EdgeSeen("front", "roof", np.nan, 0.1), EdgeSeen("front", "roof", 1.0, 0.0)):
+    for nothing in (PlottedEdge("front", "roof", np.nan, 0.1), PlottedEdge("front", "roof", 1.0, 0.0)):
         assert nothing.sigmas == 0.0
 
 
 def test_words_tell_state_size_and_probability_and_never_certainty() -> None:
-    moved = SensorSeen("roof", "lidar", placed(1.0, 0.0), 360.0, "lidar_moved", 1.0, 1.04)
-    assert words_of(moved).splitlines() == ["roof", "moved by 1°", "> 99 %"]
-    assert words_of(replace(moved, state="undecided", probability=0.42)).splitlines() == ["roof", "undecided", "42 %"]
-    assert words_of(replace(moved, state="unknown", probability=None)).splitlines() == ["roof", "unknown"]
-    assert words_of(ROOF) == "roof"
-    assert words_of(replace(ROOF, state="undecided", probability=0.0)).splitlines()[-1] == "< 1 %"
+    moved = PlottedSensor("roof", "lidar", placed(1.0, 0.0), 360.0, "lidar_moved", 1.0, 1.04)
+    assert label_of(moved).splitlines() == ["roof", "moved by 1°", "> 99 %"]
+    assert label_of(replace(moved, state="undecided", probability=0.42)).splitlines() == ["roof", "undecided", "42 %"]
+    assert label_of(replace(moved, state="unknown", probability=None)).splitlines() == ["roof", "unknown"]
+    assert label_of(ROOF) == "roof"
+    assert label_of(replace(ROOF, state="undecided", probability=0.0)).splitlines()[-1] == "< 1 %"
 
 
 def test_equal_rigs_give_equal_bytes_and_an_edge_to_nowhere_is_refused() -> None:
     assert rig_from_above((FRONT, LEFT, ROOF), EDGES, "t") == rig_from_above((FRONT, LEFT, ROOF), EDGES, "t")
     with pytest.raises(ValueError, match="nose"):
-        rig_from_above((FRONT, ROOF), (EdgeSeen("nose", "roof", 1.0, 0.1),), "t")
+        rig_from_above((FRONT, ROOF), (PlottedEdge("nose", "roof", 1.0, 0.1),), "t")

@@ -6,13 +6,13 @@ import threading
 
 import pytest
 
-from coec.runtime.decisions.mailbox import COMMANDS_WAITING, Mailbox
-from coec.runtime.handover import BusyError, Handover
+from coec.runtime.decisions.mailbox import COMMANDS_WAITING, TaskQueue
+from coec.runtime.handover import BusyError, DeferredCall
 
 
 def test_what_nobody_waits_for_any_more_is_not_done() -> None:
     done: list[int] = []
-    handed = Handover(lambda: done.append(1))
+    handed = DeferredCall(lambda: done.append(1))
     with pytest.raises(BusyError, match="nothing was done"):
         handed.result(0.0)
     handed.run()
@@ -27,7 +27,7 @@ def test_what_was_begun_in_time_is_waited_for() -> None:
         assert go_on.wait(10.0)
         return "done"
 
-    handed = Handover(work)
+    handed = DeferredCall(work)
     other = threading.Thread(target=handed.run)
     other.start()
     assert begun.wait(10.0)
@@ -39,7 +39,7 @@ def test_what_was_begun_in_time_is_waited_for() -> None:
 
 
 def test_what_the_work_raises_is_raised_where_it_was_asked_for() -> None:
-    handed = Handover(lambda: 1 // 0)
+    handed = DeferredCall(lambda: 1 // 0)
     handed.run()
     with pytest.raises(ZeroDivisionError):
         handed.result(1.0)
@@ -47,14 +47,14 @@ def test_what_the_work_raises_is_raised_where_it_was_asked_for() -> None:
 
 @pytest.mark.fault("a flood of `calibrate`", "it is refused, and pairing is not held up")
 def test_a_flood_of_commands_is_refused_and_answers_are_not_held_up() -> None:
-    mailbox = Mailbox()
+    mailbox = TaskQueue()
     asking = [threading.Thread(target=_asked, args=(mailbox,)) for _ in range(COMMANDS_WAITING)]
     for thread in asking:
         thread.start()
     while mailbox._commands < COMMANDS_WAITING:
         threading.Event().wait(0.001)
     with pytest.raises(BusyError, match="Too many commands"):
-        mailbox.ask(lambda: None, 30.0)
+        mailbox.call_and_wait(lambda: None, 30.0)
     answered: list[str] = []
     mailbox.post(lambda: answered.append("answer"))
     while (item := mailbox.take(0.0)) is not None:
@@ -65,5 +65,5 @@ def test_a_flood_of_commands_is_refused_and_answers_are_not_held_up() -> None:
     assert mailbox._commands == 0
 
 
-def _asked(mailbox: Mailbox) -> None:
-    mailbox.ask(lambda: None, 30.0)
+def _asked(mailbox: TaskQueue) -> None:
+    mailbox.call_and_wait(lambda: None, 30.0)

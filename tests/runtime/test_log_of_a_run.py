@@ -17,7 +17,7 @@ from coec.runtime.ingest import chooser
 from coec.runtime.ingest.decoder import EXPLAINED
 from coec.runtime.ingest.stream_log import QUIET_S, RATE_FRAMES, SILENT_S, StreamLog
 from coec.runtime.worker.compilation import Compiling
-from pair_bench import BEGIN_S, END_S, STEP_S, Bench, S, SlowWorker, pair_at
+from pair_bench import BEGIN_S, DRIVE_END_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
 
 
 @dataclass
@@ -44,7 +44,7 @@ def test_a_drive_in_which_the_mount_moves_is_a_story_of_a_few_lines(
 ) -> None:
     monkeypatch.setattr(chooser, "PROGRESS_S", 0.0)
     caplog.set_level(logging.INFO)
-    Bench(tmp_path / "state").drive(BEGIN_S, END_S)
+    PairBench(tmp_path / "state").drive(BEGIN_S, DRIVE_END_S)
     told = lines(caplog)
     for expected in (
         "window: 1 of 10 pairs",
@@ -62,7 +62,7 @@ def test_a_drive_in_which_the_mount_moves_is_a_story_of_a_few_lines(
 def test_pairs_of_a_window_are_logged_at_a_bounded_rate(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A drive of minutes goes through the bench in far less than `PROGRESS_S`."""
     caplog.set_level(logging.INFO)
-    Bench(tmp_path / "state").drive(BEGIN_S, STEP_S)
+    PairBench(tmp_path / "state").drive(BEGIN_S, STEP_S)
     told = lines(caplog)
     windows = sum(line.startswith("window ended") for line in told)
     assert windows > 1
@@ -71,33 +71,33 @@ def test_pairs_of_a_window_are_logged_at_a_bounded_rate(tmp_path: Path, caplog: 
 
 def test_checks_are_logged_when_what_they_say_changes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, STEP_S)
-    assert bench.pair.decider.known().checks > 10
+    assert bench.pair.manager.snapshot().checks > 10
     assert len([line for line in lines(caplog) if line.startswith("checks: ")]) < 5
 
 
 def test_checks_that_the_worker_did_not_begin_do_not_make_the_monitor_blind(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.worker.fault = Compiling(3, 38, 1.0).reason
     bench.drive(BEGIN_S, BEGIN_S + 60)
-    codes = {reason.code for reason in bench.pair.decider.known().troubles}
+    codes = {reason.code for reason in bench.pair.manager.snapshot().problems}
     assert "monitor_blind" not in codes
     assert bench.losses["monitor", "check_compiling_kernels"] > 3
     assert any("compiles its kernels" in line for line in lines(caplog))
     bench.worker.fault = Reason("dark", "It is dark.")
     bench.drive(BEGIN_S + 60, BEGIN_S + 120)
-    assert "monitor_blind" in {reason.code for reason in bench.pair.decider.known().troubles}
+    assert "monitor_blind" in {reason.code for reason in bench.pair.manager.snapshot().problems}
 
 
 def test_the_stream_does_not_wait_for_a_worker_that_compiles_its_kernels(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state", worker=SlowWorker)
+    bench = PairBench(tmp_path / "state", worker=SlowWorker)
 
     def drive(begin_s: int, end_s: int) -> None:
-        for stamp_ns in range(begin_s * S, end_s * S, S // 2):
-            bench.pair.stream.take([pair_at(stamp_ns)])
+        for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, NS_PER_S // 2):
+            bench.pair.stream.take([frame_pair_at(stamp_ns)])
             while bench.pair.stream.choose_next():
                 pass
 
@@ -135,7 +135,7 @@ def test_the_rate_of_a_stream_is_logged_once(caplog: pytest.LogCaptureFixture) -
     caplog.set_level(logging.INFO)
     log = StreamLog("camera", "in/camera", Clock())
     for number in range(3 * RATE_FRAMES):
-        log.push(camera(number * S // 10))
+        log.push(camera(number * NS_PER_S // 10))
     assert lines(caplog)[1:] == ["camera frames come at 10.0 Hz by their stamps"]
 
 

@@ -19,7 +19,7 @@ from coec.calibration.lifecycle import HealthState
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.types import Matrix4, Reason
 from coec.geometry import se3
-from pair_bench import BEFORE, BEGIN_S, STEP_S, Bench, S
+from pair_bench import BEFORE, BEGIN_S, NS_PER_S, STEP_S, PairBench
 
 WRONG_DEG, WRONG_M = 1.0, 0.1
 PERIOD_S = 5
@@ -35,7 +35,7 @@ def moved(xi: Sequence[float], share: Callable[[float], float] = lambda _: 1.0) 
     step = np.array([*np.radians(xi[:3]), *xi[3:]])
 
     def truth(stamp_ns: int) -> Matrix4:
-        since_s = stamp_ns / S - STEP_S
+        since_s = stamp_ns / NS_PER_S - STEP_S
         return BEFORE if since_s < 0.0 else se3.perturb(BEFORE, share(since_s) * step)
 
     return truth
@@ -66,14 +66,14 @@ class Moment:
         return self.health == "healthy" and (self.off_deg >= WRONG_DEG or self.off_m >= WRONG_M)
 
 
-def driven(bench: Bench, seconds: Iterable[int], speed_mps: float | Callable[[int], float] = 5.0) -> list[Moment]:
+def driven(bench: PairBench, seconds: Iterable[int], speed_mps: float | Callable[[int], float] = 5.0) -> list[Moment]:
     """Drives for these seconds of sensor time, counted from `STEP_S`, and looks after each."""
     moments = []
     for second in seconds:
         speed = speed_mps(second) if callable(speed_mps) else speed_mps
         bench.drive(STEP_S + second, STEP_S + second + 1, speed)
         health = bench.answers.health_reply
-        off = se3.difference(bench.pose, bench.truth((STEP_S + second) * S))
+        off = se3.difference(bench.pose, bench.truth((STEP_S + second) * NS_PER_S))
         reasons = tuple(reason.code for reason in health.reasons)
         angle_deg = float(np.degrees(se3.rotation_angle_rad(se3.perturbation(off))))
         moments.append(Moment(second, health.state, reasons, angle_deg, float(np.linalg.norm(off[3:]))))
@@ -100,9 +100,9 @@ def most_per_minute(moments: Sequence[Moment]) -> int:
     return max((sum(begin <= other < begin + 60 for other in begins) for begin in begins), default=0)
 
 
-def settled(folder: Path, truth: Callable[[int], Matrix4] = STILL) -> Bench:
+def settled(folder: Path, truth: Callable[[int], Matrix4] = STILL) -> PairBench:
     """A pair that is healthy when the fault begins; the policy applies every accepted window."""
-    bench = Bench(folder / "state", "always", truth=truth)
+    bench = PairBench(folder / "state", "always", truth=truth)
     bench.drive(BEGIN_S, STEP_S)
     assert bench.answers.health_reply.state == "healthy"
     return bench
@@ -176,7 +176,7 @@ def test_a_flagged_check_does_not_make_healthy(tmp_path: Path, after: str, speed
     elif after == "rollback":
         assert bench.do("rollback", to=first) == "rolled_back"
     else:
-        bench.pair.decider.look_at_clocks(time.monotonic() + LIMIT_S + 1.0)
+        bench.pair.manager.check_clocks(time.monotonic() + LIMIT_S + 1.0)
     assert bench.answers.health_reply.state != "healthy"
     assert bench.do("hold") == "held"  # so that no window repairs what is served
     moments = driven(bench, range(1, 120), speed_mps)
@@ -193,7 +193,7 @@ def test_a_flagged_check_does_not_make_healthy(tmp_path: Path, after: str, speed
 @pytest.mark.parametrize("dates_the_move", [False, True])
 def test_a_shift_that_windows_cannot_see(tmp_path: Path, *, dates_the_move: bool) -> None:
     bench = settled(tmp_path, moved((0.0, 0.0, 0.0, 0.12, 0.0, 0.0)))
-    bench.recorder.sees_knocks = dates_the_move
+    bench.recorder.sees_moves = dates_the_move
     moments = driven(bench, range(200))
     accepted = bench.answers.history(0, 2**63 - 1, 100).results
     assert len(accepted) > 3, "windows go on being accepted"
@@ -276,7 +276,7 @@ def healthy_until(observations: Sequence[Observation]) -> float:
     for observation in observations:
         state = lifecycle.after_observation(state, observation, RULES)
         if state.health is HealthState.HEALTHY:
-            last_s = (observation.stamp_ns - observations[0].stamp_ns) / S
+            last_s = (observation.stamp_ns - observations[0].stamp_ns) / NS_PER_S
     return last_s
 
 

@@ -23,20 +23,31 @@ from coec.calibration.types import (
 )
 from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.recording.window_store import start_ns_of
-from pair_bench import AFTER, BEFORE, BEGIN_S, END_S, NOMINAL, STEP_S, Bench, S, SlowWorker, pair_at
+from pair_bench import (
+    AFTER,
+    BEFORE,
+    BEGIN_S,
+    DRIVE_END_S,
+    NOMINAL,
+    NS_PER_S,
+    STEP_S,
+    PairBench,
+    SlowWorker,
+    frame_pair_at,
+)
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path / "state")
+def bench(tmp_path: Path) -> PairBench:
+    return PairBench(tmp_path / "state")
 
 
 @pytest.mark.fault("the mount is knocked", "it is noticed within a minute, and corrected by the next window")
 def test_a_step_is_noticed_within_a_minute_and_corrected_by_the_next_window(
-    bench: Bench, record_property: Callable[[str, object], None]
+    bench: PairBench, record_property: Callable[[str, object], None]
 ) -> None:
-    bench.drive(BEGIN_S, END_S)
-    states = {entry.code: (entry.stamp_ns or 0) / S - STEP_S for entry in bench.entries("state")}
+    bench.drive(BEGIN_S, DRIVE_END_S)
+    states = {entry.code: (entry.stamp_ns or 0) / NS_PER_S - STEP_S for entry in bench.entries("state")}
     assert bench.decisions() == [
         ("extrinsic", "estimated"),
         ("state", "healthy"),
@@ -53,25 +64,25 @@ def test_a_step_is_noticed_within_a_minute_and_corrected_by_the_next_window(
     alarms = bench.answers.health_reply.alarms
     assert alarms is not None
     assert (alarms.confirmed, alarms.withdrawn, alarms.open) == (1, 0, False)
-    assert 0.8 * (END_S - BEGIN_S) < alarms.watched_s < END_S - BEGIN_S
+    assert 0.8 * (DRIVE_END_S - BEGIN_S) < alarms.watched_s < DRIVE_END_S - BEGIN_S
 
 
 def test_every_event_is_told_to_whoever_keeps_the_seconds_around_it(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: PairBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[tuple[str, float]] = []
     monkeypatch.setattr(
         PairStream, "event", lambda _, name, pose: told.append((name, float(np.abs(pose - AFTER).max())))
     )
-    bench.drive(BEGIN_S, END_S)
+    bench.drive(BEGIN_S, DRIVE_END_S)
     assert [name for name, _ in told] == ["suspect", "miscalibrated"]
     assert min(off for _, off in told) > 0, "with what was served when it began"
 
 
-def test_the_same_drive_gives_the_same_decisions(bench: Bench, tmp_path: Path) -> None:
-    again = Bench(tmp_path / "again")
+def test_the_same_drive_gives_the_same_decisions(bench: PairBench, tmp_path: Path) -> None:
+    again = PairBench(tmp_path / "again")
     for one in (bench, again):
-        one.drive(BEGIN_S, END_S)
+        one.drive(BEGIN_S, DRIVE_END_S)
     kinds = ("estimate", "extrinsic", "state")
     timeless = [
         [e.model_copy(update={"wall_ns": 0, "previous_sha256": ""}) for e in b.entries(*kinds)] for b in (bench, again)
@@ -79,31 +90,31 @@ def test_the_same_drive_gives_the_same_decisions(bench: Bench, tmp_path: Path) -
     assert timeless[0] == timeless[1]
 
 
-def test_pairs_are_recorded_between_those_of_a_window_a_second_apart(bench: Bench) -> None:
+def test_pairs_are_recorded_between_those_of_a_window_a_second_apart(bench: PairBench) -> None:
     bench.drive(BEGIN_S, STEP_S)
     for window_id, stamps_ns in list(bench.recorder.stamps.items())[:2]:
         between_ns = bench.recorder.between[window_id]
         assert stamps_ns[0] < between_ns[0]
-        assert between_ns[-1] < stamps_ns[0] + 40 * S
-        apart_s = np.diff(sorted([*stamps_ns, *between_ns])) / S
+        assert between_ns[-1] < stamps_ns[0] + 40 * NS_PER_S
+        apart_s = np.diff(sorted([*stamps_ns, *between_ns])) / NS_PER_S
         assert apart_s.max() <= 1.5, "so far apart are two pairs, chosen or not"
         assert len(between_ns) > 2 * len(stamps_ns)
 
 
 @pytest.mark.fault("a worker that is slow", "no decision changes")
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_worker_that_takes_its_time_changes_no_decision(bench: Bench, tmp_path: Path, seed: int) -> None:
-    slow = Bench(tmp_path / "slow", worker=SlowWorker)
+def test_a_worker_that_takes_its_time_changes_no_decision(bench: PairBench, tmp_path: Path, seed: int) -> None:
+    slow = PairBench(tmp_path / "slow", worker=SlowWorker)
     assert isinstance(slow.worker, SlowWorker)
     slow.worker.rng = np.random.default_rng(seed)
     for one in (bench, slow):
-        one.drive(BEGIN_S, END_S)
+        one.drive(BEGIN_S, DRIVE_END_S)
     waited = 0
     while slow.pair.stream.report.held and waited < 1000:
         slow.worker.work(share=0.5)
         slow.settle()
         waited += 1
-    slow.drive(END_S, END_S)
+    slow.drive(DRIVE_END_S, DRIVE_END_S)
     told = [
         [
             e.model_copy(update={"wall_ns": 0, "previous_sha256": ""})
@@ -117,9 +128,9 @@ def test_a_worker_that_takes_its_time_changes_no_decision(bench: Bench, tmp_path
 
 
 def test_a_stream_that_has_waited_for_too_long_goes_on_and_says_so(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state", worker=SlowWorker)
-    for stamp_ns in range(BEGIN_S * S, (BEGIN_S + 60) * S, S // 2):
-        bench.pair.stream.take([pair_at(stamp_ns)])
+    bench = PairBench(tmp_path / "state", worker=SlowWorker)
+    for stamp_ns in range(BEGIN_S * NS_PER_S, (BEGIN_S + 60) * NS_PER_S, NS_PER_S // 2):
+        bench.pair.stream.take([frame_pair_at(stamp_ns)])
         while bench.pair.stream.choose_next():
             pass
     waiting = len(bench.pair.stream._held)
@@ -134,17 +145,17 @@ def test_a_stream_that_has_waited_for_too_long_goes_on_and_says_so(tmp_path: Pat
 
 @pytest.mark.fault("a restart in the middle of a drive", "no decision changes")
 @pytest.mark.parametrize("restart_s", [3, 57, 100, 104, 109, 112, 116, 125, 160])
-def test_a_restart_in_the_middle_changes_no_decision(bench: Bench, tmp_path: Path, restart_s: int) -> None:
-    bench.drive(BEGIN_S, END_S)
-    broken = Bench(tmp_path / "broken")
+def test_a_restart_in_the_middle_changes_no_decision(bench: PairBench, tmp_path: Path, restart_s: int) -> None:
+    bench.drive(BEGIN_S, DRIVE_END_S)
+    broken = PairBench(tmp_path / "broken")
     broken.drive(BEGIN_S, BEGIN_S + restart_s)
     before = broken.health
     broken.store.save()
     broken.restart()
     assert broken.health == ("unknown" if before == "healthy" else before), "nothing has been looked at since"
-    broken.drive(BEGIN_S + restart_s, END_S)
+    broken.drive(BEGIN_S + restart_s, DRIVE_END_S)
 
-    def states(one: Bench) -> list[str]:
+    def states(one: PairBench) -> list[str]:
         told = [entry.code for entry in one.entries("state") if entry.code != "unknown"]
         return [code for code, after in zip(told, [*told[1:], None], strict=True) if code != after]
 
@@ -153,17 +164,17 @@ def test_a_restart_in_the_middle_changes_no_decision(bench: Bench, tmp_path: Pat
     assert broken.store.history.damage is None
 
 
-def seeing(folder: Path) -> Bench:
-    bench = Bench(folder)
-    bench.recorder.sees_knocks = True
+def seeing(folder: Path) -> PairBench:
+    bench = PairBench(folder)
+    bench.recorder.sees_moves = True
     return bench
 
 
-def with_knock(bench: Bench) -> tuple[list[int], list[int]]:
+def with_knock(bench: PairBench) -> tuple[list[int], list[int]]:
     """Stamps of the window that holds the step, and of the one after it, in seconds since the step."""
     told = list(bench.recorder.stamps.values())
-    place = next(i for i, stamps in enumerate(told) if stamps[0] < STEP_S * S <= stamps[-1])
-    before, after = ([round(stamp / S) - STEP_S for stamp in stamps] for stamps in told[place : place + 2])
+    place = next(i for i, stamps in enumerate(told) if stamps[0] < STEP_S * NS_PER_S <= stamps[-1])
+    before, after = ([round(stamp / NS_PER_S) - STEP_S for stamp in stamps] for stamps in told[place : place + 2])
     return before, after
 
 
@@ -190,7 +201,7 @@ def test_a_restart_loses_no_pair_after_a_knock(tmp_path: Path, after_s: int) -> 
     stamps = broken.recorder.stamps
     broken.store.save()
     broken.restart()
-    broken.recorder.sees_knocks, broken.recorder.stamps = True, stamps
+    broken.recorder.sees_moves, broken.recorder.stamps = True, stamps
     broken.drive(restart_s, STEP_S + 40)
     of_broken, following = with_knock(broken)
     assert of_broken == knocked
@@ -200,8 +211,8 @@ def test_a_restart_loses_no_pair_after_a_knock(tmp_path: Path, after_s: int) -> 
 
 
 def test_what_is_kept_after_a_knock_does_not_hang_on_when_the_worker_answers(tmp_path: Path) -> None:
-    quick, slow = seeing(tmp_path / "quick"), Bench(tmp_path / "slow", worker=SlowWorker)
-    slow.recorder.sees_knocks = True
+    quick, slow = seeing(tmp_path / "quick"), PairBench(tmp_path / "slow", worker=SlowWorker)
+    slow.recorder.sees_moves = True
     assert isinstance(slow.worker, SlowWorker)
     end_s = STEP_S + 30
     for one in (quick, slow):
@@ -217,8 +228,8 @@ def test_what_is_kept_after_a_knock_does_not_hang_on_when_the_worker_answers(tmp
 
 
 def test_with_never_the_candidate_waits_until_a_person_applies_it(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state", apply="never")
-    bench.drive(BEGIN_S, END_S)
+    bench = PairBench(tmp_path / "state", apply="never")
+    bench.drive(BEGIN_S, DRIVE_END_S)
     np.testing.assert_array_equal(bench.pose, NOMINAL)
     assert bench.health == "miscalibrated"
     assert bench.entries("extrinsic") == []
@@ -226,7 +237,7 @@ def test_with_never_the_candidate_waits_until_a_person_applies_it(tmp_path: Path
     np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
     assert bench.health == "unknown", "no check has acquitted it yet"
     assert bench.do("apply") == "nothing_pending"
-    bench.drive(END_S, END_S + 10)
+    bench.drive(DRIVE_END_S, DRIVE_END_S + 10)
     assert bench.health == "healthy"
 
 
@@ -235,10 +246,10 @@ def test_with_never_the_candidate_waits_until_a_person_applies_it(tmp_path: Path
     "`apply` that names it is refused, and says which waits",
 )
 def test_apply_takes_the_named_candidate_and_no_other(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state", apply="never")
+    bench = PairBench(tmp_path / "state", apply="never")
     bench.drive(BEGIN_S, STEP_S)
     seen = bench.answers.extrinsic_reply.pending
-    bench.drive(STEP_S, END_S)
+    bench.drive(STEP_S, DRIVE_END_S)
     waits = bench.answers.extrinsic_reply.pending
     assert seen is not None
     assert waits is not None
@@ -256,8 +267,8 @@ def test_apply_takes_the_named_candidate_and_no_other(tmp_path: Path) -> None:
     assert bench.do("apply", candidate=waits.window_id) == "nothing_pending"
 
 
-def test_a_roll_back_returns_to_any_accepted_calibration(bench: Bench) -> None:
-    bench.drive(BEGIN_S, END_S)
+def test_a_roll_back_returns_to_any_accepted_calibration(bench: PairBench) -> None:
+    bench.drive(BEGIN_S, DRIVE_END_S)
     served = bench.store.history.entries()
     first = next(kept for kept in served if kept.entry.kind == "extrinsic")
     assert bench.do("rollback", to=first.sha256[:12]) == "rolled_back"
@@ -268,18 +279,18 @@ def test_a_roll_back_returns_to_any_accepted_calibration(bench: Bench) -> None:
     last = [kept for kept in served if kept.entry.kind == "estimate"][-1]
     assert bench.do("rollback", to=last.entry.window_id) == "rolled_back"
     np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
-    bench.drive(END_S, END_S + 20)
+    bench.drive(DRIVE_END_S, DRIVE_END_S + 20)
     assert bench.health == "healthy"
     assert bench.do("reset") == "reset"
     np.testing.assert_array_equal(bench.pose, NOMINAL)
 
 
-def test_hold_freezes_over_a_restart_until_it_is_released(bench: Bench) -> None:
+def test_hold_freezes_over_a_restart_until_it_is_released(bench: PairBench) -> None:
     bench.drive(BEGIN_S, STEP_S)
     frozen = bench.pose
     assert bench.do("hold") == "held"
     bench.restart()
-    bench.drive(STEP_S, END_S)
+    bench.drive(STEP_S, DRIVE_END_S)
     np.testing.assert_array_equal(bench.pose, frozen)
     assert bench.health == "miscalibrated"
     window_id = bench.entries("estimate")[-1].window_id
@@ -289,7 +300,7 @@ def test_hold_freezes_over_a_restart_until_it_is_released(bench: Bench) -> None:
     np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
 
 
-def test_every_command_is_written_down_but_a_flood_of_refusals_only_once(bench: Bench) -> None:
+def test_every_command_is_written_down_but_a_flood_of_refusals_only_once(bench: PairBench) -> None:
     for _ in range(10):
         bench.do("apply")
     bench.do("hold")
@@ -298,8 +309,8 @@ def test_every_command_is_written_down_but_a_flood_of_refusals_only_once(bench: 
     assert bench.answers.status().commands == {"apply_refused": 10, "hold_accepted": 1}
 
 
-def test_a_red_event_leaves_evidence(bench: Bench) -> None:
-    bench.drive(BEGIN_S, END_S)
+def test_a_red_event_leaves_evidence(bench: PairBench) -> None:
+    bench.drive(BEGIN_S, DRIVE_END_S)
     (event,) = bench.answers.events().events
     assert event.window_before is not None
     assert event.resolution is not None
@@ -307,9 +318,9 @@ def test_a_red_event_leaves_evidence(bench: Bench) -> None:
     assert [reason.code for reason in event.reasons] == ["bent_mount"]
     assert event.overlays == ("before", "after")
     assert event.window_after is not None
-    assert start_ns_of(event.window_before) < STEP_S * S <= start_ns_of(event.window_after)
+    assert start_ns_of(event.window_before) < STEP_S * NS_PER_S <= start_ns_of(event.window_after)
     served = matrix_of(event.camera_from_lidar).tolist()
-    before, after = (job for job in bench.worker.drawn if "poses" in job.body)
+    before, after = (job for job in bench.worker.overlays if "poses" in job.body)
     assert (before.subject, after.subject) == (event.window_before, event.window_after)
     # One place, both extrinsics, the same two on either side: the first is right before, the second after.
     assert before.body["poses"] == after.body["poses"]
@@ -324,8 +335,8 @@ def test_a_red_event_leaves_evidence(bench: Bench) -> None:
     assert whole in bench.store.incidents.events()
 
 
-def test_every_check_can_be_read_afterwards(bench: Bench) -> None:
-    bench.drive(BEGIN_S, END_S)
+def test_every_check_can_be_read_afterwards(bench: PairBench) -> None:
+    bench.drive(BEGIN_S, DRIVE_END_S)
     history = bench.answers.history(0, 2**63 - 1, 1000)
     assert len(history.checks) == bench.answers.status().checks > 20
     states = [check.state for check in history.checks]
@@ -339,7 +350,7 @@ def test_every_check_can_be_read_afterwards(bench: Bench) -> None:
     suspect = next(check for check in history.checks if check.state == "suspect")
     assert (suspect.outcome, suspect.flagged) == ("suspect", True)
     assert suspect.evidence >= alarm_levels(bench.config.pairs[0].monitor).suspect
-    told = bench.answers.history(STEP_S * S, 2**63 - 1, 3).checks
+    told = bench.answers.history(STEP_S * NS_PER_S, 2**63 - 1, 3).checks
     assert told == history.checks[-3:]
     health = bench.answers.health_reply
     assert health.check == history.checks[-1]
@@ -348,7 +359,7 @@ def test_every_check_can_be_read_afterwards(bench: Bench) -> None:
 
 
 @pytest.mark.fault("a monitor that cannot look", "this is reported, and nothing stays green")
-def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: Bench) -> None:
+def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: PairBench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
     assert bench.answers.health_reply.state == "healthy"
     bench.worker.fault = Reason("internal_error", "The program failed (ZeroDivisionError: division by zero).")
@@ -373,7 +384,7 @@ def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: Bench) -> 
         ({"pair": "front", "sensors": {"camera_frame": "other"}}, "the camera other"),
     ],
 )
-def test_a_baseline_of_something_else_is_refused_aloud(bench: Bench, spoilt: dict[str, Any], word: str) -> None:
+def test_a_baseline_of_something_else_is_refused_aloud(bench: PairBench, spoilt: dict[str, Any], word: str) -> None:
     good = replace(
         a_baseline(), config_hash=learned_hash(bench.config.pairs[0].calibration), depth_identity="precomputed"
     )
@@ -388,7 +399,7 @@ def test_a_baseline_of_something_else_is_refused_aloud(bench: Bench, spoilt: dic
     assert bench.answers.health_reply.drift is None
 
 
-def test_a_baseline_of_another_network_is_refused_at_the_first_check(bench: Bench) -> None:
+def test_a_baseline_of_another_network_is_refused_at_the_first_check(bench: PairBench) -> None:
     learned = learned_hash(bench.config.pairs[0].calibration)
     save_baseline(bench.folder / "rig.json", replace(a_baseline(), config_hash=learned))
     bench.restart()
@@ -401,7 +412,7 @@ def test_a_baseline_of_another_network_is_refused_at_the_first_check(bench: Benc
 
 @pytest.mark.fault("bad pictures: dark, blurred, covered", "degraded with the reason; the extrinsic does not move")
 @pytest.mark.parametrize("cause", ["lens_dirty", "camera_frozen", "lidar_beams_lost", "dark"])
-def test_bad_data_are_degraded_with_their_reason_and_move_nothing(bench: Bench, cause: str) -> None:
+def test_bad_data_are_degraded_with_their_reason_and_move_nothing(bench: PairBench, cause: str) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
     bench.worker.cause = cause
     bench.drive(BEGIN_S + 60, STEP_S)
@@ -409,12 +420,12 @@ def test_bad_data_are_degraded_with_their_reason_and_move_nothing(bench: Bench, 
     assert [reason.code for reason in bench.store.state.reasons] == [cause]
     assert bench.answers.events().events == ()
     bench.worker.cause = None
-    bench.drive(STEP_S, END_S)
+    bench.drive(STEP_S, DRIVE_END_S)
     assert bench.health == "healthy"
 
 
 @pytest.mark.fault("a history that was tampered with", "health says so, and it is kept aside")
-def test_a_chain_that_was_tampered_with_is_told_and_kept_aside(bench: Bench) -> None:
+def test_a_chain_that_was_tampered_with_is_told_and_kept_aside(bench: PairBench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 90)
     path = bench.folder / "history-front.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
@@ -432,7 +443,7 @@ def test_a_chain_that_was_tampered_with_is_told_and_kept_aside(bench: Bench) -> 
 
 @pytest.mark.fault("a forged state", "it is never served, and health says so")
 def test_a_forged_state_is_never_served_and_said_in_health(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, STEP_S)
     assert bench.health == "healthy"
     file = StateFile(bench.folder / "state.json")

@@ -9,11 +9,11 @@ import pytest
 
 from coec.calibration.types import Reason
 from coec.runtime.worker.jobs import Kind
-from pair_bench import BEGIN_S, END_S, STEP_S, Bench
+from pair_bench import BEGIN_S, DRIVE_END_S, STEP_S, PairBench
 
 
-def driven(folder: Path, cores: float, cost_s: dict[Kind, float], end_s: int = STEP_S) -> Bench:
-    bench = Bench(folder, cores=cores)
+def driven(folder: Path, cores: float, cost_s: dict[Kind, float], end_s: int = STEP_S) -> PairBench:
+    bench = PairBench(folder, cores=cores)
     bench.worker.cost_s.update(cost_s)
     bench.drive(BEGIN_S, end_s)
     return bench
@@ -33,8 +33,8 @@ def test_a_small_budget_makes_some_of_the_checks_of_a_large_one(tmp_path: Path) 
 def test_a_budget_that_suffices_decides_like_one_without_end(tmp_path: Path) -> None:
     """What work costs changes nothing as long as it can be paid."""
     costs = {Kind.CHECK: 0.7, Kind.SOLVE: 5.0}
-    enough = driven(tmp_path / "enough", 0.5, costs, END_S)
-    free = driven(tmp_path / "free", 64.0, {}, END_S)
+    enough = driven(tmp_path / "enough", 0.5, costs, DRIVE_END_S)
+    free = driven(tmp_path / "free", 64.0, {}, DRIVE_END_S)
     assert enough.worker.checked == free.worker.checked
     assert enough.decisions() == free.decisions()
     assert enough.recorder.stamps == free.recorder.stamps
@@ -46,14 +46,14 @@ def test_a_pair_that_is_not_afforded_is_never_silently_green(tmp_path: Path) -> 
     bench = driven(tmp_path, 0.01, {Kind.CHECK: 2.0}, BEGIN_S + 75)  # a window that is judged at 40 s is as good
     assert len(bench.worker.checked) == 1
     assert bench.losses["monitor", "check_not_afforded"] >= 10
-    bench.pair.decider.look_at_clocks(time.monotonic())
+    bench.pair.manager.check_clocks(time.monotonic())
     health = bench.answers.health_reply
     assert health.state == "degraded"
     assert any(reason.code.startswith("overdue_") for reason in health.reasons), "which one is told by what came"
 
 
 def test_slices_are_longer_where_windows_are_not_all_afforded(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, cores=0.1)
+    bench = PairBench(tmp_path, cores=0.1)
     bench.worker.cost_s[Kind.SOLVE] = 8.0
     bench.drive(STEP_S - 260, STEP_S)
     assert bench.budget.stretch == pytest.approx(2.0)
@@ -66,11 +66,11 @@ def test_a_suspicion_is_told_to_the_budget_until_it_is_over(tmp_path: Path) -> N
     bench = driven(tmp_path, 0.5, {Kind.CHECK: 0.1})
     assert not bench.budget.report().pairs["front"].suspected
     told = set()
-    for second in range(STEP_S, END_S):
+    for second in range(STEP_S, DRIVE_END_S):
         bench.drive(second, second + 1)
         told.add((bench.health, bench.budget.report().pairs["front"].suspected))
     assert ("miscalibrated", True) in told
-    bench.drive(END_S, END_S + 60)
+    bench.drive(DRIVE_END_S, DRIVE_END_S + 60)
     assert bench.health == "healthy"
     assert not bench.budget.report().pairs["front"].suspected
 
@@ -82,6 +82,6 @@ def test_a_check_that_fails_gives_its_turn_back(tmp_path: Path) -> None:
     bench.worker.cost_s[Kind.CHECK] = 0.5
     bench.drive(STEP_S, STEP_S + 60)
     report = bench.budget.report()
-    assert report.pairs["front"].look_s == 0.5
+    assert report.pairs["front"].check_s == 0.5
     assert not report.pairs["front"].waiting
     assert report.in_store_s > 0.0

@@ -21,19 +21,19 @@ from coec.config import AuthorityConfig, UplinkConfig
 from coec.geometry import se3
 from coec.runtime.api import commands, rate_limit
 from coec.runtime.api.authority import Authority
-from coec.runtime.api.last_words import LastWords
-from coec.runtime.api.reception import Reception, Rules
+from coec.runtime.api.last_words import Heartbeats
+from coec.runtime.api.reception import CommandHandler, CommandRules
 from coec.runtime.api.rig import RigAnswers
-from coec.runtime.api.routes import VehicleAnswers
-from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.api.routes import VehicleRoutes
+from coec.runtime.api.snapshots import SerializedReply
 from coec.runtime.api.uplink import Uplink
-from coec.runtime.worker.jobs import Commissioned, Fate, Job, JobOutcome, Kind
+from coec.runtime.worker.jobs import Commissioned, Fate, JobOutcome, Kind, WorkerJob
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
-from pair_bench import BEGIN_S, END_S, STEP_S, Bench, KnowingWorker
+from pair_bench import BEGIN_S, DRIVE_END_S, STEP_S, OracleWorker, PairBench
 
 
 def test_a_roll_back_on_a_commissioned_rig_serves_what_was_served_to_the_byte(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     made = a_baseline()
     bias = np.radians([0.3, -0.2, 0.1, np.nan, np.nan, np.nan])
     commissioned = replace(
@@ -49,7 +49,7 @@ def test_a_roll_back_on_a_commissioned_rig_serves_what_was_served_to_the_byte(tm
     raw = bench.answers.history(0, 2**63 - 1, 10).results[0]
     off = se3.difference(first, np.array(raw.camera_from_lidar.matrix))
     assert np.abs(off[:3]).max() > np.radians(0.2), "the estimator's bias was taken out of what is served"
-    bench.drive(STEP_S, END_S)
+    bench.drive(STEP_S, DRIVE_END_S)
     assert not np.array_equal(bench.pose, first)
     assert bench.do("rollback", to=raw.window_id) == "rolled_back"
     assert bench.pose.tobytes() == first.tobytes()
@@ -76,14 +76,14 @@ ANSWERS = {
 }
 
 
-def brought_to(situation: str, folder: Path) -> Bench:
-    bench = Bench(folder, apply="never" if situation == "pending" else "within_limits")
+def brought_to(situation: str, folder: Path) -> PairBench:
+    bench = PairBench(folder, apply="never" if situation == "pending" else "within_limits")
     if situation != "nothing":
         bench.drive(BEGIN_S, BEGIN_S + 43)
     if situation == "suspect":
         bench.drive(STEP_S, STEP_S + 11)
     if situation in ("corrected", "held", "pending"):
-        bench.drive(BEGIN_S + 43, END_S)
+        bench.drive(BEGIN_S + 43, DRIVE_END_S)
     if situation == "held":
         bench.do("hold")
     if situation == "degraded":
@@ -116,7 +116,7 @@ def test_each_command_in_each_state(tmp_path: Path, situation: str, order: int) 
 
 
 def test_who_holds_it_and_why_is_told_wherever_one_asks_also_after_a_restart(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     assert bench.do("hold", reason="the mirror is being changed") == "held"
     for _ in range(2):
         extrinsic, health = bench.answers.extrinsic_reply, bench.answers.health_reply
@@ -137,25 +137,25 @@ def test_who_holds_it_and_why_is_told_wherever_one_asks_also_after_a_restart(tmp
 
 @pytest.mark.fault("a `calibrate` that is refused as busy", "it changes nothing")
 def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 30)
-    selected = bench.pair.stream.report.chosen.selected
+    selected = bench.pair.stream.report.selection.selected
     assert selected >= 5
     monkeypatch.setattr(commands, "TIMEOUT_S", 0.0)
     told = bench.pair.commands.carry_out("calibrate", {}, "the test")
     assert (told.accepted, told.code) == (False, "busy")
     bench.settle()
-    assert (bench.pair.stream.report.chosen.selected, bench.recorder.recorded) == (selected, 0)
+    assert (bench.pair.stream.report.selection.selected, bench.recorder.recorded) == (selected, 0)
     assert bench.answers.status().commands == {"calibrate_refused": 1}
 
 
 @pytest.mark.fault("more commands than a book of the history holds", "`rollback` and `commission` find what they need")
 def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limit, "BURST", 10_000)
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.config = bench.config.model_copy(update={"state": bench.config.state.model_copy(update={"history": 12})})
     bench.restart()
-    bench.drive(BEGIN_S, END_S)
+    bench.drive(BEGIN_S, DRIVE_END_S)
     results, first = bench.store.history.results(), bench.entries("extrinsic")[0]
     corrected = bench.pose.copy()
     for _ in range(10):
@@ -173,16 +173,16 @@ def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, m
 
 
 def test_windows_that_a_pair_was_commissioned_from_are_kept_for_that_across_a_restart(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 90)
     first, *others = [result.window_id for result in bench.store.history.results()]
     told = JobOutcome(Fate.RESULT, Commissioned(bench.pose, "0123abcd", 1, 10), None, 1.0)
-    bench.pair.decider.commissioned((first,), told)
+    bench.pair.manager.commissioned((first,), told)
     bench.settle()
 
     def kept_for() -> dict[str, str | None]:
-        bench.outside.folder.look()
-        return {info.window_id: info.kept_for for info in bench.outside.folder.listing("front")}
+        bench.context.folder.scan()
+        return {info.window_id: info.kept_for for info in bench.context.folder.listing("front")}
 
     before = kept_for()
     assert before[first] == "commissioning"
@@ -191,28 +191,28 @@ def test_windows_that_a_pair_was_commissioned_from_are_kept_for_that_across_a_re
     assert kept_for() == before
 
 
-class CommissioningWorker(KnowingWorker):
+class CommissioningWorker(OracleWorker):
     """Has a commissioning under way for as long as the test wants."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.jobs: list[Job] = []
+        self.jobs: list[WorkerJob] = []
 
     def commissioning(self, pair: str) -> str | None:
         return "spread 4 of 10" if any(job.pair == pair for job in self.jobs) else None
 
-    def ask(self, job: Job) -> None:
+    def submit(self, job: WorkerJob) -> None:
         if job.kind is Kind.COMMISSION:
             self.jobs.append(job)
         else:
-            super().ask(job)
+            super().submit(job)
 
     def end(self, answer: Commissioned) -> None:
         self.jobs.pop().done(JobOutcome(Fate.RESULT, answer, None, 100.0))
 
 
-def commissioning(folder: Path) -> tuple[Bench, CommissioningWorker]:
-    bench = Bench(folder, worker=CommissioningWorker)
+def commissioning(folder: Path) -> tuple[PairBench, CommissioningWorker]:
+    bench = PairBench(folder, worker=CommissioningWorker)
     bench.drive(BEGIN_S, BEGIN_S + 90)
     assert bench.do("commission") == "commissioning"
     return bench, cast("CommissioningWorker", bench.worker)
@@ -225,7 +225,7 @@ def test_a_pair_is_commissioned_once_at_a_time(tmp_path: Path) -> None:
     assert told == ["commissioning_underway"] * 3
     assert len(worker.jobs) == 1
     assert "(spread 4 of 10)" in bench.entries("command")[-1].text
-    held = bench.outside.folder._held
+    held = bench.context.folder._held
     assert set(held) == {Path(path).stem for path in worker.jobs[0].body["paths"]}, "its windows are not removed"
     worker.end(Commissioned(bench.pose, "0123abcd", 1, 10))
     bench.settle()
@@ -253,7 +253,7 @@ def test_commands_that_come_too_fast_are_answered_and_do_nothing(
 ) -> None:
     # However long they take here, they come at once.
     monkeypatch.setattr(commands, "RateLimit", partial(rate_limit.RateLimit, clock=lambda: 0.0))
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     codes = [bench.do("hold") for _ in range(rate_limit.BURST)]
     assert set(codes) == {"held"}
     before = bench.store.history.entries()
@@ -264,12 +264,14 @@ def test_commands_that_come_too_fast_are_answered_and_do_nothing(
     assert bench.answers.status().commands == {"hold_accepted": rate_limit.BURST, "hold_refused": 5}
 
 
-def route_of(bench: Bench, command: str) -> Route:
+def route_of(bench: PairBench, command: str) -> Route:
     """Who answers the command."""
-    keys, pair, unasked = Keys("coec", "test"), bench.pair, Snapshot(b"", b"")
+    keys, pair, unasked = Keys("coec", "test"), bench.pair, SerializedReply(b"", b"")
     bus = create_autospec(Bus, instance=True)
-    reception = Reception(Rules(Authority(AuthorityConfig(), lambda: None), None), {pair.name: pair.commands})
-    VehicleAnswers(
+    reception = CommandHandler(
+        CommandRules(Authority(AuthorityConfig(), lambda: None), None), {pair.name: pair.commands}
+    )
+    VehicleRoutes(
         keys,
         {pair.name: pair.answers},
         reception,
@@ -277,7 +279,7 @@ def route_of(bench: Bench, command: str) -> Route:
         lambda: b"",
         lambda: unasked,
         RigAnswers(keys, lambda *_: None),
-        LastWords(keys, "0", UplinkConfig(), lambda *_: None),
+        Heartbeats(keys, "0", UplinkConfig(), lambda *_: None),
         Uplink(UplinkConfig()),
     ).declare(bus)
     finders = {call.args[0]: call.args[1] for call in bus.serve.call_args_list}
@@ -289,9 +291,9 @@ def route_of(bench: Bench, command: str) -> Route:
 @pytest.mark.fault("a command whose sender has given up", "it is not done")
 @pytest.mark.parametrize("name", ["hold", "calibrate"])
 def test_what_its_sender_has_given_up_on_is_not_done(tmp_path: Path, name: str) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 30)
-    selected, entries = bench.pair.stream.report.chosen.selected, len(bench.entries("command"))
+    selected, entries = bench.pair.stream.report.selection.selected, len(bench.entries("command"))
     route = route_of(bench, name)
     came_s = time.monotonic() - COMMAND_TIMEOUT_MS / 1e3
     for parameters, received_s in (("", came_s), ("timeout_ms=500", time.monotonic() - 0.5), ("timeout_ms=20", None)):
@@ -300,7 +302,7 @@ def test_what_its_sender_has_given_up_on_is_not_done(tmp_path: Path, name: str) 
         assert (json.loads(answer.payload)["accepted"], json.loads(answer.payload)["code"]) == (False, "expired")
     bench.settle()
     assert bench.store.state.hold is None
-    assert (bench.pair.stream.report.chosen.selected, bench.recorder.recorded) == (selected, 0)
+    assert (bench.pair.stream.report.selection.selected, bench.recorder.recorded) == (selected, 0)
     assert len(bench.entries("command")) == entries
     assert bench.answers.status().commands == {f"{name}_refused": 3}
     assert bench.do("hold") == "held", "the next is done"

@@ -18,16 +18,16 @@ import numpy as np
 import pytest
 
 from coec.calibration.frames.pairing import MOTION_LATE_NS
-from coec.calibration.frames.window import SliceEnded
+from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4
 from coec.config import LimitsConfig
-from coec.runtime.worker.jobs import Job, Kind
+from coec.runtime.worker.jobs import Kind, WorkerJob
 from coec.runtime.worker.messages import unpack_pairs
-from pair_bench import BEGIN_S, END_S, Bench, KnowingWorker, S, SlowWorker, pair_at
+from pair_bench import BEGIN_S, DRIVE_END_S, NS_PER_S, OracleWorker, PairBench, SlowWorker, frame_pair_at
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 
-MOTION_NS = S // 10
+MOTION_NS = NS_PER_S // 10
 PARKED_S = (BEGIN_S + 30, BEGIN_S + 75)
 """Nothing is sent between these: the first slice ends meanwhile, and its window corrects what is served."""
 
@@ -59,15 +59,15 @@ def streams() -> dict[str, deque[Frame]]:
     """Of a drive on which the mount moves, and the vehicle is parked for a while."""
     stamps = [
         stamp_ns
-        for stamp_ns in range(BEGIN_S * S, END_S * S, S // 2)
-        if not PARKED_S[0] * S <= stamp_ns < PARKED_S[1] * S
+        for stamp_ns in range(BEGIN_S * NS_PER_S, DRIVE_END_S * NS_PER_S, NS_PER_S // 2)
+        if not PARKED_S[0] * NS_PER_S <= stamp_ns < PARKED_S[1] * NS_PER_S
     ]
-    pairs = [pair_at(stamp_ns) for stamp_ns in stamps]
-    ends = ((BEGIN_S, PARKED_S[0]), (PARKED_S[1], END_S))
+    pairs = [frame_pair_at(stamp_ns) for stamp_ns in stamps]
+    ends = ((BEGIN_S, PARKED_S[0]), (PARKED_S[1], DRIVE_END_S))
     motions = [
         EgoMotion(stamp_ns + 7_000_000, "ego", (5.0 + (stamp_ns // MOTION_NS) % 7, 0.0, 0.0), (0.0, 0.0, 0.01))
         for begin_s, end_s in ends
-        for stamp_ns in range(begin_s * S, end_s * S, MOTION_NS)
+        for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, MOTION_NS)
     ]
     return {
         "camera": deque(pair.camera for pair in pairs),
@@ -79,14 +79,14 @@ def streams() -> dict[str, deque[Frame]]:
 class Watched:
     """A pair, and everything that its stream makes of the frames, in order."""
 
-    def __init__(self, folder: Path, worker: type[KnowingWorker]) -> None:
-        self.bench = Bench(folder, worker=worker)
+    def __init__(self, folder: Path, worker: type[OracleWorker]) -> None:
+        self.bench = PairBench(folder, worker=worker)
         self.looked: list[Any] = []
         self.windows: list[Any] = []
         self.checks: list[Any] = []
         bench = self.bench
-        bench.recorder.sees_knocks = True
-        choose, add, end, ask = bench.pair._chooser.choose, bench.recorder.add, bench.recorder.end, bench.worker.ask
+        bench.recorder.sees_moves = True
+        choose, add, end, ask = bench.pair._selector.choose, bench.recorder.add, bench.recorder.end, bench.worker.submit
 
         def chosen(pair: FramePair) -> None:
             self.looked.append((pair.camera.stamp_ns, pair.lidar.stamp_ns, pair.motion))
@@ -96,19 +96,19 @@ class Watched:
             self.windows.append((window_id, pair.stamp_ns, T_camera_lidar.tobytes()))
             add(window_id, pair, T_camera_lidar)
 
-        def finished(ended: SliceEnded) -> None:
-            self.windows.append(ended)
-            end(ended)
+        def finished(slice_end: SliceClosed) -> None:
+            self.windows.append(slice_end)
+            end(slice_end)
 
-        def asked(job: Job) -> None:
+        def asked(job: WorkerJob) -> None:
             if job.kind is Kind.CHECK:
                 pairs = unpack_pairs(job.body["frames"], LimitsConfig())
                 self.checks.append((job.body["pose"], [(pair.stamp_ns, pair.motion) for pair in pairs]))
             ask(job)
 
-        bench.pair._chooser.choose = chosen  # type: ignore[method-assign]
+        bench.pair._selector.choose = chosen  # type: ignore[method-assign]
         bench.recorder.add, bench.recorder.end = added, finished  # type: ignore[method-assign]
-        bench.worker.ask = asked  # type: ignore[method-assign]
+        bench.worker.submit = asked  # type: ignore[method-assign]
 
     def push(self, frame: Frame) -> None:
         self.bench.pair.stream.push(frame)
@@ -145,7 +145,7 @@ class Watched:
 
 
 def undisturbed(folder: Path) -> dict[str, Any]:
-    watched = Watched(folder, KnowingWorker)
+    watched = Watched(folder, OracleWorker)
     for frame in sorted(chain(*streams().values()), key=lambda frame: frame.stamp_ns):
         watched.push(frame)
     watched.finish()
@@ -158,13 +158,13 @@ def may_come(stream: str, waiting: dict[str, deque[Frame]]) -> bool:
         return False
     stamp_ns = waiting[stream][0].stamp_ns
     others = {name: frames[0].stamp_ns for name, frames in waiting.items() if name != stream and frames}
-    if any(stamp_ns > other_ns + 20 * S for other_ns in others.values()):
+    if any(stamp_ns > other_ns + 20 * NS_PER_S for other_ns in others.values()):
         return False  # what was sent before the vehicle was parked has come
     if stream == "ego":
         return True
-    if "ego" in others and stamp_ns - others["ego"] > MOTION_LATE_NS - S // 2:
+    if "ego" in others and stamp_ns - others["ego"] > MOTION_LATE_NS - NS_PER_S // 2:
         return False
-    return all(stamp_ns - others[name] <= AHEAD * S // 2 for name in ("camera", "lidar") if name in others)
+    return all(stamp_ns - others[name] <= AHEAD * NS_PER_S // 2 for name in ("camera", "lidar") if name in others)
 
 
 def disturbed(folder: Path, seed: int, clock: Clock) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def disturbed(folder: Path, seed: int, clock: Clock) -> dict[str, Any]:
         allowed = [name for name in waiting if may_come(name, waiting)]
         name = favourite if favourite in allowed else str(rng.choice(allowed))
         frame = waiting[name].popleft()
-        if frame.stamp_ns - last_ns > 30 * S and last_ns:
+        if frame.stamp_ns - last_ns > 30 * NS_PER_S and last_ns:
             wait_in_silence(watched, clock)
         last_ns = max(last_ns, frame.stamp_ns)
         clock.now_s += rng.exponential(0.05)
@@ -190,7 +190,7 @@ def disturbed(folder: Path, seed: int, clock: Clock) -> dict[str, Any]:
             bench.worker.work(share=1.0)
             bench.settle()
             clock.now_s += STALL_S
-            bench.pair.decider.look_at_clocks(clock.now_s)
+            bench.pair.manager.check_clocks(clock.now_s)
         watched.push(frame)
         stream.tick(waiting=False)
     watched.finish()
@@ -207,7 +207,7 @@ def wait_in_silence(watched: Watched, clock: Clock) -> None:
         bench.worker.work(share=0.5)
         bench.settle()
         bench.pair.stream.tick(waiting=False)
-    assert isinstance(watched.windows[-1], SliceEnded), "silence ends the slice"
+    assert isinstance(watched.windows[-1], SliceClosed), "silence ends the slice"
 
 
 @pytest.mark.fault(

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from coec.calibration.types import Reason
-from pair_bench import BEGIN_S, STEP_S, Bench, S, SlowWorker, pair_at
+from pair_bench import BEGIN_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path / "state")
+def bench(tmp_path: Path) -> PairBench:
+    return PairBench(tmp_path / "state")
 
 
-def test_a_drive_played_three_times_is_looked_at_each_time(bench: Bench) -> None:
+def test_a_drive_played_three_times_is_looked_at_each_time(bench: PairBench) -> None:
     for turn in range(3):
         bench.drive(BEGIN_S, BEGIN_S + 60)
         assert bench.health == "healthy"
@@ -30,7 +30,7 @@ def test_a_drive_played_three_times_is_looked_at_each_time(bench: Bench) -> None
 
 
 @pytest.mark.fault("stamps an hour ahead, then back", "the old time goes on at once")
-def test_after_stamps_an_hour_ahead_the_old_time_goes_on_at_once(bench: Bench) -> None:
+def test_after_stamps_an_hour_ahead_the_old_time_goes_on_at_once(bench: PairBench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 30)
     bench.drive(BEGIN_S + 3600, BEGIN_S + 3660)
     before = bench.answers.status().checks
@@ -40,7 +40,7 @@ def test_after_stamps_an_hour_ahead_the_old_time_goes_on_at_once(bench: Bench) -
 
 
 def test_a_worker_that_takes_its_time_while_time_steps_back_is_awaited_and_holds_up_nothing(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state", worker=SlowWorker)
+    bench = PairBench(tmp_path / "state", worker=SlowWorker)
     assert isinstance(bench.worker, SlowWorker)
 
     def catch_up() -> None:
@@ -50,7 +50,7 @@ def test_a_worker_that_takes_its_time_while_time_steps_back_is_awaited_and_holds
 
     bench.drive(BEGIN_S, BEGIN_S + 60)
     catch_up()
-    bench.pair.stream.take([pair_at(half_s * S // 2) for half_s in range(2 * BEGIN_S, 2 * BEGIN_S + 60)])
+    bench.pair.stream.take([frame_pair_at(half_s * NS_PER_S // 2) for half_s in range(2 * BEGIN_S, 2 * BEGIN_S + 60)])
     catch_up()
     assert len(bench.pair.stream._held) == 0
     assert ("monitor", "not_awaited") not in bench.losses
@@ -58,7 +58,7 @@ def test_a_worker_that_takes_its_time_while_time_steps_back_is_awaited_and_holds
 
 
 @pytest.mark.fault("the mount moves while the vehicle stands", "not green three periods later, and red once it drives")
-def test_a_mount_that_moves_while_the_vehicle_stands(bench: Bench) -> None:
+def test_a_mount_that_moves_while_the_vehicle_stands(bench: PairBench) -> None:
     bench.drive(BEGIN_S, STEP_S - 40)
     bench.drive(STEP_S - 40, STEP_S, speed_mps=0.0)
     assert bench.health == "healthy"
@@ -76,7 +76,7 @@ def test_a_mount_that_moves_while_the_vehicle_stands(bench: Bench) -> None:
 @pytest.mark.fault(
     "the mount was moved while the service was off, and the vehicle stands", "it is never called healthy"
 )
-def test_a_mount_that_was_moved_before_a_start_at_a_standstill(bench: Bench) -> None:
+def test_a_mount_that_was_moved_before_a_start_at_a_standstill(bench: PairBench) -> None:
     bench.drive(BEGIN_S, STEP_S - 10)
     assert bench.health == "healthy"
     bench.restart()
@@ -87,7 +87,7 @@ def test_a_mount_that_was_moved_before_a_start_at_a_standstill(bench: Bench) -> 
 
 
 @pytest.mark.fault("windows that come to nothing", "after three in a row, health says so")
-def test_a_window_that_is_lost_is_answered_for_and_three_in_a_row_are_said(bench: Bench) -> None:
+def test_a_window_that_is_lost_is_answered_for_and_three_in_a_row_are_said(bench: PairBench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 45)
     bench.recorder.loses = True
     bench.drive(BEGIN_S + 45, BEGIN_S + 90)
@@ -100,7 +100,7 @@ def test_a_window_that_is_lost_is_answered_for_and_three_in_a_row_are_said(bench
     assert bench.answers.health_reply.state == "healthy"
 
 
-def test_a_window_that_comes_to_nothing_is_no_check(bench: Bench) -> None:
+def test_a_window_that_comes_to_nothing_is_no_check(bench: PairBench) -> None:
     bench.worker.window_fault = Reason("worker_failed", "The worker failed on this window 2 times.")
     bench.worker.fault = Reason("bad_model", "no network")
     bench.drive(BEGIN_S, BEGIN_S + 60)
@@ -110,16 +110,16 @@ def test_a_window_that_comes_to_nothing_is_no_check(bench: Bench) -> None:
 
 @pytest.mark.fault("checks that never complete, for whatever reason", "after three periods nothing is green")
 def test_without_a_completed_check_in_three_periods_nothing_is_green(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: PairBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
     assert bench.answers.health_reply.state == "healthy"
-    bench.pair.decider.look_at_clocks(time.monotonic() + 16.0)
+    bench.pair.manager.check_clocks(time.monotonic() + 16.0)
     told = bench.answers.health_reply
     assert (told.state, told.level) == ("degraded", 1)
     assert [reason.code for reason in told.reasons] == ["overdue_data", "last_known"]
     assert "no camera frames come" in told.reasons[0].text
-    bench.pair.decider.look_at_clocks(time.monotonic() + 601.0)
+    bench.pair.manager.check_clocks(time.monotonic() + 601.0)
     assert bench.health == "stale"
     bench.drive(BEGIN_S + 60, BEGIN_S + 72)
     assert bench.answers.health_reply.state == "healthy"
@@ -132,11 +132,13 @@ def test_without_a_completed_check_in_three_periods_nothing_is_green(
 
 @pytest.mark.fault("a state from the future", "it is not green")
 @pytest.mark.parametrize("setback_s", [400 * 86_400, -100 * 86_400, -3600])
-def test_a_state_from_another_time_is_not_green(bench: Bench, monkeypatch: pytest.MonkeyPatch, setback_s: int) -> None:
+def test_a_state_from_another_time_is_not_green(
+    bench: PairBench, monkeypatch: pytest.MonkeyPatch, setback_s: int
+) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
     bench.store.save()
     now_ns = time.time_ns()
-    monkeypatch.setattr(time, "time_ns", lambda: now_ns - setback_s * S)
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns - setback_s * NS_PER_S)
     bench.restart()
     told = bench.answers.health_reply
     assert told.state == "unknown"

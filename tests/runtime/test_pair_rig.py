@@ -12,8 +12,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from coec.adapters.files.scribe import Scribe
-from coec.adapters.zenoh.ros_topics import Topics
+from coec.adapters.files.scribe import DiskWriter
+from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.calibration.lifecycle import HealthState
 from coec.config import Config
 from coec.errors import NotFoundError
@@ -24,23 +24,32 @@ from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.inbox import Call
 from coec.runtime.ingest.intake import Intake
-from coec.runtime.outside import Outside
+from coec.runtime.outside import VehicleContext
 from coec.runtime.pair import Pair
 from coec.runtime.recording.window_store import WindowStore
-from coec.runtime.rig.keeper import RigKeeper
-from coec.runtime.worker.jobs import Checked, Job
+from coec.runtime.rig.keeper import RigEstimatorThread
+from coec.runtime.worker.jobs import Checked, WorkerJob
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.base import to_json
 from coec.schemas.keys import Keys
 from coec.schemas.replies import Acknowledgement, HistoryEntry
 from coec.schemas.rig_state import RigReply
-from pair_bench import AFTER, STEP_S, InstantRecorder, InstantScribe, KnowingWorker, S, configuration, pair_at
+from pair_bench import (
+    AFTER,
+    NS_PER_S,
+    STEP_S,
+    InstantDiskWriter,
+    InstantRecorder,
+    OracleWorker,
+    frame_pair_at,
+    pair_configuration,
+)
 
 CAMERAS = ("front", "left", "rear")
 
 
 def _configuration(folder: Path, apply: str) -> Config:
-    config = configuration(folder, apply)
+    config = pair_configuration(folder, apply)
     (pair,) = config.pairs
     lidar = pair.lidar.model_copy(update={"name": "roof"})
     cameras = [pair.camera.model_copy(update={"name": name, "key": f"in/{name}"}) for name in CAMERAS]
@@ -48,10 +57,10 @@ def _configuration(folder: Path, apply: str) -> Config:
     return config.model_copy(update={"pairs": tuple(pairs)})
 
 
-class DimWorker(KnowingWorker):
+class DimWorker(OracleWorker):
     """Sees in a window what no check shows it."""
 
-    def _check(self, job: Job) -> Checked:
+    def _check(self, job: WorkerJob) -> Checked:
         checked = super()._check(job)
         vague = np.full(6, 0.2)
         said = replace(checked.observation, offset=np.zeros(6), sigma=vague, noise=vague, flagged=False)
@@ -68,11 +77,11 @@ class RigBench:
         self.rng = random.Random(seed)
         self.intake = Intake(config.limits)
         self.keys = Keys("coec", config.vehicle)
-        scribe: Scribe = InstantScribe(folder)
-        self.rig = RigKeeper(folder, (), scribe)
+        scribe: DiskWriter = InstantDiskWriter(folder)
+        self.rig = RigEstimatorThread(folder, (), scribe)
         self.answers = RigAnswers(self.keys, lambda *_: None)
         windows = WindowStore(folder / "windows", config.state)
-        outside = Outside(
+        outside = VehicleContext(
             self.keys,
             self.intake,
             StateStore(folder, config.vehicle),
@@ -84,25 +93,25 @@ class RigBench:
             lambda *_: None,
             lambda: (),
             lambda *_: None,
-            Topics,
-            rig_troubles=self.answers.troubles,
+            RosTopicList,
+            rig_problems=self.answers.problems,
         )
         self.pairs: dict[str, Pair] = {}
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)
             for pair in config.pairs:
-                worker = DimWorker() if pair.name == dim else KnowingWorker()
+                worker = DimWorker() if pair.name == dim else OracleWorker()
                 object.__setattr__(outside, "worker", worker)
                 self.pairs[pair.name] = Pair(pair, config, outside)
                 cast("InstantRecorder", self.pairs[pair.name].recorder).worker = worker
-        self.rig.listen(self.answers.hear, lambda: None)
+        self.rig.connect(self.answers.on_update, lambda: None)
         self.settle()
 
     def drive(self, begin_s: int, end_s: int) -> None:
         """Pairs of frames, twice a second, of each pair in turn; each is settled some time later."""
-        for stamp_ns in range(begin_s * S, end_s * S, S // 2):
+        for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, NS_PER_S // 2):
             for name in self.rng.sample(CAMERAS, 3):
-                self.pairs[name].stream.take([pair_at(stamp_ns)])
+                self.pairs[name].stream.take([frame_pair_at(stamp_ns)])
                 if self.rng.random() < 0.7:
                     self.settle()
         self.settle()
@@ -118,8 +127,8 @@ class RigBench:
             for name in self.rng.sample(CAMERAS, 3):
                 pair = self.pairs[name]
                 going |= pair.stream.choose_next()
-                pair.stream.tell()
-                going |= pair.decider.work(0.0)
+                pair.stream.renew_report()
+                going |= pair.manager.work(0.0)
                 if self.rng.random() < 0.5:
                     going |= self.rig.work(0.0)
             going |= self.rig.work(0.0)
@@ -182,7 +191,7 @@ def test_a_knocked_lidar_is_corrected_once_for_all_pairs_and_the_same_in_a_repla
     again.drive(STEP_S - 45, STEP_S + 65)
     assert again.told() == bench.told()
     assert again.decisions() == bench.decisions()
-    record_property("figure", f"{(reply.correction.stamp_ns / S) - STEP_S:.0f} s after the knock")
+    record_property("figure", f"{(reply.correction.stamp_ns / NS_PER_S) - STEP_S:.0f} s after the knock")
 
 
 SLICE_S = 120.0
@@ -205,7 +214,7 @@ def test_a_pair_that_suspects_nothing_has_its_window_as_soon_as_its_sensor_is_na
     correction = bench.reply.correction
     assert correction is not None
     assert set(correction.pairs) == set(CAMERAS)
-    came_s = correction.stamp_ns / S - STEP_S
+    came_s = correction.stamp_ns / NS_PER_S - STEP_S
     record_property("figure", f"{came_s:.0f} s after the knock")
     assert came_s < 60.0
     again = RigBench(tmp_path / "two", 1, config, dim="rear")

@@ -14,22 +14,22 @@ from coec.config import IDENTITY, Config, PairConfig, WindowConfig
 from coec.errors import ConfigError
 from coec.runtime.nominal.kept import completed
 from coec.runtime.reload import RELOADED, Reload, reload_of, settings_hash
-from coec.runtime.worker.jobs import Job, Kind
-from pair_bench import BEGIN_S, Bench, KnowingWorker, configuration
+from coec.runtime.worker.jobs import Kind, WorkerJob
+from pair_bench import BEGIN_S, OracleWorker, PairBench, pair_configuration
 
 INTRINSICS = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0}
 
 
 @dataclass
-class Attentive(KnowingWorker):
+class Attentive(OracleWorker):
     """Remembers by which settings it was to check."""
 
     asked: list[Any] = field(default_factory=list)
 
-    def ask(self, job: Job) -> None:
+    def submit(self, job: WorkerJob) -> None:
         if job.kind is Kind.CHECK:
             self.asked.append(job.body["configuration"])
-        super().ask(job)
+        super().submit(job)
 
 
 def changed(config: Config, **places: Any) -> Config:
@@ -48,14 +48,14 @@ def reloaded(config: Config, **places: Any) -> Reload:
     return reload_of(config, changed(config, **places))
 
 
-def use(bench: Bench, fresh: Reload) -> None:
+def use(bench: PairBench, fresh: Reload) -> None:
     (pair,) = fresh.config.pairs
-    bench.pair.use(pair, fresh.config.stale_after_s, "The test.")
+    bench.pair.reconfigure(pair, fresh.config.stale_after_s, "The test.")
     bench.settle()
 
 
 def test_nothing_that_differs_changes_nothing(tmp_path: Path) -> None:
-    config = configuration(tmp_path)
+    config = pair_configuration(tmp_path)
     assert reloaded(config) == Reload(config, (), ())
 
 
@@ -82,7 +82,7 @@ def test_a_pair_that_was_found_is_compared_as_it_was_found_and_one_that_is_await
 
 
 def test_what_can_be_taken_is_and_the_rest_waits(tmp_path: Path) -> None:
-    config = configuration(tmp_path)
+    config = pair_configuration(tmp_path)
     fresh = reloaded(
         config,
         log__level="debug",
@@ -125,7 +125,7 @@ def test_what_can_be_taken_is_and_the_rest_waits(tmp_path: Path) -> None:
 
 
 def test_pairs_that_come_and_go_wait(tmp_path: Path) -> None:
-    config = configuration(tmp_path)
+    config = pair_configuration(tmp_path)
     (front,) = config.pairs
     dotted = front.model_copy(update={"name": "a.policy.b"})
     two = config.model_copy(update={"pairs": (dotted, front)})
@@ -138,7 +138,7 @@ def test_pairs_that_come_and_go_wait(tmp_path: Path) -> None:
 
 @pytest.mark.fault("SIGHUP with a configuration that could not be started with", "refused as a whole, nothing changes")
 def test_what_could_not_be_started_with_is_refused_as_a_whole(tmp_path: Path) -> None:
-    config = configuration(tmp_path)
+    config = pair_configuration(tmp_path)
     for places in (
         {"zenoh__connect": ["tcp/nowhere"]},
         {"pairs__0__camera__mask": str(tmp_path / "none.png")},
@@ -154,7 +154,7 @@ def test_every_declared_place_is_one(tmp_path: Path) -> None:
             return [names]
         return [one for name, below in value.items() for one in places(below, (*names, name))]
 
-    document = configuration(tmp_path).model_dump()
+    document = pair_configuration(tmp_path).model_dump()
     document["pairs"] = {"front": document["pairs"][0]}
     known = places(document, ())
     for pattern in RELOADED:
@@ -164,30 +164,30 @@ def test_every_declared_place_is_one(tmp_path: Path) -> None:
 
 
 def test_a_policy_holds_from_the_next_answer_on(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     use(bench, reloaded(bench.config, pairs__0__policy__apply="never"))
     bench.drive(BEGIN_S, BEGIN_S + 60)
     state = bench.store.state
     assert state.pending is not None, "an estimate came, and waits for a person"
     (entry,) = (one for one in bench.entries("command") if one.text.startswith("reload"))
     assert (entry.code, entry.sender) == ("reloaded", "SIGHUP")
-    same = Bench(tmp_path / "other")
+    same = PairBench(tmp_path / "other")
     same.drive(BEGIN_S, BEGIN_S + 60)
     assert same.store.state.pending is None, "as it would have been applied otherwise"
 
 
 def test_the_length_of_windows_holds_from_the_next_slice_on(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 10)
-    end_ns = bench.pair._chooser.slice_end_ns
+    end_ns = bench.pair._selector.slice_end_ns
     use(bench, reloaded(bench.config, pairs__0__window__slice_s=20.0, pairs__0__window__min_pairs=6))
-    assert bench.pair._chooser.slice_end_ns == end_ns, "the open one ends as it began"
+    assert bench.pair._selector.slice_end_ns == end_ns, "the open one ends as it began"
     bench.drive(BEGIN_S + 10, BEGIN_S + 45)
-    assert bench.pair._chooser.slice_end_ns == (BEGIN_S + 60) * 10**9, "the next one has its own length"
+    assert bench.pair._selector.slice_end_ns == (BEGIN_S + 60) * 10**9, "the next one has its own length"
 
 
 def test_checks_and_windows_say_by_which_settings(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state", worker=Attentive)
+    bench = PairBench(tmp_path / "state", worker=Attentive)
     before = bench.recorder.plan.metadata["settings_hash"]
     fresh = reloaded(bench.config, pairs__0__calibration__verdict__min_overlap=0.25)
     use(bench, fresh)

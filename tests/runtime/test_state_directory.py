@@ -13,13 +13,13 @@ import pytest
 
 from baselines import a_baseline
 from coec.adapters.files.baseline_file import BASELINES, load_baseline, save_baseline
-from coec.adapters.files.scribe import Scribe
+from coec.adapters.files.scribe import DiskWriter
 from coec.daemon.state_folder import locked
 from coec.errors import ConfigError, UnavailableError
 from coec.runtime.decisions.rig_baseline import RigBaseline
-from coec.runtime.rig.rig_file import FILE as RIG_FILE
+from coec.runtime.rig.rig_file import RIG_FILE as RIG_FILE
 from fakes import wait_until
-from pair_bench import BEGIN_S, END_S, RIG, STEP_S, Bench, configuration
+from pair_bench import BEGIN_S, DRIVE_END_S, PAIR_RIG, STEP_S, PairBench, pair_configuration
 
 
 def books(folder: Path) -> dict[str, int]:
@@ -41,7 +41,7 @@ def remove(folder: Path, how: str) -> None:
 @pytest.mark.fault("`rm -rf` of the state directory under the running service", "the next write completes all books")
 @pytest.mark.parametrize("how", ["made again", "content"])
 def test_books_that_somebody_removed_are_written_again_from_memory(tmp_path: Path, how: str) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, STEP_S + 60)
     before, entries = books(bench.folder), bench.store.history.entries()
     assert len(before) > 5
@@ -73,18 +73,18 @@ def test_books_that_somebody_removed_are_written_again_from_memory(tmp_path: Pat
 
 @pytest.mark.fault("the state directory is gone", "commands are acknowledged as not durable; `health` says why")
 def test_without_a_state_directory_nothing_counts_as_written(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "state")
+    bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 20)
     remove(bench.folder, "gone")
     told = bench.acknowledged("hold")
     assert (told.code, told.durable) == ("held", False)
-    trouble = bench.outside.scribe.trouble
+    trouble = bench.context.disk_writer.problem
     assert trouble is not None
     assert trouble.code == "disk_failing"
     bench.folder.mkdir()
     told = bench.acknowledged("hold", release=True)
     assert (told.code, told.durable) == ("released", True)
-    assert bench.outside.scribe.trouble is None
+    assert bench.context.disk_writer.problem is None
     bench.restart()
     assert [entry.code for entry in bench.entries("command")][-2:] == ["held", "released"]
 
@@ -101,16 +101,16 @@ def test_the_scribe_notices_by_itself_that_the_folder_is_another_one(tmp_path: P
             self.written += 1
 
     first, last = Book(), Book()
-    scribe = Scribe(folder)
-    scribe.keep(last, first)
-    scribe.keep(last)
+    scribe = DiskWriter(folder)
+    scribe.register(last, first)
+    scribe.register(last)
     scribe.on_replaced(told.append)
-    scribe.look()
+    scribe.check_folder()
     scribe.write_due()
     assert (first.written, last.written, scribe.has_written()) == (0, 0, True)
     for time in (1, 2):
         remove(folder, "made again")
-        scribe.look()
+        scribe.check_folder()
         assert not scribe.has_written()
         scribe.write_due()
         assert (first.written, last.written, scribe.has_written(), len(told)) == (time, time, True, time)
@@ -128,7 +128,7 @@ def test_what_is_written_while_the_folder_is_replaced_is_written_again(tmp_path:
                 (tmp_path / "done").touch()
                 remove(folder, "made again")
 
-    scribe = Scribe(folder)
+    scribe = DiskWriter(folder)
     scribe.write(Book())
     scribe.write_due()
     assert not (folder / "book").exists()
@@ -147,8 +147,8 @@ def test_a_thread_writes_them_again_soon(tmp_path: Path, monkeypatch: pytest.Mon
         def flush(self) -> None:
             written.set()
 
-    scribe = Scribe(folder)
-    scribe.keep(Book())
+    scribe = DiskWriter(folder)
+    scribe.register(Book())
     scribe.thread.start()
     try:
         remove(folder, "made again")
@@ -159,9 +159,9 @@ def test_a_thread_writes_them_again_soon(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_baseline_that_somebody_removed_is_written_again(tmp_path: Path) -> None:
-    config = configuration(tmp_path)
+    config = pair_configuration(tmp_path)
     save_baseline(tmp_path / BASELINES, a_baseline())
-    baseline = RigBaseline(config.pairs[0], RIG, config.state)
+    baseline = RigBaseline(config.pairs[0], PAIR_RIG, config.state)
     before = (tmp_path / BASELINES).read_bytes()
     (tmp_path / BASELINES).unlink()
     baseline.flush()
@@ -223,9 +223,9 @@ def open_to_others(folder: Path) -> list[str]:
 @pytest.mark.usefixtures("no_umask")
 def test_no_book_is_open_to_other_users(tmp_path: Path) -> None:
     with locked(tmp_path / "state"):
-        bench = Bench(tmp_path / "state")
+        bench = PairBench(tmp_path / "state")
         save_baseline(bench.folder / BASELINES, a_baseline())
-        bench.drive(BEGIN_S, END_S)
+        bench.drive(BEGIN_S, DRIVE_END_S)
         found = books(bench.folder)
         assert {"lock", "state.json", "state.json.previous", BASELINES, "history-front.jsonl"} <= set(found)
         assert any(name.startswith("evidence/") for name in found)

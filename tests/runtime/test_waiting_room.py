@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import Input, Sample
+from coec.adapters.zenoh.inputs import InputSample, StreamInput
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.calibration.types import Reason
 from coec.config import AnyStreamConfig, Config, PairConfig, config_of
 from coec.errors import ConfigError
-from coec.runtime.nominal.findings import Found
-from coec.runtime.nominal.watch import NominalWatch
-from coec.runtime.waiting_room import WaitingRoom
+from coec.runtime.nominal.findings import DiscoveredPair
+from coec.runtime.nominal.watch import DiscoveryListener
+from coec.runtime.waiting_room import PendingPairs
 from fakes import wait_until
-from pair_bench import Bench
+from pair_bench import PairBench
 from runtime.waiting import CAMERA, INFO, POINTS, SAMPLES, T_CAMERA_LIDAR, TF_STATIC, World, configured
 
 
@@ -29,12 +29,12 @@ class Line:
     """A bus and its vehicle: who listens to a topic hears what is put there."""
 
     def __init__(self) -> None:
-        self.heard: dict[str, Callable[[Sample], None]] = {}
+        self.heard: dict[str, Callable[[InputSample], None]] = {}
         self.latched: list[str] = []
         self.subscribed: list[str] = []
         self.ended: list[str] = []
 
-    def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
+    def subscribe(self, stream: StreamInput, on_sample: Callable[[InputSample], None]) -> Callable[[], None]:
         (topic,) = stream.expressions
         self.heard[topic] = on_sample
         self.subscribed.append(topic)
@@ -45,17 +45,17 @@ class Line:
 
         return end
 
-    def subscribe_latched(self, stream: Input, on_sample: Callable[[Sample], None]) -> None:
+    def subscribe_latched(self, stream: StreamInput, on_sample: Callable[[InputSample], None]) -> None:
         self.subscribe(stream, on_sample)
         self.latched += stream.expressions
 
-    def input_of(self, stream: AnyStreamConfig) -> Input:
+    def input_of(self, stream: AnyStreamConfig) -> StreamInput:
         return self.input_of_info(stream.place)
 
-    def input_of_info(self, topic: str) -> Input:
-        return Input((topic,), lambda _: Sample(b"", ""))
+    def input_of_info(self, topic: str) -> StreamInput:
+        return StreamInput((topic,), lambda _: InputSample(b"", ""))
 
-    def input_of_static_transforms(self) -> Input:
+    def input_of_static_transforms(self) -> StreamInput:
         return self.input_of_info(TF_STATIC)
 
     def put(self, *topics: str) -> None:
@@ -70,8 +70,8 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
-def opened(stack: ExitStack, config: Config, folder: Path) -> tuple[WaitingRoom, Line, World]:
-    room, line = WaitingRoom(config, folder), Line()
+def opened(stack: ExitStack, config: Config, folder: Path) -> tuple[PendingPairs, Line, World]:
+    room, line = PendingPairs(config, folder), Line()
     world = World(folder, room.nominal)
     room.open(room.complete(config), world.outside)
     room.listen(cast("Bus", line), cast("RosSide", line))
@@ -81,12 +81,12 @@ def opened(stack: ExitStack, config: Config, folder: Path) -> tuple[WaitingRoom,
     return room, line, world
 
 
-def found(room: WaitingRoom) -> dict[str, PairConfig]:
+def found(room: PendingPairs) -> dict[str, PairConfig]:
     """Of the first hand-over."""
     handed: list[dict[str, PairConfig]] = []
 
     def comes() -> bool:
-        handed.append(room.found())
+        handed.append(room.pop_discovered())
         return bool(handed[-1])
 
     wait_until(comes, "the pair is found")
@@ -101,7 +101,7 @@ def test_where_nobody_is_awaited_nothing_is_listened_to(stack: ExitStack, tmp_pa
     document = configured(tmp_path).model_dump(include={"middleware", "state"})
     config = Config.model_validate({**document, "pairs": [{"name": "front", **given}]})
     room, line, _ = opened(stack, config, tmp_path)
-    assert (room.threads, room.answers, line.heard, room.found()) == ((), {}, {}, {})
+    assert (room.threads, room.answers, line.heard, room.pop_discovered()) == ((), {}, {}, {})
     assert room.complete(config) == config
 
 
@@ -112,7 +112,7 @@ def test_a_pair_is_handed_over_once_everything_is_heard(stack: ExitStack, tmp_pa
     assert set(line.latched) == {INFO, TF_STATIC}, "what was said before counts, too"
     line.put(INFO, TF_STATIC, POINTS)
     wait_until(lambda: [one.code for one in room.nominal("front").awaits] == ["no_image"], "what is missing is told")
-    assert room.found() == {}
+    assert room.pop_discovered() == {}
     room.renew()
     assert b"no_image" in world.published[-1][1].payload
 
@@ -122,7 +122,7 @@ def test_a_pair_is_handed_over_once_everything_is_heard(stack: ExitStack, tmp_pa
     assert room.answers == {}, "whoever is handed over is answered for elsewhere"
     assert set(line.heard) == {INFO, TF_STATIC}, "changes are told for as long as the service runs"
     line.put(INFO, TF_STATIC)
-    assert room.found() == {}, "once"
+    assert room.pop_discovered() == {}, "once"
 
 
 @pytest.mark.fault("a restart of a vehicle whose pairs were found on the bus", "they are served at once, as found")
@@ -132,12 +132,12 @@ def test_a_restart_has_what_was_found(stack: ExitStack, tmp_path: Path) -> None:
     line.put(*SAMPLES)
     pair = found(room)["front"]
 
-    again = WaitingRoom(config, tmp_path)
+    again = PendingPairs(config, tmp_path)
     complete = again.complete(config)
     assert (complete.pairs, complete.awaited) == ((pair,), ())
     assert "kept since" in again.origins()["front"]["T_camera_lidar"]
     elsewhere = configured(tmp_path, points="/rear/points")
-    assert WaitingRoom(elsewhere, tmp_path).complete(elsewhere).pairs == (), "of other topics nothing is known"
+    assert PendingPairs(elsewhere, tmp_path).complete(elsewhere).pairs == (), "of other topics nothing is known"
 
 
 @pytest.mark.fault("what was found of a pair cannot be used", "it is awaited until something else is heard")
@@ -161,7 +161,7 @@ def test_the_end_of_the_service_is_told_for_those_who_wait(stack: ExitStack, tmp
 def test_what_is_given_and_cannot_be_used_is_told_at_once(tmp_path: Path) -> None:
     config = configured(tmp_path, T_camera_lidar=np.eye(4).tolist(), camera={"topic": CAMERA, "mask": "absent.png"})
     with pytest.raises(ConfigError, match="absent"):
-        WaitingRoom(config, tmp_path)
+        PendingPairs(config, tmp_path)
 
 
 def test_what_several_pairs_wait_for_is_listened_to_once_until_the_last_is_found(
@@ -171,22 +171,22 @@ def test_what_several_pairs_wait_for_is_listened_to_once_until_the_last_is_found
     lidars = [{"name": name, "topic": f"/{name}/points"} for name in ("roof", "left")]
     config = config_of({"middleware": "ros2dds", "cameras": cameras, "lidars": lidars, "pairs": "all"})
     told: list[tuple[str, str]] = []
-    monkeypatch.setattr(NominalWatch, "take_frame", lambda _, pair, kind, __: told.append((pair, kind)))
-    room, ears = WaitingRoom(config, tmp_path), Line()
-    monkeypatch.setattr(room._watch.thread, "start", lambda: None)
-    room.open(config, Bench(tmp_path / "bench").outside)
+    monkeypatch.setattr(DiscoveryListener, "take_frame", lambda _, pair, kind, __: told.append((pair, kind)))
+    room, ears = PendingPairs(config, tmp_path), Line()
+    monkeypatch.setattr(room._listener.thread, "start", lambda: None)
+    room.open(config, PairBench(tmp_path / "bench").context)
 
     room.listen(cast("Bus", ears), cast("RosSide", ears))
     topics = {f"/{name}/image_raw" for name in ("front", "rear")} | {f"/{name}/points" for name in ("roof", "left")}
     infos = {"/front/camera_info", "/rear/camera_info"}
     assert Counter(ears.subscribed) == Counter(topics | infos | {TF_STATIC})
-    ears.heard["/roof/points"](Sample(b"", ""))
+    ears.heard["/roof/points"](InputSample(b"", ""))
     assert told == [("front-roof", "lidar"), ("rear-roof", "lidar")]
-    (pair,) = Bench(tmp_path / "other").config.pairs
-    ready = iter([{"front-roof": Found(pair, {})}, {"front-left": Found(pair, {})}])
-    monkeypatch.setattr(room._watch, "ready", lambda: next(ready))
-    assert [*room.found(), *room.found()] == ["front-roof", "front-left"]
+    (pair,) = PairBench(tmp_path / "other").config.pairs
+    ready = iter([{"front-roof": DiscoveredPair(pair, {})}, {"front-left": DiscoveredPair(pair, {})}])
+    monkeypatch.setattr(room._listener, "ready", lambda: next(ready))
+    assert [*room.pop_discovered(), *room.pop_discovered()] == ["front-roof", "front-left"]
     assert ears.ended == ["/front/image_raw"]
     told.clear()
-    ears.heard["/roof/points"](Sample(b"", ""))
+    ears.heard["/roof/points"](InputSample(b"", ""))
     assert told == [("rear-roof", "lidar")]

@@ -9,18 +9,18 @@ from typing import Any, cast
 import numpy as np
 from rosbags.typesys.stores import ros2_humble as ros
 
-from bags import STORE, a_joint, an_info
+from bags import STORE, camera_info_message, transform_message
 from coec.adapters.ros import messages
 from coec.adapters.zenoh.bus import Answer
-from coec.adapters.zenoh.inputs import CDR, Sample
-from coec.adapters.zenoh.ros_topics import Topics
+from coec.adapters.zenoh.inputs import CDR, InputSample
+from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.calibration.types import Reason
 from coec.config import Config
-from coec.runtime.nominal.watch import Nominal
-from coec.runtime.outside import Outside
+from coec.runtime.nominal.watch import NominalStatus
+from coec.runtime.outside import VehicleContext
 from coec.schemas.keys import Keys
-from pair_bench import InstantScribe
-from ros_messages import compressed, packed
+from pair_bench import InstantDiskWriter
+from ros_messages import compressed_image, packed_cloud
 
 CAMERA, POINTS, INFO, TF_STATIC = "/front/image/compressed", "/top/points", "/front/camera_info", "/tf_static"
 
@@ -34,21 +34,21 @@ def configured(folder: Path, **given: object) -> Config:
     return Config.model_validate({"middleware": "rmw_zenoh", "state": state, "pairs": [pair]})
 
 
-def _cdr(payload: bytes, type_name: str) -> Sample:
-    return Sample(payload, f"{CDR};{type_name}")
+def _cdr(payload: bytes, type_name: str) -> InputSample:
+    return InputSample(payload, f"{CDR};{type_name}")
 
 
 def _transforms() -> bytes:
-    message = ros.tf2_msgs__msg__TFMessage([a_joint("camera", "lidar", T_CAMERA_LIDAR)])
+    message = ros.tf2_msgs__msg__TFMessage([transform_message("camera", "lidar", T_CAMERA_LIDAR)])
     return bytes(STORE.serialize_cdr(message, messages.TF))
 
 
 XYZ: Any = [(axis, "<f4", [1.0, 2.0]) for axis in "xyz"]
 
 SAMPLES = {
-    CAMERA: _cdr(compressed(), messages.COMPRESSED_IMAGE),
-    POINTS: _cdr(packed(XYZ), messages.POINT_CLOUD),
-    INFO: _cdr(messages.serialized(an_info("plumb_bob", []), messages.CAMERA_INFO), messages.CAMERA_INFO),
+    CAMERA: _cdr(compressed_image(), messages.COMPRESSED_IMAGE),
+    POINTS: _cdr(packed_cloud(XYZ), messages.POINT_CLOUD),
+    INFO: _cdr(messages.serialized(camera_info_message("plumb_bob", []), messages.CAMERA_INFO), messages.CAMERA_INFO),
     TF_STATIC: _cdr(_transforms(), messages.TF),
 }
 """By topic, what tells all that the configuration leaves out."""
@@ -61,16 +61,16 @@ class World:
         published: keys and answers, in the order in which they were published.
     """
 
-    def __init__(self, folder: Path, nominal: Callable[[str], Nominal]) -> None:
+    def __init__(self, folder: Path, nominal: Callable[[str], NominalStatus]) -> None:
         self.published: list[tuple[str, Answer]] = []
         self.troubles: tuple[Reason, ...] = ()
-        self.topics = Topics()
+        self.topics = RosTopicList()
         nothing = cast("Any", None)
-        self.outside = Outside(
+        self.outside = VehicleContext(
             Keys("coec", "vehicle"),
             nothing,
             nothing,
-            InstantScribe(folder),
+            InstantDiskWriter(folder),
             nothing,
             nothing,
             nothing,

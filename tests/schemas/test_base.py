@@ -16,7 +16,7 @@ from coec.errors import DecodeError
 from coec.schemas.base import from_json, from_msgpack, json_value, to_json, to_msgpack
 from coec.schemas.replies import Acknowledgement, HealthReply, MetricReply, StreamStatus, Transform
 from coec.untrusted import Untrusted
-from hostile import HOSTILE, hostile, obeyed, texts
+from hostile import HOSTILE, hostile_message, message_texts, obeyed_characters
 
 ACKNOWLEDGEMENT = Acknowledgement(
     vehicle="v", pair="front", command="calibrate", accepted=False, code="too_few_pairs", text="4 more pairs — wait"
@@ -82,16 +82,16 @@ MODELS = [
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
 def test_every_text_of_a_message_prints_as_an_escape_and_travels_as_it_is(model: type[BaseModel]) -> None:
-    message = hostile(model)
-    assert [text for text in texts(message) if not isinstance(text, Untrusted)] == [], "declare it as `Text`"
+    message = hostile_message(model)
+    assert [text for text in message_texts(message) if not isinstance(text, Untrusted)] == [], "declare it as `Text`"
     for back in (from_json(model, to_json(message)), from_msgpack(model, to_msgpack(message))):
         assert back == message
-        assert set(map(type, texts(back))) <= {Untrusted}
-    assert obeyed(f"{texts(message)}{message!r}") == ""
+        assert set(map(type, message_texts(back))) <= {Untrusted}
+    assert obeyed_characters(f"{message_texts(message)}{message!r}") == ""
 
 
 def test_places_of_mistakes_name_no_key_of_the_sender_as_it_came() -> None:
-    document = json.loads(to_json(hostile(HealthReply)))
+    document = json.loads(to_json(hostile_message(HealthReply)))
     document["metrics"] = {HOSTILE + "k" * 10_000: {}}
     with pytest.raises(DecodeError) as refused:
         from_json(HealthReply, json.dumps(document).encode())

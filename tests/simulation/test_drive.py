@@ -27,7 +27,7 @@ from coec.simulation.drive import DriveConfig, SimulatedDrive
 from coec.simulation.faults import parse_fault
 from coec.simulation.journey import START_NS
 from coec.simulation.parallel import messages_by
-from coec.sources.recording import Message
+from coec.sources.recording import SensorMessage
 
 
 def small(*faults: str, seconds: float = 1.0, depth: bool = False, **more: object) -> SimulatedDrive:
@@ -37,13 +37,13 @@ def small(*faults: str, seconds: float = 1.0, depth: bool = False, **more: objec
 
 
 @lru_cache(maxsize=1)
-def plain() -> tuple[Message, ...]:
+def plain() -> tuple[SensorMessage, ...]:
     """The drive without any fault."""
     return tuple(small().messages())
 
 
-def fingerprint(messages: Iterable[Message]) -> list[object]:
-    def of(message: Message) -> object:
+def fingerprint(messages: Iterable[SensorMessage]) -> list[object]:
+    def of(message: SensorMessage) -> object:
         match message:
             case CameraFrame():
                 return message.stamp_ns, message.sequence, message.image.data, message.depth and message.depth.data
@@ -55,11 +55,11 @@ def fingerprint(messages: Iterable[Message]) -> list[object]:
     return [of(message) for message in messages]
 
 
-def pictures(messages: Iterable[Message]) -> list[CameraFrame]:
+def pictures(messages: Iterable[SensorMessage]) -> list[CameraFrame]:
     return [message for message in messages if isinstance(message, CameraFrame)]
 
 
-def sweeps(messages: Iterable[Message]) -> list[LidarFrame]:
+def sweeps(messages: Iterable[SensorMessage]) -> list[LidarFrame]:
     return [message for message in messages if isinstance(message, LidarFrame)]
 
 

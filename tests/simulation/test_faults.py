@@ -14,9 +14,9 @@ from coec.simulation.faults import parse_fault, shifted
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("step:30:rx=3,tz=0.1", faults.Step(30, math.inf, rx=3, tz=0.1)),
-        ("step:30-40:ry=-1.5", faults.Step(30, 40, ry=-1.5)),
-        ("drift:10-20:rz=2", faults.Drift(10, 20, rz=2)),
+        ("step:30:rx=3,tz=0.1", faults.StepFault(30, math.inf, rx=3, tz=0.1)),
+        ("step:30-40:ry=-1.5", faults.StepFault(30, 40, ry=-1.5)),
+        ("drift:10-20:rz=2", faults.DriftFault(10, 20, rz=2)),
         ("dirt:5", faults.Dirt(5, math.inf)),
         ("dark:5-6:light=0.1", faults.Dark(5, 6, light=0.1)),
         ("swing:10-20:rx=1.5,period_s=2.3", faults.Swing(10, 20, rx=1.5, period_s=2.3)),
@@ -25,7 +25,7 @@ from coec.simulation.faults import parse_fault, shifted
         ("beams:1-2:share=0.25", faults.Beams(1, 2, share=0.25)),
         ("no-ego:1-2", faults.NoEgo(1, 2)),
         ("zero-ego:1-2", faults.ZeroEgo(1, 2)),
-        ("offset:1-2:seconds=-0.1", faults.Offset(1, 2, seconds=-0.1)),
+        ("offset:1-2:seconds=-0.1", faults.StampOffset(1, 2, seconds=-0.1)),
         ("loss:0:share=1", faults.Loss(0, math.inf, share=1)),
         ("tunnel:20-35", faults.Tunnel(20, 35)),
         ("open_road:20", faults.OpenRoad(20, math.inf)),

@@ -14,7 +14,7 @@ from coec.simulation.mesh import Material, Mesh, join, quads
 from coec.simulation.road import build_road
 from coec.simulation.scan import Raster, Rosette, Turn, even_deg
 from coec.simulation.scene import Scene
-from coec.simulation.sky import draw_sky
+from coec.simulation.sky import sample_sky
 from coec.simulation.weather import Air, rainy_air
 
 TURN = Turn(even_deg(-15.0, 15.0, 16), columns=720)
@@ -34,7 +34,7 @@ def a_room(size_m: float = 20.0) -> Mesh:
 
 
 def a_scene(mesh: Mesh) -> Scene:
-    return Scene(build_road(0, -10.0, 10.0), draw_sky(0), np.zeros(3), mesh, [])
+    return Scene(build_road(0, -10.0, 10.0), sample_sky(0), np.zeros(3), mesh, [])
 
 
 def moving(speed_mps: float) -> Poses:

@@ -10,9 +10,9 @@ from coec.calibration.types import EgoMotion, FramePair, LidarFrame
 from coec.simulation.drive import SimulatedDrive
 from coec.simulation.faults import parse_fault
 from coec.simulation.parallel import messages_by
-from coec.simulation.passages import CLEAR_M, Passages, Span, passages
+from coec.simulation.passages import CLEAR_M, Passages, RoadSpan, passages
 from coec.simulation.scene import Town
-from coec.simulation.street import draw_style
+from coec.simulation.street import sample_style
 from coec.simulation.tunnel import HIGH_M, VERGE_M
 from coec.simulation.vehicle import P_EGO_LIDAR_M, Pace
 from simulation.test_drive import fingerprint, pictures, pixels, share_consistent, small, sweeps
@@ -34,14 +34,14 @@ def test_a_span_lies_where_the_vehicle_then_is() -> None:
     assert bare.begin_m == at_20
     assert bare.end_m > at_30
     assert found.cleared() == (bare.widened(CLEAR_M),)
-    assert tunnel.part(at_5 - 10, at_5 + 1) == Span(at_5, at_5 + 1)
+    assert tunnel.part(at_5 - 10, at_5 + 1) == RoadSpan(at_5, at_5 + 1)
     assert tunnel.part(at_9, at_9 + 1) is None
 
 
 def test_a_tunnel_is_near_dim_and_bare() -> None:
     street, _ = at(20, "dirt:0-1")
     picture, sweep = at(20, "tunnel:10-30")
-    style = draw_style(4)
+    style = sample_style(4)
     beside = np.abs(sweep.xyz_m[np.abs(sweep.xyz_m[:, 0]) < 8.0][:, 1])
     assert beside.max() < 2 * style.lane_m + VERGE_M
     above = sweep.xyz_m[:, 2][np.linalg.norm(sweep.xyz_m, axis=1) < 20.0]
@@ -91,7 +91,7 @@ def test_several_processes_give_the_same_bytes() -> None:
 
 def test_a_poor_stretch_has_less_to_cast_rays_at() -> None:
     plain = len(Town(5, 600.0).scene(200.0).colour)
-    whole = (Span(150.0, 300.0),)
+    whole = (RoadSpan(150.0, 300.0),)
     assert len(Town(5, 600.0, Passages(tunnels=whole)).scene(200.0).colour) < plain
     assert len(Town(5, 600.0, Passages(open=whole)).scene(200.0).colour) < plain / 2
     assert Town(5, 600.0, Passages(open=whole)).scene(225.0).movers == ()

@@ -15,7 +15,7 @@ from coec.simulation.mesh import Material, Mesh, box, join, quads
 from coec.simulation.render import render_view
 from coec.simulation.road import build_road
 from coec.simulation.scene import Scene, Town
-from coec.simulation.sky import draw_sky
+from coec.simulation.sky import sample_sky
 
 PINHOLE = cameras.build("pinhole", width=61, height=41, fx=40.0, fy=40.0, cx=30.0, cy=20.0)
 FISHEYE = fisheye(96, 92.5)
@@ -24,7 +24,7 @@ AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def a_scene(mesh: Mesh, sun: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Scene:
-    sky = replace(draw_sky(0), towards_sun=np.array(sun, np.float32), sun=(1.0, 1.0, 1.0), clouds=0.0)
+    sky = replace(sample_sky(0), towards_sun=np.array(sun, np.float32), sun=(1.0, 1.0, 1.0), clouds=0.0)
     return Scene(build_road(0, -10.0, 10.0), sky, np.array([1000.0, 2000.0, 30.0]), mesh, [])
 
 

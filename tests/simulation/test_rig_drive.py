@@ -20,12 +20,12 @@ from coec.geometry.projection import project
 from coec.geometry.se3 import difference, inverse
 from coec.simulation.aboard import NEAREST_M
 from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigDrive, RigPair
+from coec.simulation.rig_drive import RigDrive, SimulatedRigPair
 from coec.simulation.scene import Solid
 from coec.simulation.source import open_rig
 from coec.simulation.vehicle import whole_body
 from coec.sources import open_source
-from coec.sources.recording import KnowsTruth, Message
+from coec.sources.recording import HasGroundTruth, SensorMessage
 
 WORDS = "rig=four-fisheyes&seed=4&seconds=0.5&camera=fisheye128&camera_hz=2&lidar_hz=2&ego_hz=20"
 
@@ -36,12 +36,12 @@ def drive(*faults: str, **more: str) -> RigDrive:
 
 
 @lru_cache(maxsize=1)
-def plain() -> tuple[Message, ...]:
+def plain() -> tuple[SensorMessage, ...]:
     """The drive without any fault."""
     return tuple(drive(depth="yes").messages())
 
 
-def content(message: Message) -> object:
+def content(message: SensorMessage) -> object:
     match message:
         case CameraFrame():
             return message.frame_id, message.stamp_ns, message.image.data
@@ -50,7 +50,7 @@ def content(message: Message) -> object:
     return message
 
 
-def by_sensor(messages: tuple[Message, ...] | list[Message]) -> dict[str, Message]:
+def by_sensor(messages: tuple[SensorMessage, ...] | list[SensorMessage]) -> dict[str, SensorMessage]:
     """The first of each."""
     return {message.frame_id: message for message in reversed(messages)}
 
@@ -66,7 +66,7 @@ def test_every_sensor_speaks_at_its_own_stamps() -> None:
 
 def test_a_pair_has_the_frames_of_the_rig_and_draws_no_others() -> None:
     pair = open_source(f"sim:{WORDS}&pair=left-near_left")
-    assert isinstance(pair, KnowsTruth)
+    assert isinstance(pair, HasGroundTruth)
     assert pair.rig.pair == "left-near_left"
     ours = [content(message) for message in pair.messages()]
     theirs = [content(message) for message in plain() if message.frame_id in ("left", "near_left", "ego")]
@@ -229,7 +229,7 @@ def test_night_is_everywhere() -> None:
 def test_a_pair_is_a_recording_of_the_rig_that_it_was_asked_of() -> None:
     made = drive("roof:step:0.2:rz=1")
     one, other = made.pair("front", "roof"), made.pair("right", "roof")
-    assert isinstance(one, RigPair)
+    assert isinstance(one, SimulatedRigPair)
     late_ns = START_NS + 300_000_000
     for pair in (one, other):  # a knocked LiDAR is the same knock in every pair that has it
         xi = difference(pair.truth(late_ns), pair.truth(START_NS))

@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from coec.calibration.types import CameraFrame, LidarFrame
-from coec.simulation.rig_drive import RigConfig, RigDrive
+from coec.simulation.rig_drive import RigDrive, RigDriveConfig
 from coec.simulation.rig_instants import instants, pair_of
 
-SMALL = RigConfig(seed=4, seconds=3.0, camera="fisheye64", ego_hz=20.0)
+SMALL = RigDriveConfig(seed=4, seconds=3.0, camera="fisheye64", ego_hz=20.0)
 
 
 def test_every_camera_has_a_picture_of_its_own_within_half_a_turn_of_the_sweep() -> None:

@@ -25,7 +25,7 @@ def test_only_what_is_near_is_kept() -> None:
     town = Town(2, 2000.0)
     for at_m in (0.0, 3 * STRETCH_M, 20 * STRETCH_M):
         scene = town.scene(at_m)
-        assert town.stretches_kept == BEHIND + AHEAD + 1
+        assert town.stretch_count == BEHIND + AHEAD + 1
         assert len(scene.colour) < 600_000
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.matching import is_heard
+from coec.adapters.zenoh.matching import has_subscribers
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import Config
 from coec.reports.commented_yaml import commented_yaml
@@ -83,7 +83,7 @@ class Vehicle:
 
     def start(self) -> None:
         """Begin as soon as somebody listens: nobody can know of what was sent before."""
-        wait_until(lambda: all(is_heard(one) for one in self._publishers.values()), "somebody who listens")
+        wait_until(lambda: all(has_subscribers(one) for one in self._publishers.values()), "somebody who listens")
         self._thread.start()
 
     def stop(self) -> None:
@@ -97,7 +97,7 @@ class Vehicle:
     def put(self, stream: str, payload: bytes) -> None:
         """Whatever it is, it counts as sent. From the thread of who sends it; it is no frame of the vehicle's and has
         no number: nobody could know of one that was sent while the router was away."""
-        wait_until(lambda: is_heard(self._publishers[stream]), "the router back")
+        wait_until(lambda: has_subscribers(self._publishers[stream]), "the router back")
         self._publishers[stream].put(payload, encoding=MSGPACK)
         self.sent[f"{stream} of others"] += 1
 

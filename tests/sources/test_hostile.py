@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ruamel.yaml.scanner import Scanner
 
-from cloud_files import npy, npz, pcd, with_header
+from cloud_files import npy, npy_with_header, npz, pcd
 from coec.config import MAX_YAML_BYTES, load_config, load_yaml, parse_yaml
 from coec.errors import CoecError, ConfigError, SourceError
 from coec.sources import open_source, reading
@@ -52,7 +52,7 @@ HEADERS = {
 @pytest.mark.parametrize("suffix", ["npy", "npz"])
 def test_the_header_of_a_numpy_file_may_say_anything(tmp_path: Path, suffix: str, header: str) -> None:
     path = tmp_path / f"cloud.{suffix}"
-    array = with_header(header, bytes(96))
+    array = npy_with_header(header, bytes(96))
     path.write_bytes(array if suffix == "npy" else npz(xyz=array))
     with pytest.raises(SourceError, match=str(path)):
         load_cloud(0, "lidar", path)
@@ -63,11 +63,11 @@ def test_an_archive_that_promises_more_than_it_holds_is_refused_before_it_is_unp
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "cloud.npz"
-    path.write_bytes(npz(xyz=with_header(HEADERS["immense"].replace("9" + 18 * "0", "20000000"), bytes(96))))
+    path.write_bytes(npz(xyz=npy_with_header(HEADERS["immense"].replace("9" + 18 * "0", "20000000"), bytes(96))))
     with pytest.raises(SourceError, match="promises more"):
         load_cloud(0, "lidar", path)
     monkeypatch.setattr(reading, "MAX_FILE_BYTES", MB)
-    bomb = npz(xyz=with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (4, 3), }", bytes(2 * MB)))
+    bomb = npz(xyz=npy_with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (4, 3), }", bytes(2 * MB)))
     path.write_bytes(bomb)
     with pytest.raises(SourceError, match="would unpack"):
         load_cloud(0, "lidar", path)
@@ -163,7 +163,7 @@ def test_files_larger_than_a_file_may_be_are_not_read(tmp_path: Path, suffix: st
     path = tmp_path / f"cloud.{suffix}"
     rows = reading.MAX_FILE_BYTES // 24 + 1
     with path.open("wb") as stream:
-        stream.write(with_header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({rows}, 3), }}"))
+        stream.write(npy_with_header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({rows}, 3), }}"))
         stream.truncate(reading.MAX_FILE_BYTES + 1024)
     tracemalloc.start()
     try:

@@ -14,7 +14,7 @@ from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import cameras
 from coec.sources import open_source
-from sweeps import ROOF, a_sweep, in_frame
+from sweeps import ROOF_POSE, sweep_in_frame, turning_sweep
 
 LIMITS = LimitsConfig()
 
@@ -266,11 +266,15 @@ def test_the_raw_fisheye_with_its_mask(sample_data: Path) -> None:
 
 
 def test_clouds_in_another_frame_come_back_to_the_lidars(tmp_path: Path) -> None:
-    np.savez(tmp_path / "given.npz", xyz=in_frame(a_sweep(), ROOF).xyz_m, ring=np.asarray(a_sweep().ring))
+    np.savez(
+        tmp_path / "given.npz",
+        xyz=sweep_in_frame(turning_sweep(), ROOF_POSE).xyz_m,
+        ring=np.asarray(turning_sweep().ring),
+    )
     frames = [{"image": "1.jpg", "cloud": "given.npz", "stamp_ns": 1000}]
-    a_dataset(tmp_path, T_cloud_lidar=[[float(v) for v in row] for row in ROOF], frames=frames)
+    a_dataset(tmp_path, T_cloud_lidar=[[float(v) for v in row] for row in ROOF_POSE], frames=frames)
     (sweep,) = (m for m in open_source(str(tmp_path)).messages() if isinstance(m, LidarFrame))
-    np.testing.assert_allclose(sweep.xyz_m, a_sweep().xyz_m, atol=1e-5)
+    np.testing.assert_allclose(sweep.xyz_m, turning_sweep().xyz_m, atol=1e-5)
     a_dataset(tmp_path, frames=frames)
     with pytest.raises(SourceError, match=r"given.npz: The points contradict their origin.*`T_cloud_lidar`"):
         list(open_source(str(tmp_path)).messages())

@@ -17,7 +17,7 @@ from coec.adapters.files.baseline_file import BASELINES, load_baseline
 from coec.adapters.files.rig import rig_from_json
 from coec.calibration import lifecycle
 from coec.calibration.lifecycle import PairState
-from coec.runtime.decisions.history import History
+from coec.runtime.decisions.history import PairHistory
 from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.state_store import StateStore
 
@@ -29,15 +29,15 @@ def state_of(remembered: Any) -> PairState:
 
 
 def books_of(folder: Path, pair: str, remembered: Any) -> Any:
-    history: Any = History
-    if "pair" in inspect.signature(History).parameters:
+    history: Any = PairHistory
+    if "pair" in inspect.signature(PairHistory).parameters:
         return history(folder, pair, 1000, getattr(remembered, "history_heads", {}))
     return history(folder / f"history-{pair}.jsonl", 1000, getattr(remembered, "history_head", None))
 
 
 def pair_read(store: StateStore, folder: Path, name: str, rig_document: Any) -> dict[str, Any]:
     try:
-        remembered = store.recall(rig_from_json(rig_document, None))
+        remembered = store.load(rig_from_json(rig_document, None))
     except Exception as error:  # whatever an old version raises is what is to be told
         return {"error": f"{type(error).__name__}: {error}"}
     if remembered is None:

@@ -18,24 +18,24 @@ from hypothesis import strategies as st
 from coec.adapters.files.rig import identity_sha256, rig_identity
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.lifecycle import (
+    ExtrinsicHold,
     HealthState,
-    Hold,
     PairState,
     Provenance,
     after_estimate,
     initial_state,
     restored,
 )
-from coec.calibration.monitor.change_detector import Finding, MonitorState
+from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState
 from coec.calibration.types import Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import StateError
 from coec.runtime.decisions.pair_reader import pair_from_json
 from coec.runtime.decisions.state_store import STATE_FILE, StateStore, read_pairs
-from coec.runtime.decisions.stored_pair import PARTS, Clocks, Remembered, StoredPair, pair_to_json
+from coec.runtime.decisions.stored_pair import PARTS, Clocks, RestoredPair, StoredPair, pair_to_json
 from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import CalibrationResult
-from estimates import RIG, estimate
+from estimates import ESTIMATE_RIG, estimate
 from upgrade.write_state import FRONT, REAR, front_state, rear_state, rules
 
 CLOCKS = Clocks(6, 8, 4)
@@ -66,7 +66,7 @@ class Seed:
 
 def waiting_state() -> PairState:
     """A candidate waits that contradicts what is served."""
-    state = after_estimate(initial_state(RIG), estimate(1), 0, rules())
+    state = after_estimate(initial_state(ESTIMATE_RIG), estimate(1), 0, rules())
     never = type(rules())(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())
     state = after_estimate(state, estimate(2), 0, never)
     return after_estimate(state, estimate(2), 0, never)
@@ -80,11 +80,11 @@ SEEDS = {
 RED = (HealthState.SUSPECT, HealthState.MISCALIBRATED)
 
 
-def read(seed: Seed, document: dict[str, Any]) -> Remembered:
+def read(seed: Seed, document: dict[str, Any]) -> RestoredPair:
     return pair_from_json(document, seed.rig, initial_state(seed.rig))[1]
 
 
-def damaged(seed: Seed, name: str, value: object) -> Remembered:
+def damaged(seed: Seed, name: str, value: object) -> RestoredPair:
     document = seed.document
     if value is GONE:
         del document[name]
@@ -100,7 +100,7 @@ def part_of(name: str) -> str:
 
 def plain(state: PairState) -> dict[str, Any]:
     """The state as comparable values, by field."""
-    document = pair_to_json(RIG, "test", state, CLOCKS, ())
+    document = pair_to_json(ESTIMATE_RIG, "test", state, CLOCKS, ())
     return {name: document[name] for name in StoredPair.model_fields if name not in ("versions", "rig", "rig_sha256")}
 
 
@@ -113,7 +113,7 @@ FOLLOWS = {
 """What falls back with a part, because it has no meaning without it."""
 
 
-def assert_only(seed: Seed, part: str, remembered: Remembered) -> None:
+def assert_only(seed: Seed, part: str, remembered: RestoredPair) -> None:
     """Only this part is lost, all else is as it was, and nothing is better than it was."""
     assert {lost.part for lost in remembered.lost} <= {part} | ({"extrinsic"} if part == "rig" else set())
     before, after = seed.plain, plain(remembered.state)
@@ -212,7 +212,7 @@ def mutated(data: st.DataObject, value: Any) -> Any:
     return value
 
 
-def assert_safe(seed: Seed, name: str, remembered: Remembered) -> None:
+def assert_safe(seed: Seed, name: str, remembered: RestoredPair) -> None:
     """A field with any content costs no other part; a state that can be written again is what is read."""
     part = part_of(name)
     assert {lost.part for lost in remembered.lost} <= {part, "extrinsic"}
@@ -233,8 +233,8 @@ def assert_safe(seed: Seed, name: str, remembered: Remembered) -> None:
 def test_a_hold_that_cannot_be_read_holds() -> None:
     seed = SEEDS["held and healthy"]
     assert damaged(seed, "frozen", "x").state.hold == seed.state.hold
-    assert damaged(seed, "hold", "x").state.hold == Hold()
-    assert damaged(SEEDS["miscalibrated"], "frozen", "x").state.hold == Hold()
+    assert damaged(seed, "hold", "x").state.hold == ExtrinsicHold()
+    assert damaged(SEEDS["miscalibrated"], "frozen", "x").state.hold == ExtrinsicHold()
     assert damaged(SEEDS["miscalibrated"], "hold", "x").state.hold is None
 
 
@@ -270,18 +270,23 @@ def test_of_a_monitor_that_cannot_be_read_what_accuses_is_kept() -> None:
     document = SEEDS["miscalibrated"].document
     document["monitor"] |= {"turned": "x", "blind": {"lens_dirty": 2.0}}
     monitor = read(SEEDS["miscalibrated"], document).state.monitor
-    assert monitor == MonitorState(outcome=Finding.CONFIRMED, blind={"lens_dirty": 2.0}, vouched=monitor.vouched)
+    assert monitor == MonitorState(outcome=MonitorOutcome.CONFIRMED, blind={"lens_dirty": 2.0}, vouched=monitor.vouched)
     front = damaged(
         SEEDS["held and healthy"], "monitor", {**SEEDS["held and healthy"].document["monitor"], "turned": 3}
     )
-    assert front.state.monitor.outcome is Finding.UNKNOWN, "that nothing was found is forgotten with the evidence"
+    assert front.state.monitor.outcome is MonitorOutcome.UNKNOWN, (
+        "that nothing was found is forgotten with the evidence"
+    )
 
 
 # --- the rig --------------------------------------------------------------------------------------------------------
 
 
 def test_the_hash_of_a_rig_is_the_one_that_all_versions_know() -> None:
-    assert identity_sha256(rig_identity(RIG)) == "2a962d0310f4c42053cb69cc809509435b11b11bfd04a06df067062d3be6fe40"
+    assert (
+        identity_sha256(rig_identity(ESTIMATE_RIG))
+        == "2a962d0310f4c42053cb69cc809509435b11b11bfd04a06df067062d3be6fe40"
+    )
 
 
 @pytest.mark.fault("a version that knows more of a rig, or rounds differently", "it is the same rig")
@@ -335,9 +340,9 @@ def test_two_pairs_that_lose_parts_set_one_file_aside(tmp_path: Path) -> None:
     before = (tmp_path / STATE_FILE).read_bytes()
     store = StateStore(tmp_path, "test")
     for rig in (FRONT, REAR):
-        remembered = store.recall(rig)
+        remembered = store.load(rig)
         assert remembered is not None
-        store.remember(rig, remembered.state, remembered.clocks, dict)
+        store.update(rig, remembered.state, remembered.clocks, dict)
     store.flush()
     assert (tmp_path / f"{STATE_FILE}.broken").read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == [STATE_FILE, f"{STATE_FILE}.broken"]
@@ -351,10 +356,10 @@ def test_a_file_with_fields_of_a_newer_version_is_kept_aside(tmp_path: Path) -> 
     written(tmp_path, {"front": seed.document | {"towed": {"by": "a lorry"}}})
     before = (tmp_path / STATE_FILE).read_bytes()
     store = StateStore(tmp_path, "test")
-    remembered = store.recall(FRONT)
+    remembered = store.load(FRONT)
     assert remembered is not None
     assert (remembered.lost, plain(remembered.state)) == ((), seed.plain)
-    store.remember(FRONT, remembered.state, remembered.clocks, dict)
+    store.update(FRONT, remembered.state, remembered.clocks, dict)
     store.flush()
     assert (tmp_path / f"{STATE_FILE}.newer").read_bytes() == before
 

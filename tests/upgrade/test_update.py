@@ -16,19 +16,19 @@ from coec.adapters.files.baseline_file import BASELINES, baseline_hash, load_bas
 from coec.adapters.files.rig import rig_from_json
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.commissioning.baseline import learned_hash
-from coec.calibration.lifecycle import HealthState, Hold, PairState, after_observation, restored
-from coec.calibration.monitor.change_detector import Finding
+from coec.calibration.lifecycle import ExtrinsicHold, HealthState, PairState, after_observation, restored
+from coec.calibration.monitor.change_detector import MonitorOutcome
 from coec.calibration.types import Rig
 from coec.config import CalibrationConfig, Config, StateConfig
-from coec.runtime.decisions.history import History
+from coec.runtime.decisions.history import PairHistory
 from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.decisions.state_store import StateStore, read_pairs
-from coec.runtime.decisions.stored_pair import Remembered
-from coec.runtime.nominal.kept import KeptNominals
+from coec.runtime.decisions.stored_pair import RestoredPair
+from coec.runtime.nominal.kept import DiscoveryStore
 from coec.runtime.recording.window_store import WindowStore
-from coec.runtime.rig.rig_file import RigFile
-from pair_bench import InstantScribe
+from coec.runtime.rig.rig_file import RigStore
+from pair_bench import InstantDiskWriter
 from upgrade.write_state import VEHICLE, checked, rules
 
 FIXTURES = Path(__file__).with_name("fixtures")
@@ -62,8 +62,8 @@ class Vehicle:
     def rig(self, pair: str) -> Rig:
         return rig_from_json(self.told["pairs"][pair]["rig"], None)
 
-    def recalled(self, pair: str) -> Remembered:
-        remembered = StateStore(self.folder, VEHICLE).recall(self.rig(pair))
+    def recalled(self, pair: str) -> RestoredPair:
+        remembered = StateStore(self.folder, VEHICLE).load(self.rig(pair))
         assert remembered is not None
         return remembered
 
@@ -76,7 +76,7 @@ class Vehicle:
             VEHICLE,
             config,
             StateStore(self.folder, VEHICLE),
-            InstantScribe(self.folder),
+            InstantDiskWriter(self.folder),
             WindowStore(self.folder / "windows", config),
             losses,
         )
@@ -114,7 +114,7 @@ def test_an_update_keeps_the_calibration_and_the_hold(vehicle: Vehicle) -> None:
             assert state.accepted.window_id == told["window_id"]
         assert (state.hold is not None) == told["is_held"]
         if told["hold"] is not None:
-            assert state.hold == Hold(7_000_000_000, *told["hold"])
+            assert state.hold == ExtrinsicHold(7_000_000_000, *told["hold"])
         if told["record"] is not None:
             assert {name: getattr(state.record, name) for name in told["record"]} == told["record"]
         assert list(remembered.commissioned_from) == told["commissioned_from"]
@@ -128,7 +128,7 @@ def test_an_update_makes_nothing_green(vehicle: Vehicle) -> None:
     assert front.health is HealthState.UNKNOWN
     assert vehicle.told["pairs"]["rear"]["outcome"] == "confirmed"
     assert rear.health is HealthState.MISCALIBRATED
-    assert rear.monitor.outcome is Finding.CONFIRMED
+    assert rear.monitor.outcome is MonitorOutcome.CONFIRMED
 
 
 @pytest.mark.fault(
@@ -149,7 +149,7 @@ def test_a_monitor_without_its_evidence_does_not_acquit(vehicle: Vehicle) -> Non
 @pytest.mark.fault("an update of the software", "the history is kept and verified, and goes on")
 def test_an_update_keeps_the_history(vehicle: Vehicle) -> None:
     for pair, told in vehicle.told["pairs"].items():
-        books = History(vehicle.folder, pair, 1000, vehicle.recalled(pair).history_heads)
+        books = PairHistory(vehicle.folder, pair, 1000, vehicle.recalled(pair).history_heads)
         assert books.damage is None
         assert [kept.entry.text for kept in books.entries()] == told["history"]
         assert Incidents(vehicle.folder / "evidence", pair, 4).window_ids == {f"{pair}-1"}
@@ -159,7 +159,7 @@ def test_an_update_keeps_the_history(vehicle: Vehicle) -> None:
 def test_a_history_that_was_cut_off_is_noticed_by_the_head_of_an_earlier_version(vehicle: Vehicle) -> None:
     path = vehicle.folder / "history-front.jsonl"
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:1]))
-    books = History(vehicle.folder, "front", 1000, vehicle.recalled("front").history_heads)
+    books = PairHistory(vehicle.folder, "front", 1000, vehicle.recalled("front").history_heads)
     assert "cut off" in str(books.damage)
 
 
@@ -172,11 +172,11 @@ def test_an_update_keeps_what_stands_beside_the_state(vehicle: Vehicle) -> None:
         assert baseline.config_hash == learned_hash(CalibrationConfig()), (
             "a setting of the objective or of the search that is added changes the hash, and drops every baseline"
         )
-    rig = RigFile(vehicle.folder)
+    rig = RigStore(vehicle.folder)
     assert rig.damage == ()
     assert sorted(rig._edges) == vehicle.told["edges"]
     if vehicle.told["nominal"]:
-        found = KeptNominals(vehicle.folder).found(Config.model_validate(vehicle.told["nominal"]))
+        found = DiscoveryStore(vehicle.folder).load(Config.model_validate(vehicle.told["nominal"]))
         assert found["side"].pair.T_camera_lidar[2][3] == -0.7
 
 

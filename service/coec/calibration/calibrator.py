@@ -9,16 +9,16 @@ from math import degrees
 
 import numpy as np
 
-from coec.calibration.confidence.from_before import summit_from_before
-from coec.calibration.confidence.looks import Looks, look
-from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LENS_FREE, Loosened, loosen
+from coec.calibration.confidence.from_before import mode_next_to_prior
+from coec.calibration.confidence.looks import IndependentSamples, independent_samples_at
+from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LENS_FREE, RelaxedAssumption, relax_assumptions
 from coec.calibration.confidence.modes import Rivals
-from coec.calibration.confidence.shifted import shifted
+from coec.calibration.confidence.shifted import translation_profile
 from coec.calibration.confidence.told import LENS
 from coec.calibration.confidence.uncertainty import measure_uncertainty
-from coec.calibration.estimators import ESTIMATORS, Found, sight_of
+from coec.calibration.estimators import ESTIMATORS, EstimatorResult, prepare_window_data
 from coec.calibration.frames.motion_compensation import compensation
-from coec.calibration.moved_within import in_words, moved_within
+from coec.calibration.moved_within import move_text, moved_within
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.search.change_point import change_point
@@ -64,46 +64,48 @@ def calibrate(
     dof = config.search.dof
 
     # P_i and D_i, the objective and its maximum.
-    sight = sight_of(window, depth, images, config, progress)
-    found = ESTIMATORS[config.objective.kind](sight, config)
-    objective, search, every = found.objective, found.search, tuple(range(dof))
+    data = prepare_window_data(window, depth, images, config, progress)
+    result = ESTIMATORS[config.objective.kind](data, config)
+    objective, search, every = result.objective, result.search, tuple(range(dof))
     curvature = measure_curvature(objective, search.T_camera_lidar, dof)
     held = tuple(axis for axis in TRANSLATIONS if axis not in every)
     held_m = config.verdict.held_translation_sigma_m
-    rivals = (*found.rivals, *_from_before(found, sight.window, dof))
-    loosened = _loosened(found, sight.window, search.T_camera_lidar, held, held_m)
-    seen = _looks(found, search.T_camera_lidar)
-    uncertainty = _uncertainty(found, sight.window, search.T_camera_lidar, every, rivals, loosened, seen, config)
+    rivals = (*result.rivals, *_prior_mode(result, data.window, dof))
+    relaxed = _relaxed_assumptions(result, data.window, search.T_camera_lidar, held, held_m)
+    seen = _independent_samples(result, search.T_camera_lidar)
+    uncertainty = _uncertainty(result, data.window, search.T_camera_lidar, every, rivals, relaxed, seen, config)
     blind = unobservable(curvature, uncertainty.sigma, dof, config.verdict)
     if blind:
         search = without(blind, search, objective, window.T_camera_lidar_start, config.search, progress)
         curvature = measure_curvature(objective, search.T_camera_lidar, dof, blind)
-        told = tuple(axis for axis in every if axis not in blind)
-        loosened = _loosened(found, sight.window, search.T_camera_lidar, blind, config.verdict.max_sigma_m)
-        seen = _looks(found, search.T_camera_lidar)
-        uncertainty = _uncertainty(found, sight.window, search.T_camera_lidar, told, rivals, loosened, seen, config)
+        determined = tuple(axis for axis in every if axis not in blind)
+        relaxed = _relaxed_assumptions(result, data.window, search.T_camera_lidar, blind, config.verdict.max_sigma_m)
+        seen = _independent_samples(result, search.T_camera_lidar)
+        uncertainty = _uncertainty(
+            result, data.window, search.T_camera_lidar, determined, rivals, relaxed, seen, config
+        )
     pose = search.T_camera_lidar
     # Self-diagnosis, equation (2).
     at_optimum = objective.evaluate(pose)
-    change = None if found.edges is None else change_point(found.edges, pose)
-    looks, pairs = uncertainty.looks, len(window.pairs)
+    change = None if result.edges is None else change_point(result.edges, pose)
+    independent_samples, pairs = uncertainty.independent_samples, len(window.pairs)
     changed = change_metric(change, config.verdict)
     metrics = (
-        *counted_once(found.metrics, looks, pairs),
+        *counted_once(result.metrics, independent_samples, pairs),
         *shape_metrics(at_optimum, curvature, uncertainty.sigma, config.verdict),
         *repetition_metric(seen, window.pairs, config.verdict),
-        *intrinsics_metric(loosened, config.verdict),
+        *intrinsics_metric(relaxed, config.verdict),
         *changed,
     )
     moved = None
-    if found.edges is not None and change is not None and not all(metric.passed for metric in changed):
-        moved = moved_within(change, found.edges, sight)
+    if result.edges is not None and change is not None and not all(metric.passed for metric in changed):
+        moved = moved_within(change, result.edges, data)
     details = {
-        "sigma_deg": _told_of_words(loosened),
-        INTRINSICS_OFF: _told_of_lens(loosened, window),
-        MOVED: "" if moved is None else in_words(moved, window),
+        "sigma_deg": _contradictions_text(relaxed),
+        INTRINSICS_OFF: _lens_text(relaxed, window),
+        MOVED: "" if moved is None else move_text(moved, window),
     }
-    verdict = judge(metrics, search.stop_reason, looks, pairs, details)
+    verdict = judge(metrics, search.stop_reason, independent_samples, pairs, details)
     progress.step("diagnosis", 1, 1)
 
     outcomes = Counter(compensation(pair, window.rig, enabled=config.motion_compensation) for pair in window.pairs)
@@ -137,19 +139,19 @@ def calibrate(
     )
 
 
-def _looks(found: Found, pose: Matrix4) -> Looks | None:
+def _independent_samples(result: EstimatorResult, pose: Matrix4) -> IndependentSamples | None:
     """How many independent looks the frames are worth at a pose (4, 4); None if the estimator used no edges."""
-    return None if found.edges is None else look(found.edges.sharp, pose)
+    return None if result.edges is None else independent_samples_at(result.edges.sharp, pose)
 
 
 def _uncertainty(
-    found: Found,
+    result: EstimatorResult,
     window: Window,
     pose: Matrix4,
     moved: tuple[int, ...],
     rivals: Sequence[Rivals],
-    loosened: Sequence[Loosened],
-    seen: Looks | None,
+    relaxed: Sequence[RelaxedAssumption],
+    seen: IndependentSamples | None,
     config: CalibrationConfig,
 ) -> Uncertainty:
     """The uncertainty of `pose` (4, 4), found by a search along the axes `moved`.
@@ -158,46 +160,46 @@ def _uncertainty(
     ridges are followed (`shifted`).
     """
     if seen is not None and seen.count < len(moved):
-        rivals = (*rivals, shifted(found.objective, pose, moved, config))
+        rivals = (*rivals, translation_profile(result.objective, pose, moved, config))
     held_m = config.verdict.held_translation_sigma_m
-    uncertainty = measure_uncertainty(found.objective, pose, moved, rivals, loosened, window, held_m)
-    return uncertainty if seen is None else replace(uncertainty, looks=seen.count)
+    uncertainty = measure_uncertainty(result.objective, pose, moved, rivals, relaxed, window, held_m)
+    return uncertainty if seen is None else replace(uncertainty, independent_samples=seen.count)
 
 
-def _loosened(
-    found: Found, window: Window, pose: Matrix4, held: tuple[int, ...], known_m: float
-) -> tuple[Loosened, ...]:
+def _relaxed_assumptions(
+    result: EstimatorResult, window: Window, pose: Matrix4, held: tuple[int, ...], known_m: float
+) -> tuple[RelaxedAssumption, ...]:
     """What changes when the assumptions of the window (held centre, clocks, lens) are set free one by one.
 
     It runs from bands that still feel a lens which is off by pixels to the sharpest edges; empty without edges.
     """
-    return () if found.edges is None else loosen(found.edges.to_the_sharpest, window, pose, held, known_m)
+    return () if result.edges is None else relax_assumptions(result.edges.to_the_sharpest, window, pose, held, known_m)
 
 
-def _from_before(found: Found, window: Window, dof: int) -> tuple[Rivals, ...]:
+def _prior_mode(result: EstimatorResult, window: Window, dof: int) -> tuple[Rivals, ...]:
     """The summit next to the camera's place before the search, as a rival of the pose found.
 
     Empty without edges, without searched translations, or without such a summit.
     """
-    if found.edges is None or dof <= TRANSLATIONS.start:
+    if result.edges is None or dof <= TRANSLATIONS.start:
         return ()
-    pose = found.search.T_camera_lidar
-    summit = summit_from_before(found.edges.to_the_sharpest, window, pose)
-    return () if summit is None else (Rivals(found.objective, pose, (summit,)),)
+    pose = result.search.T_camera_lidar
+    summit = mode_next_to_prior(result.edges.to_the_sharpest, window, pose)
+    return () if summit is None else (Rivals(result.objective, pose, (summit,)),)
 
 
-def _told_of_words(loosened: Sequence[Loosened]) -> str:
+def _contradictions_text(relaxed: Sequence[RelaxedAssumption]) -> str:
     """For people: which assumptions the window contradicts, and by how much the camera turns without each."""
     turns = [
         f"{CONTRADICTED[one.name]} set free, it turns by {degrees(float(np.linalg.norm(one.shift[:3]))):.1f}°"
-        for one in loosened
+        for one in relaxed
         if one.contradicts and one.name in CONTRADICTED
     ]
     return f" ({'; '.join(turns)})" if turns else ""
 
 
-def _told_of_lens(loosened: Sequence[Loosened], window: Window) -> str:
-    lens = [one.deviation[LENS] for one in loosened if one.name == LENS_FREE]
+def _lens_text(relaxed: Sequence[RelaxedAssumption], window: Window) -> str:
+    lens = [one.deviation[LENS] for one in relaxed if one.name == LENS_FREE]
     if not lens:
         return ""
     (right, down, longer), camera = lens[0].tolist(), window.rig.camera

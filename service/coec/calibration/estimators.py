@@ -11,12 +11,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.looks import look
+from coec.calibration.confidence.looks import independent_samples_at
 from coec.calibration.confidence.modes import Rivals
-from coec.calibration.frames.decoded_once import DecodedOnce
+from coec.calibration.frames.decoded_once import CachedImages
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
-from coec.calibration.objective.edges import EdgeWitness, build_edges
+from coec.calibration.objective.edges import EdgeCue, build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
     Divisible,
@@ -93,7 +93,7 @@ points of a sweep."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class WindowData:
     """A window as an estimator sees it.
 
     Sweeps are motion-compensated, depth is inferred and images are decoded only when an estimator asks for them,
@@ -106,9 +106,9 @@ class Sight:
     images: ImageReader
     progress: Progress
 
-    def points(self, index: int, chosen: Choice = EVERY) -> NDArray[np.float32]:
+    def points(self, index: int, selection: Choice = EVERY) -> NDArray[np.float32]:
         """P_i: (N, 3) the chosen points of the sweep of pair `index`, at the instant of the exposure."""
-        return compensate(self.window.pairs[index], self.window.rig, enabled=self.compensated, chosen=chosen)
+        return compensate(self.window.pairs[index], self.window.rig, enabled=self.compensated, selection=selection)
 
     def depths(self) -> list[DepthMap]:
         """D_i of every pair.
@@ -126,45 +126,45 @@ class Sight:
         """
         return self._each("images", lambda index: self.images.grey(self.window.pairs[index].camera))
 
-    def _each(self, stage: str, sight_of: Callable[[int], Seen]) -> Iterator[Seen]:
+    def _each(self, stage: str, load: Callable[[int], Seen]) -> Iterator[Seen]:
         for index, pair in enumerate(self.window.pairs):
             try:
-                seen = sight_of(index)
+                seen = load(index)
             except DecodeError as error:
                 raise CalibrationError(f"no {stage} for the camera frame at {pair.stamp_ns} ns: {error}") from error
             self.progress.step(stage, index + 1, len(self.window.pairs))
             yield seen
 
 
-def sight_of(
+def prepare_window_data(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, progress: Progress
-) -> Sight:
+) -> WindowData:
     """The window as `config` wants it seen. If the rig has no mask, one is found from the window's own frames."""
-    sight = Sight(window, config.motion_compensation, depth, images, progress)
-    return sight if window.rig.mask is not None or len(window.pairs) < MIN_FRAMES else _masked(sight)
+    data = WindowData(window, config.motion_compensation, depth, images, progress)
+    return data if window.rig.mask is not None or len(window.pairs) < MIN_FRAMES else _masked(data)
 
 
-def _masked(sight: Sight) -> Sight:
-    images = DecodedOnce(sight.images)
-    sight = replace(sight, images=images)
-    first_looks = sight._each("images", lambda index: images.first(sight.window.pairs[index].camera))
+def _masked(data: WindowData) -> WindowData:
+    images = CachedImages(data.images)
+    data = replace(data, images=images)
+    first_images = data._each("images", lambda index: images.first(data.window.pairs[index].camera))
     moving = (
         grey
-        for grey, pair in zip(first_looks, sight.window.pairs, strict=True)
+        for grey, pair in zip(first_images, data.window.pairs, strict=True)
         if pair.motion is None or not pair.motion.stays_below(MIN_SPEED_MPS)
     )
-    rig = sight.window.rig
+    rig = data.window.rig
     try:
         mask = lit_pixels(moving)
     except CalibrationError:
-        return sight  # an estimator that needs the images will say so
+        return data  # an estimator that needs the images will say so
     if mask is None or mask.shape != (rig.camera.height, rig.camera.width):
-        return sight
-    return replace(sight, window=replace(sight.window, rig=replace(rig, mask=mask)))
+        return data
+    return replace(data, window=replace(data.window, rig=replace(rig, mask=mask)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class EstimatorResult:
     """What an estimator found.
 
     Attributes:
@@ -179,43 +179,43 @@ class Found:
     search: SearchResult
     metrics: tuple[Metric, ...]
     rivals: tuple[Rivals, ...] = ()
-    edges: EdgeWitness | None = None
+    edges: EdgeCue | None = None
 
 
-Estimator = Callable[[Sight, CalibrationConfig], Found]
+Estimator = Callable[[WindowData, CalibrationConfig], EstimatorResult]
 
 
-def by_depth(sight: Sight, config: CalibrationConfig) -> Found:
+def by_depth(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     """The paper's estimator: BOBYQA on the mutual information of depth and range."""
-    return _by_mutual_information(depth_features(sight, sight.window.T_camera_lidar_start), sight, config)
+    return _by_mutual_information(depth_features(data, data.window.T_camera_lidar_start), data, config)
 
 
-def by_intensity(sight: Sight, config: CalibrationConfig) -> Found:
+def by_intensity(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     """Pandey, McBride, Savarese, Eustice 2012: BOBYQA on the mutual information of reflectance and grey value.
 
     Raises:
         CalibrationError: the sweeps carry no intensity.
     """
     frames = []
-    for index, (pair, grey) in enumerate(zip(sight.window.pairs, sight.greys(), strict=True)):
+    for index, (pair, grey) in enumerate(zip(data.window.pairs, data.greys(), strict=True)):
         if pair.lidar.intensity is None:
             raise CalibrationError(f"the sweep at {pair.lidar.stamp_ns} ns carries no intensity: use another objective")
         pixels = grey.astype(np.float32)
         while pixels.shape[1] > MAX_GREY_WIDTH_PX:
             pixels = halved(pixels)
-        frames.append(Features(sight.points(index), pair.lidar.intensity, pixels))
-    return _by_mutual_information(frames, sight, config)
+        frames.append(Features(data.points(index), pair.lidar.intensity, pixels))
+    return _by_mutual_information(frames, data, config)
 
 
-def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
+def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     """Edges and depth: finds every basin of the edge witness within reach, ranks them by both witnesses, and polishes
     the best on both."""
-    window, progress = sight.window, sight.progress
+    window, progress = data.window, data.progress
     start = window.T_camera_lidar_start
     reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
     # Edges first: depth may be inferred meanwhile.
-    edges = build_edges(window.pairs, sight.points, sight.greys(), window.rig)
-    features = depth_features(sight, start, LEADING_DEPTH_POINTS)
+    edges = build_edges(window.pairs, data.points, data.greys(), window.rig)
+    features = depth_features(data, start, LEADING_DEPTH_POINTS)
     depth = build_mutual_information(features, window.rig, start, reach, config.objective)
     basins = find_basins(edges, start, reach)
     progress.step("basins", 1, 1)
@@ -240,15 +240,15 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     polished = _with_ranks(fusion, [end.T_camera_lidar for end in ends])
 
     _, highest = max(polished, key=lambda end: end[0])
-    independent = look(edges.sharp, highest).count / len(window.pairs)
+    independent = independent_samples_at(edges.sharp, highest).count / len(window.pairs)
 
     def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:
         rank, pose = end
         # Half the square of a rank is, in nats, what the window says against chance, if its frames are independent:
         # ten frames of one view fit a wrong pose ten times. A maximum outside of the reach is a rival, but the answer
         # has to lie inside.
-        told = 0.5 * independent * rank**2 + log_prior(pose, start, window.start_known_to_rad)
-        return not at_rim(pose, start, reach), told
+        log_posterior = 0.5 * independent * rank**2 + log_prior(pose, start, window.start_known_to_rad)
+        return not at_rim(pose, start, reach), log_posterior
 
     _, pose = max(polished, key=preferred)
     contrast = fusion.edge_contrast(pose)
@@ -263,13 +263,13 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
     finest = fusion.settling[-1]
     if fusion.depth_contrast(alike[0][1]) >= TELLING:
-        finest = finest.with_depth(_denser(sight, depth, alike[0][1], config))
+        finest = finest.with_depth(_denser(data, depth, alike[0][1], config))
     last = (fusion.settling[0], finest)
     settled = [polish_in_turn(last, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
     best = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
-    found = replace(best, evaluations=sum(end.evaluations for end in (*ends, *settled)))
-    if at_rim(found.T_camera_lidar, start, reach):
-        found = replace(found, stop_reason=StopReason.AT_BOUND)
+    final = replace(best, evaluations=sum(end.evaluations for end in (*ends, *settled)))
+    if at_rim(final.T_camera_lidar, start, reach):
+        final = replace(final, stop_reason=StopReason.AT_BOUND)
     others = [end.T_camera_lidar for end in settled if end is not best]
     if not _differ(start, best.T_camera_lidar):
         # A window that cannot tell the start from the pose found says nothing.
@@ -278,7 +278,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
         Rivals(finest, best.T_camera_lidar, tuple(others)),
         Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
     )
-    return Found(finest, found, metrics, summits, edges)
+    return EstimatorResult(finest, final, metrics, summits, edges)
 
 
 def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[tuple[float, Matrix4]]:
@@ -294,8 +294,8 @@ def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> lis
     """
     contrasts = fusion.edge_contrasts(np.array(others).reshape(-1, 4, 4))
     for contrast, other in sorted(zip(contrasts, others, strict=True), key=lambda item: -item[0]):
-        apart = se3.difference(other, pose)
-        if any(fusion.edge_contrast(se3.perturb(pose, share * apart)) < contrast for share in BETWEEN):
+        difference = se3.difference(other, pose)
+        if any(fusion.edge_contrast(se3.perturb(pose, share * difference)) < contrast for share in BETWEEN):
             return [contrast]
     return []
 
@@ -321,18 +321,18 @@ def runner_up(contrast: float, rivals: Sequence[float]) -> float:
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
 
 
-def depth_features(sight: Sight, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:
+def depth_features(data: WindowData, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:
     """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4). Every sweep gives the
     same share of its points, so that about `at_most` are used in all.
 
     Raises:
         CalibrationError: a frame has no usable depth.
     """
-    counts = [len(pair.lidar.xyz_m) for pair in sight.window.pairs]
+    counts = [len(pair.lidar.xyz_m) for pair in data.window.pairs]
     share = 1.0 if at_most is None else min(1.0, at_most / max(sum(counts), 1))
     return [
-        distance_and_depth(sight.points(index, _share_of(counts[index], share)), depth, T_camera_lidar)
-        for index, depth in enumerate(sight.depths())
+        distance_and_depth(data.points(index, _share_of(counts[index], share)), depth, T_camera_lidar)
+        for index, depth in enumerate(data.depths())
     ]
 
 
@@ -344,32 +344,32 @@ def _number(count: int, share: float) -> int:
     return count if share >= 1.0 else round(share * count)
 
 
-def _denser(sight: Sight, depth: MutualInformation, pose: Matrix4, config: CalibrationConfig) -> MutualInformation:
+def _denser(data: WindowData, depth: MutualInformation, pose: Matrix4, config: CalibrationConfig) -> MutualInformation:
     """The depth witness with about `SEEN_DEPTH_POINTS` in view at `pose` (4, 4); unchanged if at least half as many are
     in view there already. At least one point must be in view there."""
     seen = depth.evaluate(pose).points_in_view
     if 2 * seen >= SEEN_DEPTH_POINTS:
         return depth
-    counts = [len(pair.lidar.xyz_m) for pair in sight.window.pairs]
+    counts = [len(pair.lidar.xyz_m) for pair in data.window.pairs]
     leading = [_number(count, LEADING_DEPTH_POINTS / sum(counts)) for count in counts]
     share, points, times = SEEN_DEPTH_POINTS / seen * sum(leading) / sum(counts), [], []
     for index, (count, led) in enumerate(zip(counts, leading, strict=True)):
-        chosen = thinned(count, _number(count, share))
-        times.append(len(chosen) / max(led, 1))
-        chosen = chosen[depth.may_see(sight.window.pairs[index].lidar.xyz_m[chosen], pose, DISPLACED)]
-        points.append(distances(sight.points(index, chosen), pose))
+        indices = thinned(count, _number(count, share))
+        times.append(len(indices) / max(led, 1))
+        indices = indices[depth.may_see(data.window.pairs[index].lidar.xyz_m[indices], pose, DISPLACED)]
+        points.append(distances(data.points(index, indices), pose))
     return depth.with_points(points, np.array(times), pose, SETTLING, config.objective)
 
 
-def _by_mutual_information(frames: list[Features], sight: Sight, config: CalibrationConfig) -> Found:
-    start, progress = sight.window.T_camera_lidar_start, sight.progress
+def _by_mutual_information(frames: list[Features], data: WindowData, config: CalibrationConfig) -> EstimatorResult:
+    start, progress = data.window.T_camera_lidar_start, data.progress
     objective: MutualInformation = build_mutual_information(
-        frames, sight.window.rig, start, box_of(config.search), config.objective
+        frames, data.window.rig, start, box_of(config.search), config.objective
     )
     search = maximise(objective, start, config.search, progress)
     mi, unrelated = objective.evaluate(search.T_camera_lidar).mi, objective.mi_of_unrelated(search.T_camera_lidar)
     ratio = Metric("mi_over_unrelated", mi / max(unrelated, 1e-12), config.verdict.min_mi_over_unrelated, at_least=True)
-    return Found(objective, search, (ratio,))
+    return EstimatorResult(objective, search, (ratio,))
 
 
 def _differ(a: Matrix4, b: Matrix4) -> bool:

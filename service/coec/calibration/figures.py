@@ -13,7 +13,7 @@ from coec.calibration.types import INTRINSICS_OFF, MOVED, StopReason
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class DiagnosticFigure:
     """A figure, explained for people.
 
     Attributes:
@@ -25,7 +25,7 @@ class Figure:
 
     title: str
     unit: str
-    tells: str
+    measures: str
     fails: str
     advice: str
 
@@ -35,10 +35,10 @@ _MORE_STRUCTURE = "Take a window where buildings, poles or parked cars are in re
 _CALIBRATE = "Calibrate: `coec calibrate` on a window of this mount tells where the camera is."
 _COMPARE_ONLY = "Nothing: the paper's figures are reported for comparison only; the edges decide."
 
-FIGURES: Mapping[str, Figure] = MappingProxyType(
+FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
     {
         # Of a calibration.
-        "mi_over_unrelated": Figure(
+        "mi_over_unrelated": DiagnosticFigure(
             "Agreement with depth",
             "",
             "Mutual information of the LiDAR's ranges with the depth maps of their own frames, over that with the maps "
@@ -46,28 +46,28 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "depth and LiDAR agree no better than a cloud with the depth map of another frame",
             "Try a depth network that suits the scene (see `coec models assess`), or a window with more in reach.",
         ),
-        "range_edges": Figure(
+        "range_edges": DiagnosticFigure(
             "Range edges",
             "",
             "Independent jumps in range in the sweeps of the window: what the edges of the images are held against.",
             "too little structure: the sweeps have too few independent jumps in range",
             _MORE_SCENES,
         ),
-        "edge_contrast": Figure(
+        "edge_contrast": DiagnosticFigure(
             "Edge contrast",
             "σ",
             "How far the edge score at the result stands above that at other poses, in standard deviations of those.",
             "no pose stands out from the others",
             _MORE_STRUCTURE,
         ),
-        "runner_up": Figure(
+        "runner_up": DiagnosticFigure(
             "Runner-up",
             "",
             "Edge contrast of the next best pose over that of the best one. 1 is a draw.",
             "ambiguous: another pose explains the window nearly as well",
             "Start nearer to the truth, or take a longer window with other scenes in it.",
         ),
-        "edges_once": Figure(
+        "edges_once": DiagnosticFigure(
             "Edges, counted once",
             "σ",
             "How significantly the LiDAR's edges lie on those of the images while the vehicle drives. What all frames "
@@ -75,21 +75,21 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "what fits is the same in all frames although the vehicle drives: lines along the road fit one another",
             "Take a window that passes other things: houses, cars, posts and trees within reach of the LiDAR.",
         ),
-        "newton_step_deg": Figure(
+        "newton_step_deg": DiagnosticFigure(
             "Slope left, rotation",
             "°",
             "How far each rotation axis alone would still go to its maximum; the largest of them.",
             "the objective is not at a maximum on every rotation axis",
             "Calibrate again from this result, or take a window with more frames.",
         ),
-        "newton_step_m": Figure(
+        "newton_step_m": DiagnosticFigure(
             "Slope left, translation",
             "m",
             "How far each translation axis alone would still go to its maximum; the largest of them.",
             "the objective is not at a maximum on every translation axis",
             "Calibrate again from this result, or search the rotation only.",
         ),
-        "peakedness_per_deg2": Figure(
+        "peakedness_per_deg2": DiagnosticFigure(
             "Peakedness",
             "1/°²",
             "How sharply the objective falls off beside the result, as a share of its height, on the flattest rotation "
@@ -97,35 +97,35 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "the objective is too flat on at least one rotation axis",
             _MORE_SCENES,
         ),
-        "sigma_deg": Figure(
+        "sigma_deg": DiagnosticFigure(
             "σ, rotation",
             "°",
             "Standard deviation of the least certain rotation axis.",
             "what was seen does not determine every rotation axis, or is too little to say",
             _MORE_SCENES,
         ),
-        "sigma_m": Figure(
+        "sigma_m": DiagnosticFigure(
             "σ, translation",
             "m",
             "Standard deviation of the least certain translation axis.",
             "what was seen does not determine every translation axis, or is too little to say",
             "Take a longer window with objects near the camera, or search the rotation only.",
         ),
-        "overlap": Figure(
+        "overlap": DiagnosticFigure(
             "Overlap",
             "",
             "LiDAR points in view, over the most that any pose within reach would have in view.",
             "too few LiDAR points are in view",
             "See that the nominal extrinsic, the image size and the mask are those of this camera.",
         ),
-        MOVED: Figure(
+        MOVED: DiagnosticFigure(
             "Moved within the window",
             "σ",
             "What two poses, one after the other, score more than one pose for all frames.",
             "the camera moved while the window was taken",
             "See that the mount is tight, and take another window: no single pose is right for this one.",
         ),
-        INTRINSICS_OFF: Figure(
+        INTRINSICS_OFF: DiagnosticFigure(
             "Other intrinsics",
             "",
             "How certainly another lens explains the window better than the intrinsics that are given.",
@@ -133,35 +133,35 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "Calibrate the intrinsics anew: no extrinsic makes up for wrong ones.",
         ),
         # Of a check.
-        "mi": Figure(
+        "mi": DiagnosticFigure(
             "Mutual information",
             "nats",
             "MI of the paper's equation (1), of LiDAR ranges and depth maps at the extrinsic that is checked.",
             "depth and LiDAR agree less than when the rig was commissioned",
             _COMPARE_ONLY,
         ),
-        "f1": Figure(
+        "f1": DiagnosticFigure(
             "Slope of MI",
             "nats/rad",
             "First derivative f' of the paper's equation (2); zero at a maximum.",
             "mutual information rises beside the extrinsic",
             _COMPARE_ONLY,
         ),
-        "f2": Figure(
+        "f2": DiagnosticFigure(
             "Curvature of MI",
             "nats/rad²",
             "Second derivative f'' of the paper's equation (2); high at a sharp maximum.",
             "mutual information is flat about the extrinsic",
             _COMPARE_ONLY,
         ),
-        "agreement_deg": Figure(
+        "agreement_deg": DiagnosticFigure(
             "Agreement of the witnesses",
             "°",
             "Rotation between where the edges fit best and where depth does.",
             "edges and depth put the camera in different places",
             "See whether the depth network suits the scene (`coec models assess`); the edges decide.",
         ),
-        "distance_rotation": Figure(
+        "distance_rotation": DiagnosticFigure(
             "Distance, rotation",
             "of its limit",
             "How far the rotation at which the edges fit best is from the extrinsic, squared and in the standard "
@@ -169,49 +169,49 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "the edges fit best at another rotation, farther away than they do when the extrinsic is right",
             _CALIBRATE,
         ),
-        "distance_pose": Figure(
+        "distance_pose": DiagnosticFigure(
             "Distance, pose",
             "of its limit",
             "Likewise of rotation and translation together, on the axis that is farthest off.",
             "the edges fit best at another pose, farther away than they do when the extrinsic is right",
             _CALIBRATE,
         ),
-        "edge_score": Figure(
+        "edge_score": DiagnosticFigure(
             "Edge score",
             "σ",
             "How strongly the image has edges where the LiDAR has them, at the extrinsic that is checked.",
             "the image has hardly any edges where the LiDAR has them",
             _MORE_STRUCTURE,
         ),
-        "edges_per_pair": Figure(
+        "edges_per_pair": DiagnosticFigure(
             "Edges per pair",
             "σ",
             "The same where the edges fit best, for each pair of frames.",
             "the edges are fainter than a check can rely on: it counts less",
             _MORE_STRUCTURE,
         ),
-        "edges_kept_rotation": Figure(
+        "edges_kept_rotation": DiagnosticFigure(
             "Edges kept, rotation",
             "",
             "Edge score at the extrinsic, over that at the rotation that fits best. 1: nothing is gained by turning.",
             "turning the camera gains more edges than chance does",
             _CALIBRATE,
         ),
-        "edges_kept_pose": Figure(
+        "edges_kept_pose": DiagnosticFigure(
             "Edges kept, pose",
             "",
             "Edge score at the extrinsic, over that at the pose that fits best. 1: nothing is gained by moving.",
             "moving the camera gains more edges than chance does",
             _CALIBRATE,
         ),
-        "certainty_rotation": Figure(
+        "certainty_rotation": DiagnosticFigure(
             "Certainty, rotation",
             "σ",
             "How certainly another rotation gains more than the frames differ from one another.",
             "the frames insist on another rotation",
             _CALIBRATE,
         ),
-        "certainty_pose": Figure(
+        "certainty_pose": DiagnosticFigure(
             "Certainty, pose",
             "σ",
             "How certainly another pose gains more than the frames differ from one another.",

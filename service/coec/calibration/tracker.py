@@ -73,20 +73,20 @@ class Measurement:
     stamp_ns: int
 
     @classmethod
-    def of(cls, estimate: Estimate) -> Measurement:
+    def from_estimate(cls, estimate: Estimate) -> Measurement:
         """What an estimate tells about the axes that it solved."""
-        told, noise = estimate.solved, estimate.uncertainty.noise
-        uncertainty = replace(estimate.uncertainty, noise=np.where(told[:, None] & told, noise, np.nan))
+        determined, noise = estimate.solved, estimate.uncertainty.noise
+        uncertainty = replace(estimate.uncertainty, noise=np.where(determined[:, None] & determined, noise, np.nan))
         return cls(estimate.optimum.T_camera_lidar, uncertainty, estimate.data_stamp_ns)
 
-    def told_axes(self) -> list[int]:
+    def determined_axes(self) -> list[int]:
         """Axes with a finite variance above zero."""
         variances = self.uncertainty.noise.diagonal()
         return [axis for axis in range(6) if np.isfinite(variances[axis]) and variances[axis] > 0.0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Belief:
+class PosePosterior:
     """A pose and what is known of it.
 
     Attributes:
@@ -124,11 +124,11 @@ class Track:
         chance: how probable a distance at least as large is without a step; 1 before the first window.
     """
 
-    slow: Belief
+    slow: PosePosterior
     prior_sigma: NDArray[np.float64]
     stamp_ns: int
     step: StepState = StepState.NONE
-    candidate: Belief | None = None
+    candidate: PosePosterior | None = None
     innovation: float = 0.0
     chance: float = 1.0
 
@@ -144,7 +144,7 @@ class Track:
             raise ValueError("T_camera_lidar of a track must be a rigid transform (4, 4)")
         if sigma.shape != (6,) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
             raise ValueError(f"prior_sigma of a track must be six positive numbers, got {sigma.tolist()}")
-        return cls(Belief(T_camera_lidar, np.diag(sigma**2), {}, np.zeros(6, np.bool_), 0), sigma, stamp_ns)
+        return cls(PosePosterior(T_camera_lidar, np.diag(sigma**2), {}, np.zeros(6, np.bool_), 0), sigma, stamp_ns)
 
     @property
     def T_camera_lidar(self) -> Matrix4:
@@ -183,59 +183,59 @@ def creep_sigma(config: TrackerConfig) -> NDArray[np.float64]:
     return np.array([radians(config.drift_deg_per_sqrt_h)] * 3 + [config.drift_m_per_sqrt_h] * 3)
 
 
-def absorb(track: Track, measurement: Measurement, config: TrackerConfig, *, doubted: bool = False) -> Track:
+def update_track(track: Track, measurement: Measurement, config: TrackerConfig, *, doubted: bool = False) -> Track:
     """The track after another accepted window; a window that determines no axis leaves the track unchanged. `doubted`:
     whether the monitor doubts what is served."""
-    axes = measurement.told_axes()
+    axes = measurement.determined_axes()
     if not axes:
         return track
     elapsed_h = max(0, measurement.stamp_ns - track.stamp_ns) / NS_PER_H
     slow = _drifted(track.slow, elapsed_h, config)
     distance, chance = _disagreement(slow, measurement, axes)
     stamp_ns = max(track.stamp_ns, measurement.stamp_ns)
-    heard = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
+    updated = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
     if chance >= config.step_false_alarm:
         if doubted and chance < DOUBTFUL:
             slow = _grown(slow, measurement, axes)
-        return replace(heard, slow=_updated(slow, measurement, axes), step=StepState.NONE, candidate=None)
+        return replace(updated, slow=_updated(slow, measurement, axes), step=StepState.NONE, candidate=None)
     alone = _restarted(track, measurement, axes)
     if chance < config.overwhelming_false_alarm:
-        return replace(heard, slow=alone, step=StepState.CONFIRMED, candidate=None)
+        return replace(updated, slow=alone, step=StepState.CONFIRMED, candidate=None)
     if track.candidate is not None:
         fast = _drifted(track.candidate, elapsed_h, config)
         _, chance_of_fast = _disagreement(fast, measurement, axes)
         if chance_of_fast >= config.step_false_alarm:
-            return replace(heard, slow=_updated(fast, measurement, axes), step=StepState.CONFIRMED, candidate=None)
-    return replace(heard, step=StepState.SUSPECTED, candidate=alone)
+            return replace(updated, slow=_updated(fast, measurement, axes), step=StepState.CONFIRMED, candidate=None)
+    return replace(updated, step=StepState.SUSPECTED, candidate=alone)
 
 
 def fits(T_camera_lidar: Matrix4, measurement: Measurement) -> bool:
     """Whether a window vouches for a pose (4, 4): the pose is not improbable if the window is right."""
-    axes = measurement.told_axes()
+    axes = measurement.determined_axes()
     if not axes:
         return True
-    exact = Belief(T_camera_lidar, np.zeros((6, 6)), {}, np.zeros(6, np.bool_), 0)
+    exact = PosePosterior(T_camera_lidar, np.zeros((6, 6)), {}, np.zeros(6, np.bool_), 0)
     return _disagreement(exact, measurement, axes)[1] >= IMPROBABLE
 
 
-def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belief:
+def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> PosePosterior:
     """A belief from one window alone. Axes that the window does not determine keep their values, but with the spread of
     the prior, because after a step nothing else vouches for them."""
     away = se3.difference(measurement.T_camera_lidar, track.T_camera_lidar)
     covariance = np.diag(track.prior_sigma**2)
     covariance[np.ix_(axes, axes)] = measurement.uncertainty.noise[np.ix_(axes, axes)]
-    told = np.isin(np.arange(6), axes)
-    systematic = {name: np.where(told, shift, 0.0) for name, shift in measurement.uncertainty.systematic.items()}
-    pose = se3.perturb(track.T_camera_lidar, np.where(told, away, 0.0))
-    return Belief(pose, covariance, systematic, told, 1)
+    determined = np.isin(np.arange(6), axes)
+    systematic = {name: np.where(determined, shift, 0.0) for name, shift in measurement.uncertainty.systematic.items()}
+    pose = se3.perturb(track.T_camera_lidar, np.where(determined, away, 0.0))
+    return PosePosterior(pose, covariance, systematic, determined, 1)
 
 
-def _drifted(belief: Belief, elapsed_h: float, config: TrackerConfig) -> Belief:
+def _drifted(posterior: PosePosterior, elapsed_h: float, config: TrackerConfig) -> PosePosterior:
     """The belief after `elapsed_h` hours in which the mount may have crept."""
-    return replace(belief, covariance=belief.covariance + np.diag(elapsed_h * creep_sigma(config) ** 2))
+    return replace(posterior, covariance=posterior.covariance + np.diag(elapsed_h * creep_sigma(config) ** 2))
 
 
-def _grown(slow: Belief, measurement: Measurement, axes: list[int]) -> Belief:
+def _grown(slow: PosePosterior, measurement: Measurement, axes: list[int]) -> PosePosterior:
     """The slow track with a covariance that explains a window."""
     grown = slow
     # Ends: the distance of the window falls to nothing as the covariance grows.
@@ -244,34 +244,34 @@ def _grown(slow: Belief, measurement: Measurement, axes: list[int]) -> Belief:
     return grown
 
 
-def _disagreement(belief: Belief, measurement: Measurement, axes: list[int]) -> tuple[float, float]:
+def _disagreement(posterior: PosePosterior, measurement: Measurement, axes: list[int]) -> tuple[float, float]:
     """Squared Mahalanobis distance of a window on the axes it determines, and the chance of one as large. Errors that
     windows of one scene have in common differ between scenes, so the window's systematic errors count as noise here."""
-    away = se3.difference(measurement.T_camera_lidar, belief.T_camera_lidar).tolist()
-    spread = (belief.covariance + measurement.uncertainty.covariance).tolist()
+    away = se3.difference(measurement.T_camera_lidar, posterior.T_camera_lidar).tolist()
+    spread = (posterior.covariance + measurement.uncertainty.covariance).tolist()
     s = [[spread[i][j] for j in axes] for i in axes]
     y = [away[i] for i in axes]
     distance = fsum(a * b for a, b in zip(y, solved(s, y), strict=True))
     return distance, chi_square_tail(distance, len(axes))
 
 
-def _updated(belief: Belief, measurement: Measurement, axes: list[int]) -> Belief:
+def _updated(posterior: PosePosterior, measurement: Measurement, axes: list[int]) -> PosePosterior:
     """The Kalman update with the window's perturbation from the belief, on the axes that the window determines.
 
     K = P Hᵀ (H P Hᵀ + R)⁻¹, ξ = K y, P ← (1 - K H) P (1 - K H)ᵀ + K R Kᵀ (Joseph's form: stays positive definite).
     A systematic error is the same in every window and shifts the belief as it shifts the window, b ← (1 - K H) b + K s.
     It is considered, not estimated (Schmidt 1966), because no number of windows can determine it.
     """
-    p, r = belief.covariance.tolist(), measurement.uncertainty.noise.tolist()
-    away = se3.difference(measurement.T_camera_lidar, belief.T_camera_lidar).tolist()
+    p, r = posterior.covariance.tolist(), measurement.uncertainty.noise.tolist()
+    away = se3.difference(measurement.T_camera_lidar, posterior.T_camera_lidar).tolist()
     s = [[p[i][j] + r[i][j] for j in axes] for i in axes]
     gain = [solved(s, [p[row][j] for j in axes]) for row in range(6)]  # S is symmetric: K's rows solve S·k = P's
     xi = np.array([fsum(k * away[j] for k, j in zip(row, axes, strict=True)) for row in gain])
-    told = {axis: place for place, axis in enumerate(axes)}
-    keep = [[float(i == j) - (gain[i][told[j]] if j in told else 0.0) for j in range(6)] for i in range(6)]
+    column = {axis: place for place, axis in enumerate(axes)}
+    keep = [[float(i == j) - (gain[i][column[j]] if j in column else 0.0) for j in range(6)] for i in range(6)]
     noise = [[r[i][j] for j in axes] for i in axes]
     covariance = np.array(congruent(keep, p)) + np.array(congruent(gain, noise))
-    before, of_window, none = belief.systematic, measurement.uncertainty.systematic, np.zeros(6)
+    before, of_window, none = posterior.systematic, measurement.uncertainty.systematic, np.zeros(6)
     systematic = {}
     for name in sorted({*before, *of_window}):
         old, new = before.get(name, none).tolist(), of_window.get(name, none).tolist()
@@ -281,12 +281,12 @@ def _updated(belief: Belief, measurement: Measurement, axes: list[int]) -> Belie
             for i in range(6)
         ]
         systematic[name] = np.array(shift)
-    return Belief(
-        se3.perturb(belief.T_camera_lidar, xi),
+    return PosePosterior(
+        se3.perturb(posterior.T_camera_lidar, xi),
         0.5 * (covariance + covariance.T),
         systematic,
-        belief.observed | np.isin(np.arange(6), axes),
-        belief.windows + 1,
+        posterior.observed | np.isin(np.arange(6), axes),
+        posterior.windows + 1,
     )
 
 
@@ -310,8 +310,8 @@ def chi_square_tail(x: float, degrees_of_freedom: int) -> float:
 def track_to_dict(track: Track) -> dict[str, Any]:
     """Plain values for JSON; floats survive it to the last bit."""
     return {
-        "slow": _belief_to_dict(track.slow),
-        "candidate": None if track.candidate is None else _belief_to_dict(track.candidate),
+        "slow": _posterior_to_dict(track.slow),
+        "candidate": None if track.candidate is None else _posterior_to_dict(track.candidate),
         "prior_sigma": track.prior_sigma.tolist(),
         "stamp_ns": track.stamp_ns,
         "step": track.step.value,
@@ -329,11 +329,11 @@ def track_from_dict(document: Mapping[str, Any]) -> Track:
     try:
         candidate = document["candidate"]
         return Track(
-            slow=_belief_from_dict(document["slow"]),
+            slow=_posterior_from_dict(document["slow"]),
             prior_sigma=_array(document["prior_sigma"], (6,)),
             stamp_ns=int(document["stamp_ns"]),
             step=StepState(document["step"]),
-            candidate=None if candidate is None else _belief_from_dict(candidate),
+            candidate=None if candidate is None else _posterior_from_dict(candidate),
             innovation=float(document["innovation"]),
             chance=float(document["chance"]),
         )
@@ -341,18 +341,18 @@ def track_from_dict(document: Mapping[str, Any]) -> Track:
         raise ValueError(f"not a track: {error}") from error
 
 
-def _belief_to_dict(belief: Belief) -> dict[str, Any]:
+def _posterior_to_dict(posterior: PosePosterior) -> dict[str, Any]:
     return {
-        "T_camera_lidar": belief.T_camera_lidar.tolist(),
-        "covariance": belief.covariance.tolist(),
-        "systematic": {name: shift.tolist() for name, shift in belief.systematic.items()},
-        "observed": belief.observed.tolist(),
-        "windows": belief.windows,
+        "T_camera_lidar": posterior.T_camera_lidar.tolist(),
+        "covariance": posterior.covariance.tolist(),
+        "systematic": {name: shift.tolist() for name, shift in posterior.systematic.items()},
+        "observed": posterior.observed.tolist(),
+        "windows": posterior.windows,
     }
 
 
-def _belief_from_dict(document: Mapping[str, Any]) -> Belief:
-    return Belief(
+def _posterior_from_dict(document: Mapping[str, Any]) -> PosePosterior:
+    return PosePosterior(
         _array(document["T_camera_lidar"], (4, 4)),
         _array(document["covariance"], (6, 6)),
         {str(name): _array(shift, (6,)) for name, shift in document["systematic"].items()},

@@ -354,19 +354,19 @@ class Verdict:
     reasons: tuple[Reason, ...]
 
     @property
-    def tells_two_poses(self) -> bool:
+    def shows_two_poses(self) -> bool:
         """Whether a refused window failed only because the camera moved within it."""
         codes = {reason.code for reason in self.reasons}
         return MOVED in codes and codes <= TWO_POSES
 
     @property
-    def tells_another_lens(self) -> bool:
+    def shows_another_lens(self) -> bool:
         """Whether a refused window shows a pose that would stand out more clearly through another lens."""
         codes = {reason.code for reason in self.reasons}
         return INTRINSICS_OFF in codes and not codes & {"edge_contrast", "range_edges", "overlap"}
 
     @property
-    def cannot_tell(self) -> bool:
+    def is_inconclusive(self) -> bool:
         """Whether a refused window says nothing about where the camera is: it shows too little, or several answers."""
         codes = {reason.code for reason in self.reasons}
         return not codes or not codes <= ELSEWHERE
@@ -385,7 +385,7 @@ class Uncertainty:
 
     noise: NDArray[np.float64]
     systematic: Mapping[str, NDArray[np.float64]]
-    looks: float
+    independent_samples: float
 
     @classmethod
     def unknown(cls) -> Uncertainty:
@@ -395,8 +395,8 @@ class Uncertainty:
     @classmethod
     def independent(cls, sigma: NDArray[np.float64]) -> Uncertainty:
         """Noise alone with uncorrelated axes, from standard deviations (6,); NaN on axes that were not determined."""
-        told = np.isfinite(sigma)
-        noise = np.where(told[:, None] & told, np.diag(np.where(told, sigma, 0.0) ** 2), np.nan)
+        determined = np.isfinite(sigma)
+        noise = np.where(determined[:, None] & determined, np.diag(np.where(determined, sigma, 0.0) ** 2), np.nan)
         return cls(noise, {}, np.nan)
 
     @property

@@ -17,8 +17,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.looks import Looks
-from coec.calibration.confidence.loosened import LENS_FREE, Loosened
+from coec.calibration.confidence.looks import IndependentSamples
+from coec.calibration.confidence.loosened import LENS_FREE, RelaxedAssumption
 from coec.calibration.figures import FIGURES
 from coec.calibration.frames.sampling import drives
 from coec.calibration.objective.curvature import Curvature
@@ -43,16 +43,16 @@ tenths and more on a drive through streets, a fifth to a third in slow traffic a
 with a standing vehicle."""
 
 
-def saw_one_scene(looks: float, frames: int) -> bool:
+def saw_one_scene(independent_samples: float, frames: int) -> bool:
     """Whether frames that are worth so many independent `looks` show the same again and again, as those of a standing
     vehicle do."""
-    return looks < SAME_SCENE * frames
+    return independent_samples < SAME_SCENE * frames
 
 
-def counted_once(metrics: tuple[Metric, ...], looks: float, frames: int) -> tuple[Metric, ...]:
+def counted_once(metrics: tuple[Metric, ...], independent_samples: float, frames: int) -> tuple[Metric, ...]:
     """The metrics of an objective, with what the frames have in common counted once, not once a frame. If the number of
     independent `looks` is not finite, every frame counts."""
-    share = looks / frames if isfinite(looks) else 1.0
+    share = independent_samples / frames if isfinite(independent_samples) else 1.0
     return tuple(replace(m, value=m.value * share) if m.name == COUNTED else m for m in metrics)
 
 
@@ -88,7 +88,9 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
     return (Metric(MOVED, gain, limits.max_change_gain, at_least=False),)
 
 
-def repetition_metric(looks: Looks | None, pairs: Sequence[FramePair], limits: VerdictConfig) -> tuple[Metric, ...]:
+def repetition_metric(
+    independent_samples: IndependentSamples | None, pairs: Sequence[FramePair], limits: VerdictConfig
+) -> tuple[Metric, ...]:
     """How significant the edges are if all that frames have in common counts once; empty if no edges were used, or if
     the vehicle is not known to drive.
 
@@ -96,12 +98,12 @@ def repetition_metric(looks: Looks | None, pairs: Sequence[FramePair], limits: V
     the lines along its road, and any two of those fit each other. On 25 simulated drives, most of them along motorways,
     such lines bring wrong poses up to 13.7; right poses that are accepted are at 29 and more.
     """
-    if looks is None or not drives(pairs):
+    if independent_samples is None or not drives(pairs):
         return ()
-    return (Metric("edges_once", looks.significance, limits.min_edges_once, at_least=True),)
+    return (Metric("edges_once", independent_samples.significance, limits.min_edges_once, at_least=True),)
 
 
-def intrinsics_metric(loosened: Sequence[Loosened], limits: VerdictConfig) -> tuple[Metric, ...]:
+def intrinsics_metric(relaxed: Sequence[RelaxedAssumption], limits: VerdictConfig) -> tuple[Metric, ...]:
     """How certainly another lens explains the window better than that of the rig; empty if none was tried. A lens that
     hardly moves the edges (`Loosened.matters`) counts as 0."""
     return tuple(
@@ -111,7 +113,7 @@ def intrinsics_metric(loosened: Sequence[Loosened], limits: VerdictConfig) -> tu
             limits.max_intrinsics_certainty,
             at_least=False,
         )
-        for one in loosened
+        for one in relaxed
         if one.name == LENS_FREE
     )
 
@@ -127,7 +129,7 @@ def _newton_step(curvature: Curvature, axes: slice) -> float:
 def judge(
     metrics: tuple[Metric, ...],
     stop: StopReason,
-    looks: float,
+    independent_samples: float,
     frames: int,
     details: Mapping[str, str] = MappingProxyType({}),
 ) -> Verdict:
@@ -144,7 +146,7 @@ def judge(
     ]
     if stop is not StopReason.TOLERANCE:
         reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
-    if saw_one_scene(looks, frames) and any(reason.code in UNCERTAIN for reason in reasons):
-        told = f"{frames} frames are worth {looks:.1f} independent ones: a window past other things would settle more"
-        reasons.append(Reason("motion", told))
+    if saw_one_scene(independent_samples, frames) and any(reason.code in UNCERTAIN for reason in reasons):
+        text = f"{frames} frames are worth {independent_samples:.1f} independent ones: a window past other things would settle more"
+        reasons.append(Reason("motion", text))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

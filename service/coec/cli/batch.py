@@ -16,7 +16,7 @@ from coec.cli.options import Json
 from coec.errors import UsageError
 
 if TYPE_CHECKING:
-    from coec.fleet.engines.engine import Bounds, Engine
+    from coec.fleet.engines.engine import Engine, WorkerLimits
     from coec.schemas.fleet import BatchReport, WindowRow
 
 MIB = 2**20
@@ -88,14 +88,14 @@ def batch(
 ) -> int:
     """Evaluate many windows again: exit 0 if every one has a result, 1 if not."""
     from coec.fleet import batch as fleet_batch
-    from coec.fleet.engines.engine import Bounds
+    from coec.fleet.engines.engine import WorkerLimits
     from coec.fleet.places import jobs_of
-    from coec.fleet.terms import terms_of
+    from coec.fleet.terms import load_settings
     from coec.reports import console
 
-    terms = terms_of(with_config, rig, depth)
+    terms = load_settings(with_config, rig, depth)
     inputs = jobs_of(windows)
-    bounds = Bounds(deadline_s, memory_mib * MIB)
+    bounds = WorkerLimits(deadline_s, memory_mib * MIB)
     if keep_going:
         bounds = replace(bounds, alike=None)
     # Ray prints what happens to its nodes on standard output, which is for the report. Its log files have it, too.
@@ -113,7 +113,9 @@ def batch(
     return 1 if report.errors else 0
 
 
-def _engine(name: str, jobs: int | None, bounds: Bounds, ray_address: str | None, *, send_credentials: bool) -> Engine:
+def _engine(
+    name: str, jobs: int | None, bounds: WorkerLimits, ray_address: str | None, *, send_credentials: bool
+) -> Engine:
     if name == "ray":
         from coec.fleet.engines.ray import RayEngine
 

@@ -50,7 +50,7 @@ def calibrate(
         perturbation_of(options["perturb"] or ())
     with console.progress() as bars:
         times = StageTimes(bars)
-        loaded = windows.load(
+        loaded = windows.load_window(
             source, options.get("frames"), WindowConfig().pairs, lambda done, total: times.step("load", done, total)
         )
         with picture_of_lens_error(output, loaded.window.rig.camera):
@@ -157,7 +157,7 @@ def _write(
         paths.append(pictures.write_lens(folder, camera, window.rig.camera))
         blocks = (*blocks, Pictures((file_picture(paths[-1]),)))
     report = CalibrationReport.model_validate(document)
-    written = files.write(folder / "result.json", to_json(report))
+    written = files.write_output(folder / "result.json", to_json(report))
     remarks = calibration.remarks(document.get("camera_fit"), document.get("time_offset"))
     of_result = calibration_page(report, window, calibration.start_of(window), blocks, remarks, provenance.here())
     return [*paths, written, page.write(folder / "report.html", of_result)], comparison.left_out

@@ -12,9 +12,9 @@ from coec.errors import CalibrationError, SourceError
 
 if TYPE_CHECKING:
     from coec.calibration.types import Estimate
-    from coec.evaluation.fitness import Cadence, Fitness, Remark
+    from coec.evaluation.fitness import Cadence, Fitness, Notice
     from coec.reports.stage_times import StageTimes
-    from coec.sources import Recording
+    from coec.sources import RecordingSource
 
 PAIRS = 6
 """Pairs of the trial, evenly chosen: as many as in a check of the monitor."""
@@ -53,7 +53,7 @@ def check(
     return int(failed or isinstance(trial, CalibrationError))
 
 
-def _trial(recording: Recording, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
+def _trial(recording: RecordingSource, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
     """A calibration of a few pairs near the recording's own extrinsic: shows how well this scene fixes the pose."""
     from coec.adapters.depth.maps import open_depth
     from coec.adapters.images.codec import GreyImages
@@ -61,7 +61,7 @@ def _trial(recording: Recording, depth: str | None, times: StageTimes) -> Estima
     from coec.config import LimitsConfig
     from coec.sources import windows
 
-    loaded = windows.chosen_from(recording, PAIRS, lambda done, total: times.step("load", done, total))
+    loaded = windows.window_of_recording(recording, PAIRS, lambda done, total: times.step("load", done, total))
     window = loaded.window
     configuration = configuration_of(SolverOptions(depth=depth), loaded.configuration)
     limits = LimitsConfig()
@@ -71,14 +71,14 @@ def _trial(recording: Recording, depth: str | None, times: StageTimes) -> Estima
         return error
 
 
-def _of_trial(trial: Estimate | CalibrationError | None) -> tuple[Remark, ...]:
-    from coec.evaluation.fitness import Remark
+def _of_trial(trial: Estimate | CalibrationError | None) -> tuple[Notice, ...]:
+    from coec.evaluation.fitness import Notice
 
     if isinstance(trial, CalibrationError):
-        return (Remark("fail", "no_calibration", str(trial)),)
+        return (Notice("fail", "no_calibration", str(trial)),)
     if trial is None:
         return ()
-    return tuple(Remark("warn", reason.code, reason.text) for reason in trial.verdict.reasons)
+    return tuple(Notice("warn", reason.code, reason.text) for reason in trial.verdict.reasons)
 
 
 def _document(source: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> dict[str, Any]:

@@ -28,8 +28,8 @@ def check_config(
     as_json: Json = False,
 ) -> int:
     """Print the effective configuration with every default; exit 78 if it, or a file it names, cannot be used."""
-    from coec.adapters.tls.conversation import Listener, credentials_of
-    from coec.adapters.zenoh.settings import check_certificates, settings_of, where
+    from coec.adapters.tls.conversation import CommandListener, credentials_of
+    from coec.adapters.zenoh.settings import check_certificates, settings_of, settings_source
     from coec.config import config_hash, load_config
     from coec.reports import console
     from coec.reports.commented_yaml import commented_yaml
@@ -49,10 +49,10 @@ def check_config(
         checks.append(f"no pairs of sensors that see nothing in common: {', '.join(config.left_out)}")
     if config.zenoh.file is not None:
         checks.append(_check_file(config.zenoh.file, "zenoh.file"))
-    check_certificates(settings_of(config.zenoh, config.limits), where(config.zenoh))
+    check_certificates(settings_of(config.zenoh, config.limits), settings_source(config.zenoh))
     credentials = credentials_of(config.authority)
     if credentials is not None:
-        Listener(credentials)
+        CommandListener(credentials)
         checks.append(f"authority.certificate {credentials.certificate}")
     digest = config_hash(config)
     if as_json:

@@ -113,7 +113,7 @@ def load(sources: Sequence[str], options: SolverOptions, times: StageTimes) -> R
     if not sources:
         raise UsageError("name at least one recording of a rig whose calibration is right")
     loaded = [
-        windows.load(
+        windows.load_window(
             source,
             options.get("frames"),
             WindowConfig().pairs,

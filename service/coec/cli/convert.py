@@ -17,7 +17,7 @@ from coec.errors import OutputError, UsageError
 if TYPE_CHECKING:
     from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
     from coec.config import CalibrationConfig, PairConfig, SweepConfig, WindowConfig
-    from coec.sources import Recording
+    from coec.sources import RecordingSource
 
 NS_PER_S = 1_000_000_000
 
@@ -79,18 +79,18 @@ def convert(
     return 0
 
 
-def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path | None) -> PairConfig:
+def configuration_for(recording: RecordingSource, T_camera_lidar: Matrix4, mask: Path | None) -> PairConfig:
     """A pair that accepts the frames of a recording as they are, on `sensors/<pair>/camera|lidar|ego`.
 
     Its window is one that the recording can fill, see `_window`.
     """
     from coec.adapters.files.rig import intrinsics_config, matrix_rows
-    from coec.adapters.zenoh.player import Streams
+    from coec.adapters.zenoh.player import StreamKeys
     from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
     from coec.config import CameraConfig, EgoConfig, LidarConfig, PairConfig
 
     rig = recording.rig
-    streams = Streams.default(rig.pair)
+    streams = StreamKeys.default(rig.pair)
     first = first_frames(recording)
     motion = next((frame for frame in first if isinstance(frame, EgoMotion)), None)
     camera = next(frame for frame in first if isinstance(frame, CameraFrame))
@@ -141,12 +141,12 @@ def _calibration(camera: CameraFrame) -> CalibrationConfig:
     return CalibrationConfig() if camera.depth is None else CalibrationConfig(depth=DepthConfig(model=STEREO))
 
 
-def first_frames(recording: Recording) -> list[CameraFrame | LidarFrame | EgoMotion]:
+def first_frames(recording: RecordingSource) -> list[CameraFrame | LidarFrame | EgoMotion]:
     """The first camera frame, and the frames that are needed to pair it."""
     return list(recording.messages([0]))
 
 
-def _configuration(recording: Recording, out: Path, *, full: bool, force: bool) -> list[Path]:
+def _configuration(recording: RecordingSource, out: Path, *, full: bool, force: bool) -> list[Path]:
     import numpy as np
 
     from coec.adapters.files import output
@@ -167,11 +167,11 @@ def _configuration(recording: Recording, out: Path, *, full: bool, force: bool) 
         text = f"{head}# Keys that are not here have their defaults: `coec check-config {out.name}` prints them all.\n"
         text += short_yaml(config, ALWAYS, COMMENTS)
     if mask is None:
-        return [output.replace(out, text.encode())]
+        return [output.replace_output(out, text.encode())]
     had_mask = mask_path.exists()
-    output.replace(mask_path, mask_to_png(np.asarray(mask)))
+    output.replace_output(mask_path, mask_to_png(np.asarray(mask)))
     try:
-        output.replace(out, text.encode())
+        output.replace_output(out, text.encode())
     except OutputError:
         if not had_mask:  # it would refuse the next try
             mask_path.unlink(missing_ok=True)
@@ -179,7 +179,7 @@ def _configuration(recording: Recording, out: Path, *, full: bool, force: bool) 
     return [mask_path, out]
 
 
-def _bag(recording: Recording, out: Path) -> list[Path]:
+def _bag(recording: RecordingSource, out: Path) -> list[Path]:
     from coec.adapters.mcap.bag_writer import write_bag
     from coec.calibration.types import CameraFrame
     from coec.reports import console

@@ -88,13 +88,13 @@ def diagnose(
 def _detection(rigged: RigWindows, splits: int, checks: int, times: StageTimes) -> DetectionReport:
     """How well moved extrinsics are detected on the window."""
     from coec.calibration.commissioning.learning import FAR_RAD
-    from coec.calibration.estimators import sight_of
+    from coec.calibration.estimators import prepare_window_data
     from coec.calibration.monitor.check import gather
     from coec.evaluation.detection import try_detection
     from coec.reports.evaluation_documents import detection_of
 
     window = rigged.windows[0]
-    evidence = gather(sight_of(window, rigged.depth, rigged.images, rigged.configuration, times), FAR_RAD)
+    evidence = gather(prepare_window_data(window, rigged.depth, rigged.images, rigged.configuration, times), FAR_RAD)
     tried = try_detection(
         evidence,
         window.T_camera_lidar_start,
@@ -125,7 +125,7 @@ def _moved(window: Window, perturb: str | None) -> Window:
 
     if perturb is None:
         return window
-    moved = se3.perturb(window.T_camera_lidar_start, windows.vector_of("--perturb", perturb))
+    moved = se3.perturb(window.T_camera_lidar_start, windows.parse_perturbation("--perturb", perturb))
     return replace(window, T_camera_lidar_start=moved)
 
 
@@ -151,7 +151,9 @@ def _baseline(file: Path | None, window: Window, rigged: RigWindows) -> Baseline
     return baseline
 
 
-def _document(seen: Observation, finding: diagnosis.Finding, measured: diagnosis.Measured | None) -> dict[str, Any]:
+def _document(
+    seen: Observation, finding: diagnosis.ExtrinsicFinding, measured: diagnosis.SolvedOffset | None
+) -> dict[str, Any]:
     from coec.adapters.files.conversions import metric_of
 
     return {
@@ -172,7 +174,7 @@ def _document(seen: Observation, finding: diagnosis.Finding, measured: diagnosis
     }
 
 
-def _show(seen: Observation, finding: diagnosis.Finding) -> None:
+def _show(seen: Observation, finding: diagnosis.ExtrinsicFinding) -> None:
     from coec.adapters.files.conversions import metric_of
     from coec.reports import console, diagnosis
 
@@ -192,7 +194,7 @@ def _show(seen: Observation, finding: diagnosis.Finding) -> None:
     console.show_metrics({metric.name: metric_of(metric) for metric in seen.metrics if metric.value is not None})
 
 
-def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosis.Measured | None:
+def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosis.SolvedOffset | None:
     """How far off a flagged extrinsic is, by a solve of all pairs within reach of it; None without a result.
     Translations are searched if the check sees one. If not, the camera's centre counts as known only as well as the
     check knows it, because what turned the mount may also have shifted it."""
@@ -218,7 +220,7 @@ def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosi
         return None
     difference = se3.difference(estimate.optimum.T_camera_lidar, window.T_camera_lidar_start)
     sigma = in_degrees(estimate.uncertainty.sigma)
-    return diagnosis.Measured(
+    return diagnosis.SolvedOffset(
         offset=tuple(in_degrees(difference)),
         sigma=tuple(value if solved else None for value, solved in zip(sigma, estimate.solved, strict=True)),
         accepted=estimate.verdict.decision is Decision.ACCEPTED,
@@ -228,7 +230,7 @@ def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosi
 
 
 def _write(
-    folder: Path, seen: Observation, window: Window, rigged: RigWindows, measured: diagnosis.Measured | None
+    folder: Path, seen: Observation, window: Window, rigged: RigWindows, measured: diagnosis.SolvedOffset | None
 ) -> None:
     from coec.config import config_hash
     from coec.reports import page, pictures, provenance

@@ -19,7 +19,7 @@ from coec.errors import ConfigError, ModelError
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.adapters.zenoh.ros_topics import Topics
+    from coec.adapters.zenoh.ros_topics import RosTopicList
     from coec.config import Config, OpenPairConfig
     from coec.schemas.doctor import Finding
 
@@ -130,12 +130,12 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
     from coec.adapters.zenoh.settings import connected_of, listened_of, settings_of
     from coec.cli.doctor_computer import fail, ok
     from coec.config import load_config
-    from coec.runtime.nominal.kept import with_kept
+    from coec.runtime.nominal.kept import with_discovered
 
     advice = "correct it, or name another with --config; `coec check-config FILE` prints what a file comes to"
     try:
         config = load_config(path.resolve())  # absolute, as paths are in a service
-        config = with_kept(config)
+        config = with_discovered(config)
         for pair in config.pairs:
             rig_of(pair)
         for undiscovered in config.awaited:
@@ -149,7 +149,7 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
     return config, ok("configuration", str(path), f"valid; vehicle {config.vehicle}, pairs {names}")
 
 
-def _undiscovered(pair: OpenPairConfig, there: Topics) -> Finding:
+def _undiscovered(pair: OpenPairConfig, there: RosTopicList) -> Finding:
     """The finding on a pair whose nominal calibration no service has discovered yet."""
     from coec.cli.doctor_computer import warn
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from coec.adapters.system.clock import clock_state
-from coec.adapters.system.locks import holder_of
+from coec.adapters.system.locks import lock_holder
 from coec.config import StateConfig
 from coec.schemas.doctor import Finding
 
@@ -62,7 +62,7 @@ def state_findings(state: StateConfig) -> Iterator[Finding]:
             yield fail("state", where, "does not exist, and this user cannot create it", advice)
         return
     yield _ownership(folder)
-    holder = holder_of(folder / "lock")
+    holder = lock_holder(folder / "lock")
     if holder is not None:
         who = f"process {holder}" if holder else "a process"
         yield ok("lock", where, f"locked by {who}: a service runs here")

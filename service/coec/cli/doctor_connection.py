@@ -16,24 +16,24 @@ import zenoh
 
 from coec import __version__
 from coec.adapters.zenoh.bus import closed, is_connected, open_session
-from coec.adapters.zenoh.client import ask, ask_one
+from coec.adapters.zenoh.client import query_all, query_one
 from coec.adapters.zenoh.endpoints import CERTIFIED, WITH_PORT, Endpoint, redacted
 from coec.adapters.zenoh.opening import open_client
-from coec.adapters.zenoh.settings import beside as as_separate_client
 from coec.adapters.zenoh.settings import connected_of, finds_peers, listened_of, mode_of, settings_of
+from coec.adapters.zenoh.settings import to_observer as as_separate_client
 from coec.adapters.zenoh.tls import (
     Certificate,
     CertificateError,
     host_and_port,
-    material_of,
     read_certificate,
     shake_hands,
+    tls_files,
 )
 from coec.cli.doctor_computer import fail, ok, warn
 from coec.config import Config
 from coec.errors import CoecError, NotFoundError, UnavailableError
-from coec.runtime.api.configuration import shown
-from coec.runtime.api.troubles import TROUBLES
+from coec.runtime.api.configuration import redacted_configuration
+from coec.runtime.api.troubles import PROBLEMS
 from coec.runtime.reload import differing
 from coec.schemas.base import from_json, json_value
 from coec.schemas.doctor import Finding, Level
@@ -78,7 +78,7 @@ def certificate_findings(config: Config) -> Iterator[Finding]:
     )
     for role, endpoints in roles:
         for endpoint in (Endpoint.parse(text) for text in endpoints):
-            material = material_of(settings, endpoint, role)
+            material = tls_files(settings, endpoint, role)
             where = str(material.certificate)
             if endpoint.protocol not in CERTIFIED or material.certificate is None or where in seen:
                 continue
@@ -240,7 +240,7 @@ def _reached(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Iterator
 
 def _handshake(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Finding:
     try:
-        seen = shake_hands(endpoint, material_of(settings, endpoint, "connect"), CONNECT_S)
+        seen = shake_hands(endpoint, tls_files(settings, endpoint, "connect"), CONNECT_S)
     except CertificateError as error:
         advice = (
             "compare the authority here (root_ca_certificate) with who signed the router's certificate, the host with "
@@ -277,7 +277,7 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
     """Findings from the answers of the vehicle's service; a single one if no service answers."""
     keys = Keys(config.prefix, config.vehicle)
     try:
-        status = from_json(StatusReply, ask_one(session, f"{keys.status}?format=json", TIMEOUT_S).payload)
+        status = from_json(StatusReply, query_one(session, f"{keys.status}?format=json", TIMEOUT_S).payload)
     except NotFoundError:
         yield ok("service", keys.root, "no service of the vehicle answers here; its status is not known")
         return
@@ -287,7 +287,7 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
     yield from _status(status, keys)
     yield _compared(session, config, keys)
     try:
-        replies = ask(session, f"{keys.health('*')}?format=json", TIMEOUT_S)
+        replies = query_all(session, f"{keys.health('*')}?format=json", TIMEOUT_S)
         healths = [from_json(HealthReply, reply.payload) for reply in replies]
     except CoecError as error:
         yield fail("health", keys.health("*"), f"invalid reply: {error}", "check its log")
@@ -299,8 +299,10 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
 def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:
     """Whether the service runs with this file."""
     try:
-        served = json_value(ask_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
-        places = [place for place in differing(served, shown(config)) if place not in OF_THE_COMMAND_LINE]
+        served = json_value(query_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
+        places = [
+            place for place in differing(served, redacted_configuration(config)) if place not in OF_THE_COMMAND_LINE
+        ]
     except (CoecError, ValueError, KeyError, TypeError) as error:
         text = f"the service does not report its configuration: {error}"
         return warn("file", keys.config, text, "check its version and the rules of the router")
@@ -330,7 +332,7 @@ def _status(status: StatusReply, keys: Keys) -> Iterator[Finding]:
         waits = ", ".join(loaded.waiting)
         yield warn("reload", keys.root, f"waits for a restart: {waits}", "restart the service at a suitable time")
     for reason in status.reasons:
-        problem = TROUBLES.get(reason.code)
+        problem = PROBLEMS.get(reason.code)
         advice = f"reason {reason.code}: check its log" if problem is None else problem.advice
         yield warn("service", keys.root, reason.text, advice)
 

@@ -21,16 +21,16 @@ from coec.adapters.depth.maps import STEREO
 from coec.adapters.images.codec import Inspector
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import Input, Sample
+from coec.adapters.zenoh.inputs import InputSample, StreamInput
 from coec.adapters.zenoh.ros_side import RosSide
-from coec.adapters.zenoh.ros_topics import Topics, listed
+from coec.adapters.zenoh.ros_topics import RosTopicList, listed
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.cli.doctor_computer import fail, ok, warn
 from coec.cli.doctor_connection import cause_of_silence
 from coec.config import CameraMessage, Config, EgoMessage, LidarMessage, PairConfig
 from coec.errors import DecodeError
-from coec.runtime.api.streams import troubles_of
-from coec.runtime.api.troubles import TROUBLES
+from coec.runtime.api.streams import stream_problems
+from coec.runtime.api.troubles import PROBLEMS
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame, StreamCounts
 from coec.runtime.nominal.findings import info_topic_of, needs_transforms
 from coec.schemas.doctor import Finding
@@ -99,7 +99,7 @@ class StreamSamples:
     counts: StreamCounts | None = None
     elsewhere: int = 0
 
-    def count(self, sample: Sample) -> None:
+    def count(self, sample: InputSample) -> None:
         """Counts a sample that is not decoded."""
         if len(self.arrivals_s) < SAMPLES_COUNTED:
             self.arrivals_s.append(time.monotonic())
@@ -160,7 +160,9 @@ def _undiscovered(session: zenoh.Session, ros: RosSide, config: Config) -> tuple
     """Listens, as the service does, to the streams of pairs that are not discovered yet."""
     bus, undiscovered = Bus(session), dict[str, StreamSamples]()
 
-    def listen_to(place: str, stream: Input, subscribe: Callable[[Input, Callable[[Sample], None]], object]) -> None:
+    def listen_to(
+        place: str, stream: StreamInput, subscribe: Callable[[StreamInput, Callable[[InputSample], None]], object]
+    ) -> None:
         if place not in undiscovered:
             undiscovered[place] = StreamSamples(place, stream.expressions)
             subscribe(stream, undiscovered[place].count)
@@ -192,7 +194,7 @@ class _PairSubscription:
         self.samples = {
             name: StreamSamples(stream.place, inputs[name].expressions) for name, stream in pair.streams.items()
         }
-        self._waiting: dict[str, deque[tuple[int, Sample]]] = {
+        self._waiting: dict[str, deque[tuple[int, InputSample]]] = {
             name: deque(maxlen=MOTIONS_WAITING if name == EGO else SAMPLES_WAITING) for name in self.samples
         }
         self._losses = LossCounter(_SILENT, pair.name)
@@ -241,7 +243,7 @@ class _PairSubscription:
         return any_sample
 
     def _subscribe(
-        self, session: zenoh.Session, expression: str, read: Callable[[zenoh.Sample], Sample], name: str
+        self, session: zenoh.Session, expression: str, read: Callable[[zenoh.Sample], InputSample], name: str
     ) -> zenoh.Subscriber[None]:
         samples, waiting = self.samples[name], self._waiting[name]
 
@@ -256,14 +258,14 @@ class _PairSubscription:
 
 
 def stream_findings(
-    pair: PairConfig, streams: Mapping[str, StreamSamples], config: Config, seconds: float, topics: Topics
+    pair: PairConfig, streams: Mapping[str, StreamSamples], config: Config, seconds: float, topics: RosTopicList
 ) -> Iterator[Finding]:
     """Findings on the streams of one pair."""
     for name, one in streams.items():
         yield from _stream(pair, name, one, config, seconds, topics)
     counts = {name: one.counts for name, one in streams.items() if one.counts is not None}
-    for reason in troubles_of(counts, pair, topics):
-        yield warn("senders", pair.name, reason.text, TROUBLES[reason.code].advice)
+    for reason in stream_problems(counts, pair, topics):
+        yield warn("senders", pair.name, reason.text, PROBLEMS[reason.code].advice)
     camera, lidar, ego = streams[CAMERA], streams[LIDAR], streams.get(EGO)
     if camera.stamps and lidar.stamps:
         yield _in_step(pair, camera.stamps, lidar.stamps)
@@ -276,7 +278,7 @@ def stream_findings(
 
 
 def _stream(
-    pair: PairConfig, name: str, samples: StreamSamples, config: Config, seconds: float, topics: Topics
+    pair: PairConfig, name: str, samples: StreamSamples, config: Config, seconds: float, topics: RosTopicList
 ) -> Iterator[Finding]:
     if not samples.arrivals_s:
         stream = pair.streams[name]
@@ -300,7 +302,7 @@ def _stream(
 
 
 def undiscovered_findings(
-    undiscovered: Mapping[str, StreamSamples], config: Config, seconds: float, topics: Topics
+    undiscovered: Mapping[str, StreamSamples], config: Config, seconds: float, topics: RosTopicList
 ) -> Iterator[Finding]:
     """Findings on the streams of pairs whose configuration is not complete."""
     for place, samples in undiscovered.items():
@@ -476,7 +478,7 @@ def _image(pair: PairConfig, frame: CameraFrame, config: Config) -> Iterator[Fin
         yield fail("depth", key, "frames carry no depth map, and the configuration requires them", advice)
 
 
-def topic_findings(here: Topics, topics: Topics, config: Config) -> Iterator[Finding]:
+def topic_findings(here: RosTopicList, topics: RosTopicList, config: Config) -> Iterator[Finding]:
     """Findings on topics: types and nodes of those that may be streams, and the number of others; and those of them
     that the service does not see.
 
@@ -513,6 +515,6 @@ def topic_findings(here: Topics, topics: Topics, config: Config) -> Iterator[Fin
         yield warn("topics", where, f"liveliness tokens that were not read: {counted}", advice)
 
 
-def _from(topics: Topics, topic: str) -> str:
+def _from(topics: RosTopicList, topic: str) -> str:
     nodes = sorted({one.node for one in topics.of(topic) if one.node})
     return f", by {', '.join(nodes)}" if nodes else ""

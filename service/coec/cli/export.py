@@ -13,8 +13,8 @@ from coec.cli.options import Json, pair_named, suggesting
 from coec.errors import DecodeError, SourceError, UsageError
 
 if TYPE_CHECKING:
-    from coec.adapters.exports.extrinsic import Extrinsic
-    from coec.adapters.exports.told import Frames
+    from coec.adapters.exports.extrinsic import ExportedExtrinsic
+    from coec.adapters.exports.told import ExportFrames
     from coec.calibration.types import Matrix4
     from coec.config import CameraIntrinsics, Config
 
@@ -80,18 +80,18 @@ def export(
     as_json: Json = False,
 ) -> int:
     """Write a calibration into the files of other programs: exit 1 if it is not accepted."""
-    from coec.adapters.exports.told import Frames
+    from coec.adapters.exports.told import ExportFrames
     from coec.adapters.files import output as files
     from coec.recording import export_text, require_accepted, require_format
     from coec.reports import console
 
     require_format(format)
-    frames = Frames(parent, child, _pose(parent_pose))
+    frames = ExportFrames(parent, child, _pose(parent_pose))
     extrinsic = _read(source, config, pair, frames)
     require_accepted(extrinsic, str(source), "--force", force=force)
     text = export_text(extrinsic, format, output)
     if output is not None:
-        files.replace(output, text.encode())
+        files.replace_output(output, text.encode())
     if as_json:
         written = None if output is None else str(output)
         console.print_json({"format": format, "text": text, "written": written})
@@ -102,12 +102,12 @@ def export(
     return 0
 
 
-def _read(source: Path, config: Path | None, pair: str | None, frames: Frames) -> Extrinsic:
+def _read(source: Path, config: Path | None, pair: str | None, frames: ExportFrames) -> ExportedExtrinsic:
     from coec.config import load_config
     from coec.runtime.decisions.state_store import STATE_FILE
-    from coec.runtime.nominal.kept import with_kept
+    from coec.runtime.nominal.kept import with_discovered
 
-    loaded = None if config is None else with_kept(load_config(config))
+    loaded = None if config is None else with_discovered(load_config(config))
     if source.is_dir() or source.name == STATE_FILE:
         return _of_state(source if source.is_dir() else source.parent, pair, loaded, frames)
     if source.suffix == ".mcap":
@@ -115,8 +115,8 @@ def _read(source: Path, config: Path | None, pair: str | None, frames: Frames) -
     return _of_document(source, None if loaded is None else pair_named(loaded, pair).camera.intrinsics, frames)
 
 
-def _of_window(path: Path, frames: Frames) -> Extrinsic:
-    from coec.adapters.exports.told import of_result
+def _of_window(path: Path, frames: ExportFrames) -> ExportedExtrinsic:
+    from coec.adapters.exports.told import extrinsic_of_result
     from coec.adapters.files.rig import intrinsics_config
     from coec.adapters.mcap.windows import read_result, read_window
 
@@ -124,11 +124,11 @@ def _of_window(path: Path, frames: Frames) -> Extrinsic:
     if result is None:
         raise SourceError(f"{path} holds no result: `coec calibrate {path} --output DIR` makes one")
     window, _ = read_window(path)
-    return of_result(result, intrinsics_config(window.rig.camera), frames)
+    return extrinsic_of_result(result, intrinsics_config(window.rig.camera), frames)
 
 
-def _of_document(path: Path, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
-    from coec.adapters.exports.told import of_reply, of_result
+def _of_document(path: Path, camera: CameraIntrinsics | None, frames: ExportFrames) -> ExportedExtrinsic:
+    from coec.adapters.exports.told import extrinsic_of_reply, extrinsic_of_result
     from coec.recording import MAX_EXPORT_BYTES
     from coec.schemas.base import from_json
     from coec.schemas.replies import CalibrationResult, ExtrinsicReply
@@ -136,16 +136,16 @@ def _of_document(path: Path, camera: CameraIntrinsics | None, frames: Frames) ->
 
     data = read_bytes(path, MAX_EXPORT_BYTES)
     with suppress(DecodeError):
-        return of_result(from_json(CalibrationResult, data), camera, frames)
+        return extrinsic_of_result(from_json(CalibrationResult, data), camera, frames)
     with suppress(DecodeError):
-        return of_reply(from_json(ExtrinsicReply, data), camera, frames)
+        return extrinsic_of_reply(from_json(ExtrinsicReply, data), camera, frames)
     raise SourceError(
         f"{path} is neither the result of `coec calibrate --json` nor a reply of `coec query extrinsic --json`, nor a "
         "state directory, nor a window (.mcap)"
     )
 
 
-def _of_state(folder: Path, name: str | None, config: Config | None, frames: Frames) -> Extrinsic:
+def _of_state(folder: Path, name: str | None, config: Config | None, frames: ExportFrames) -> ExportedExtrinsic:
     """The calibration that the service of a state directory serves, with its full covariance."""
     from coec.adapters.exports.told import intrinsics_config_of
     from coec.runtime.api.exports import exported
@@ -170,11 +170,11 @@ def _of_state(folder: Path, name: str | None, config: Config | None, frames: Fra
 
 
 def _pose(text: str | None) -> Matrix4 | None:
-    from coec.adapters.exports.told import pose_of
+    from coec.adapters.exports.told import parse_pose
 
     if text is None:
         return None
     try:
-        return pose_of(text)
+        return parse_pose(text)
     except ValueError as error:
         raise UsageError(f"--parent-pose {text}: {error}") from error

@@ -24,7 +24,7 @@ from coec.errors import CoecError, DecodeError, NotFoundError, OutputError, Remo
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.adapters.zenoh.window_fetch import Recording
+    from coec.adapters.zenoh.window_fetch import RecordingInfo
     from coec.schemas.base import Message
     from coec.schemas.incident import Absent, FetchedFile, FetchedWindow, IncidentReport
     from coec.schemas.keys import Keys
@@ -124,12 +124,12 @@ def fetch(
 
 def _events(session: zenoh.Session, keys: Keys, pair: str | None, timeout_s: float) -> list[EvidenceEvent]:
     """Red events of the pair (None: of every pair), the latest last."""
-    from coec.adapters.zenoh.client import ask
+    from coec.adapters.zenoh.client import query_all
     from coec.schemas.base import from_json
     from coec.schemas.replies import EvidenceReply
 
     selector = f"{keys.evidence(pair or '*')}?format=json"
-    answers = ask(session, selector, timeout_s)
+    answers = query_all(session, selector, timeout_s)
     if not answers:
         raise _nobody(session, keys, timeout_s, selector)
     events: list[EvidenceEvent] = []
@@ -141,11 +141,11 @@ def _events(session: zenoh.Session, keys: Keys, pair: str | None, timeout_s: flo
 
 def _nobody(session: zenoh.Session, keys: Keys, timeout_s: float, selector: str) -> NotFoundError:
     """The error that nobody answers, with the last heartbeat of the vehicle, if one is stored."""
-    from coec.adapters.zenoh.client import ask, nobody
+    from coec.adapters.zenoh.client import no_reply_error, query_all
     from coec.reports.fleet_board import duration
-    from coec.schemas.last_word import read as read_word
+    from coec.schemas.last_word import decode_heartbeat as read_word
 
-    for answer in ask(session, keys.last("*"), timeout_s):
+    for answer in query_all(session, keys.last("*"), timeout_s):
         try:
             word = read_word(answer.key, answer.payload)
         except DecodeError:
@@ -156,7 +156,7 @@ def _nobody(session: zenoh.Session, keys: Keys, timeout_s: float, selector: str)
             f"{word.vehicle} does not answer; it {left} {ago} ago ({word.pair}: {word.state}). Its data are on "
             "board: fetch them when it is back"
         )
-    return nobody(selector)
+    return no_reply_error(selector)
 
 
 def _is_of(event: EvidenceEvent, vehicle: str, pair: str) -> bool:
@@ -234,7 +234,7 @@ class Download:
         snippets = () if not self.with_windows else tuple(self._snippets(event))
         holds = None if history is None else chain_holds(history)
         documents = (event, history, health, extrinsic, status)
-        story = incident_page.Story(*documents, tuple(windows), tuple(self.absent), holds, snippets)
+        story = incident_page.FetchedIncident(*documents, tuple(windows), tuple(self.absent), holds, snippets)
         pictures = {name: (self.folder / name).read_bytes() for name in incident_page.PICTURED if name in self.files}
         self._store(PAGE, render(incident_page.page(story, pictures, provenance.here())).encode())
         report = IncidentReport(
@@ -250,7 +250,7 @@ class Download:
             chain_holds=holds,
             absent=tuple(self.absent),
         )
-        files.replace(self.folder / REPORT, to_json(report))
+        files.replace_output(self.folder / REPORT, to_json(report))
         return report
 
     def _document(self, model: type[M], selector: str) -> M:
@@ -324,7 +324,7 @@ class Download:
             how = "`coec query windows` lists all, and `coec query windows/ID --output FILE` fetches one"
             self.absent.append(Absent(what=f"{len(near) - MAX_SNIPPETS} snippets", why=f"{why}; {how}"))
 
-    def _recording(self, recording_id: str) -> Recording | None:
+    def _recording(self, recording_id: str) -> RecordingInfo | None:
         from coec.adapters.zenoh.window_fetch import fetch_window
         from coec.reports import console
         from coec.schemas.incident import Absent, FetchedFile
@@ -333,7 +333,7 @@ class Download:
             self.absent.append(Absent(what="a recording", why="the vehicle reports an invalid name for it"))
             return None
         name = _recorded(recording_id)
-        recordings: list[Recording] = []
+        recordings: list[RecordingInfo] = []
         left = MAX_RECORDED_BYTES - self.recorded_bytes
         if left <= 0:
             how = f"`coec query windows/{recording_id} --output FILE` fetches it"
@@ -362,12 +362,12 @@ class Download:
         return recordings[0] if recordings else None
 
     def _answer(self, selector: str) -> bytes:
-        from coec.adapters.zenoh.client import ask_one
+        from coec.adapters.zenoh.client import query_one
 
         deadline_s = time.monotonic() + self.patience_s
         while True:
             try:
-                return ask_one(self.session, selector, self.timeout_s).payload
+                return query_one(self.session, selector, self.timeout_s).payload
             except RemoteError as error:
                 if error.reply_code not in WAITS or time.monotonic() + WAIT_S > deadline_s:
                     raise
@@ -389,7 +389,7 @@ class Download:
         from coec.adapters.files import output as files
         from coec.schemas.incident import FetchedFile
 
-        files.replace(self.folder / name, data)
+        files.replace_output(self.folder / name, data)
         self.files[name] = FetchedFile(name=name, sha256=hashlib.sha256(data).hexdigest(), size_bytes=len(data))
 
 

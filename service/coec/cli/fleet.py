@@ -53,7 +53,7 @@ def report(
     if output is not None:
         of_fleet = fleet_page.page(summary, f"Fleet: {results.resolve().name}", provenance.here())
         page.write(output / "report.html", of_fleet)
-        files.write(output / "report.json", to_json(summary))
+        files.write_output(output / "report.json", to_json(summary))
     if as_json:
         console.print_json(summary.model_dump(mode="json"))
         return 0
@@ -114,11 +114,11 @@ def _show_sql(results: Path) -> None:
     from coec.fleet import questions
     from coec.reports import console
 
-    console.write(f"-- the view `{questions.WINDOWS}` of the examples below\n")
-    console.write(f"{questions.statement(questions.WINDOWS, results)};\n\n")
+    console.write(f"-- the view `{questions.WINDOWS_VIEW}` of the examples below\n")
+    console.write(f"{questions.view_statement(questions.WINDOWS_VIEW, results)};\n\n")
     for name, kind in questions.columns(results):
         console.write(f"--   {name:<22} {kind}\n")
-    for question, query in questions.EXAMPLES.items():
+    for question, query in questions.EXAMPLE_QUERIES.items():
         console.write(f"\n-- {question}{query};\n")
 
 
@@ -137,7 +137,7 @@ def commission(
 ) -> int:
     """Learn from commissioned vehicles what others of their model start from (`state.model`): bias, spread, limits."""
     from coec.adapters.files.baseline_file import load_baselines, save_baseline
-    from coec.calibration.commissioning.of_model import of_model
+    from coec.calibration.commissioning.of_model import model_baseline
     from coec.reports import console
 
     vehicles = [load_baselines(path) for path in _each_once(baselines)]
@@ -147,7 +147,7 @@ def commission(
     shared = sorted(set.intersection(*(set(pairs) for pairs in vehicles)))
     if not shared:
         raise UsageError("there is no pair that all of the vehicles have")
-    models = [of_model([pairs[name] for pairs in vehicles]) for name in shared]
+    models = [model_baseline([pairs[name] for pairs in vehicles]) for name in shared]
     for model in models:
         save_baseline(output, model)
     if as_json:

@@ -12,13 +12,13 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from coec.adapters.system.keyboard import keys as keyboard
-from coec.adapters.zenoh.client import ask_one, connected_by
-from coec.adapters.zenoh.words import Words
+from coec.adapters.system.keyboard import pressed_keys as keyboard
+from coec.adapters.zenoh.client import connected_by, query_one
+from coec.adapters.zenoh.words import HeartbeatReceiver
 from coec.cli.options import ServiceAddress
 from coec.cli.signals import until_signal
 from coec.errors import CoecError, UsageError
-from coec.fleet.roster import RANKS, Filter, Name, Roster, of_states
+from coec.fleet.roster import RANKS, FleetFilter, FleetState, PairName, parse_states
 from coec.reports import console, fleet_board, half_blocks
 from coec.reports.replies import results_table
 from coec.schemas.base import from_msgpack
@@ -61,17 +61,17 @@ def show_fleet(
         ConnectionFailedError: no router answered.
         UsageError: an unknown state.
     """
-    selected = Filter(of_states(states, UsageError), find)
+    selected = FleetFilter(parse_states(states, UsageError), find)
     with (
         until_signal() as stop,
         connected_by(address.way, timeout_s) as session,
         connected_by(address.way, timeout_s) as of_tokens,
     ):
-        heartbeats = Words(session, of_tokens, Keys(address.prefix, address.vehicle), timeout_s)
-        with heartbeats.listening():
-            board = Board(Roster(), heartbeats, selected, PairQuery(session, address.prefix))
+        heartbeats = HeartbeatReceiver(session, of_tokens, Keys(address.prefix, address.vehicle), timeout_s)
+        with heartbeats.subscribed():
+            board = Board(FleetState(), heartbeats, selected, PairQuery(session, address.prefix))
             if once:
-                while not heartbeats.told.wait(FRAME_S) and not stop.is_set():
+                while not heartbeats.initial_query_done.wait(FRAME_S) and not stop.is_set():
                     pass
                 fleet = board.once()
                 if as_json:
@@ -105,7 +105,7 @@ class PairQuery:
     def __exit__(self, *raised: object) -> None:
         self._thread.shutdown(wait=False, cancel_futures=True)
 
-    def begin(self, what: str, name: Name, size: tuple[int, int]) -> None:
+    def begin(self, what: str, name: PairName, size: tuple[int, int]) -> None:
         """Query `history` or `overlay`, unless a query is still open; `size` in characters."""
         if self._future is not None and not self._future.done():
             return
@@ -122,14 +122,14 @@ class PairQuery:
         except CoecError as error:
             return Text(f"no {self._what}: {error}", "yellow")
 
-    def _history(self, name: Name, _: tuple[int, int]) -> RenderableType:
+    def _history(self, name: PairName, _: tuple[int, int]) -> RenderableType:
         key = Keys(self._prefix, name[0]).history(name[1])
-        reply = from_msgpack(HistoryReply, ask_one(self._session, f"{key}?limit={RESULTS}", ANSWER_S).payload)
+        reply = from_msgpack(HistoryReply, query_one(self._session, f"{key}?limit={RESULTS}", ANSWER_S).payload)
         return results_table(reply)
 
-    def _overlay(self, name: Name, size: tuple[int, int]) -> RenderableType:
+    def _overlay(self, name: PairName, size: tuple[int, int]) -> RenderableType:
         key = Keys(self._prefix, name[0]).overlay(name[1])
-        return half_blocks.drawn(ask_one(self._session, key, ANSWER_S).payload, *size)
+        return half_blocks.half_block_text(query_one(self._session, key, ANSWER_S).payload, *size)
 
 
 @dataclass(slots=True)
@@ -141,15 +141,15 @@ class Board:
         name: of the pair that a key selected, which stays selected wherever it moves; None: the first pair is selected.
     """
 
-    state: Roster
-    heartbeats: Words
-    given: Filter
+    state: FleetState
+    heartbeats: HeartbeatReceiver
+    given: FleetFilter
     query: PairQuery
     clock: Callable[[], float] = time.monotonic
     pane: str = "reasons"
     quick: int = 0
     index: int = 0
-    name: Name | None = None
+    name: PairName | None = None
     queried_s: float = field(default=-QUERY_PERIOD_S)
     fleet: FleetNow | None = None
 
@@ -182,7 +182,7 @@ class Board:
         del width
         self._update()
         label, states = QUICK_FILTERS[self.quick]
-        shown = Filter(states or self.given.states, self.given.text)
+        shown = FleetFilter(states or self.given.states, self.given.text)
         pane_rows = PANE_ROWS * (2 if self.pane == "overlay" else 1)
         rows = max(height - pane_rows - 5, 3)
         self.fleet = self.state.now(self.clock(), shown, max(rows, self.index + rows))
@@ -200,27 +200,27 @@ class Board:
 
     def _pane(self, pair: PairNow | None) -> RenderableType:
         if pair is None:
-            answered = self.heartbeats.told.is_set()
+            answered = self.heartbeats.initial_query_done.is_set()
             return Text("no pair has sent a heartbeat" if answered else "looking for pairs …", "dim")
         return fleet_board.detail(pair) if self.pane == "reasons" else self.query.shown()
 
     def _update(self) -> None:
         now_s = self.clock()
-        for message in self.heartbeats.take():
+        for message in self.heartbeats.pending():
             if message.kind == "said":
-                self.state.hear(message.key, message.payload, message.at_s)
+                self.state.on_heartbeat(message.key, message.payload, message.at_s)
             elif message.kind == "kept":
-                self.state.recall(message.key, message.payload, message.at_s, time.time_ns())
+                self.state.restore(message.key, message.payload, message.at_s, time.time_ns())
             else:
                 vehicle, pair = message.key.split("/")[-3:-1]
-                self.state.present(vehicle, pair, is_there=bool(message.payload))
+                self.state.on_liveliness(vehicle, pair, is_there=bool(message.payload))
         for cause, count in self.heartbeats.refused().items():
-            self.state.refuse(cause, count)
-        if now_s - self.queried_s >= QUERY_PERIOD_S and self.heartbeats.told.is_set():
+            self.state.count_refused(cause, count)
+        if now_s - self.queried_s >= QUERY_PERIOD_S and self.heartbeats.initial_query_done.is_set():
             self.queried_s = now_s
             for vehicle, pair in self.state.overdue(now_s, QUERIES_AT_ONCE):
-                self.heartbeats.ask(vehicle, pair)
+                self.heartbeats.query(vehicle, pair)
 
 
-def _name(pair: PairNow) -> Name:
+def _name(pair: PairNow) -> PairName:
     return pair.word.vehicle, pair.word.pair

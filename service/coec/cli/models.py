@@ -58,7 +58,7 @@ def add(
     from coec.adapters.depth import network_files
     from coec.reports import console
 
-    card, place, copied = network_files.add(file, name, force=force)
+    card, place, copied = network_files.add_network(file, name, force=force)
     if as_json:
         console.print_json({"name": card.name, "path": str(place), "copied": copied})
     elif copied:
@@ -77,14 +77,14 @@ def _list(*, as_json: bool) -> int:
 
     cards = list_models()
     folder = models_folder()
-    files = {card.name: network_files.file_of(card) for card in cards}
+    files = {card.name: network_files.network_file(card) for card in cards}
     if as_json:
         documents = [
             {
                 **card.model_dump(mode="json"),
                 "present": files[card.name] is not None,
                 "path": None if files[card.name] is None else str(files[card.name]),
-                "looked_for": [str(path) for path in network_files.places_of(card)],
+                "looked_for": [str(path) for path in network_files.candidate_paths(card)],
             }
             for card in cards
         ]

@@ -20,7 +20,7 @@ from coec.errors import UsageError
 
 if TYPE_CHECKING:
     from coec.adapters.tls.conversation import Credentials
-    from coec.adapters.zenoh.client import Way
+    from coec.adapters.zenoh.client import RouterAddress
     from coec.config import Config, PairConfig
 
 
@@ -167,7 +167,7 @@ class ServiceAddress:
 
     vehicle: str
     prefix: str
-    way: Way
+    way: RouterAddress
     credentials: Credentials | None = None
 
 
@@ -183,7 +183,7 @@ def service_address(
     Raises:
         ConfigError: the configuration, or the Zenoh configuration, cannot be read.
     """
-    from coec.adapters.zenoh.client import Way
+    from coec.adapters.zenoh.client import RouterAddress
     from coec.adapters.zenoh.settings import connected_of
     from coec.adapters.zenoh.settings_file import credentials_in, read_settings
     from coec.config import Config, ZenohConfig, load_config
@@ -200,7 +200,7 @@ def service_address(
     return ServiceAddress(
         usual_vehicle if vehicle is None else vehicle,
         usual_prefix if prefix is None else prefix,
-        Way((endpoints or zenoh_config.router) if connect is None else (connect,), file),
+        RouterAddress((endpoints or zenoh_config.router) if connect is None else (connect,), file),
         None if settings is None else credentials_in(settings),
     )
 

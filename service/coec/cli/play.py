@@ -18,10 +18,10 @@ from coec.errors import DecodeError, SourceError, UsageError
 if TYPE_CHECKING:
     from coec.adapters.ros.topics import TopicInfo, TopicMessage
     from coec.adapters.zenoh.cadence import Played, Stamped
-    from coec.adapters.zenoh.player import SensorKeys, Streams
+    from coec.adapters.zenoh.player import SensorKeys, StreamKeys
     from coec.calibration.types import Rig
     from coec.config import Config, OpenPairConfig, RosConfig
-    from coec.sources import Recording
+    from coec.sources import RecordingSource
     from coec.sources.spec import SourceSpec
 
 RosMiddleware = Literal["rmw_zenoh", "ros2dds"]
@@ -76,7 +76,7 @@ class FrameProgramme:
     """
 
     name: str
-    keys: Streams | SensorKeys
+    keys: StreamKeys | SensorKeys
     messages: Callable[[], Iterator[Any]]
     first_stamp_ns: int
     counted: tuple[str, ...]
@@ -262,11 +262,11 @@ def _publish_topics(
 
 def _frames(source: str, name: str | None, target: Target, encoding: Encoding) -> FrameProgramme:
     from coec.adapters.zenoh.client import single_key
-    from coec.adapters.zenoh.player import Streams
+    from coec.adapters.zenoh.player import StreamKeys
     from coec.sources import open_source
 
     recording, pair = open_source(source), target.pair
-    streams = Streams.default(name or recording.rig.pair) if pair is None else Streams.of_pair(pair)
+    streams = StreamKeys.default(name or recording.rig.pair) if pair is None else StreamKeys.of_pair(pair)
     single_key(streams.camera)
     _warn(recording, pair, encoding)
     return FrameProgramme(
@@ -372,7 +372,7 @@ def _needing_listener(selected: Iterable[str], pair: OpenPairConfig | None) -> l
     return ours if configured is None else [topic for topic in ours if topic in configured]
 
 
-def _warn(recording: Recording, pair: OpenPairConfig | None, encoding: str) -> None:
+def _warn(recording: RecordingSource, pair: OpenPairConfig | None, encoding: str) -> None:
     """Prints what the receiver will refuse or miss."""
     from coec.calibration.types import CameraFrame, LidarFrame
     from coec.reports import console
@@ -407,7 +407,7 @@ def _warn_unsubscribed(streams: list[str]) -> None:
         console.say(f"coec: nobody listens to {', '.join(streams)}; publishing all the same")
 
 
-def _first_stamp_ns(recording: Recording) -> int:
+def _first_stamp_ns(recording: RecordingSource) -> int:
     """Stamp of the first frame of a recording.
 
     Raises:
@@ -418,7 +418,7 @@ def _first_stamp_ns(recording: Recording) -> int:
     raise SourceError(f"{recording.name} holds no frame")
 
 
-def _period_ns(recording: Recording) -> int:
+def _period_ns(recording: RecordingSource) -> int:
     """Time between two passes: the usual period of the camera."""
     import numpy as np
 

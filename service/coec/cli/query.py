@@ -19,7 +19,7 @@ from coec.untrusted import Untrusted
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.adapters.zenoh.client import Reply, Way
+    from coec.adapters.zenoh.client import Reply, RouterAddress
     from coec.schemas.keys import Keys
 
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
@@ -89,10 +89,10 @@ class Request:
 
 def _typable() -> Iterable[str]:
     """Keys that a shell suggests; commands each by name."""
-    from coec.schemas.commands import NAMES
+    from coec.schemas.commands import COMMAND_NAMES
 
     plain = (each.key for each in KEYS if "/" not in each.key)
-    return (*plain, "windows/", "evidence/", *(f"command/{name}" for name in NAMES))
+    return (*plain, "windows/", "evidence/", *(f"command/{name}" for name in COMMAND_NAMES))
 
 
 KeyArgument = Annotated[
@@ -179,7 +179,7 @@ def query(
     force: ForceOption = False,
     as_json: Json = False,
 ) -> int:
-    from coec.adapters.zenoh.client import connected_by, is_alive, nobody
+    from coec.adapters.zenoh.client import connected_by, is_alive, no_reply_error
 
     address = service_address(config, vehicle, prefix, connect, zenoh)
     request = Request(key, pair, sensor, tuple(params or ()), timeout_s)
@@ -197,7 +197,7 @@ def query(
             kind = None
         answers = _answers(session, selected, request, address, data, anonymous=anonymous)
         if not answers:
-            raise nobody(selected, service_is_there=is_alive(session, keys, timeout_s))
+            raise no_reply_error(selected, service_is_there=is_alive(session, keys, timeout_s))
     _show(answers, kind, request, selected, as_json=as_json)
     return 0 if all(_succeeded(answer, kind) for answer in answers) else 1
 
@@ -212,21 +212,21 @@ def _answers(
     anonymous: bool,
 ) -> list[Reply]:
     """Answers to the query; a command is authenticated if the session has a certificate."""
-    from coec.adapters.tls.conversation import Speaker
+    from coec.adapters.tls.conversation import CommandSender
     from coec.adapters.zenoh.bus import JSON, MSGPACK
-    from coec.adapters.zenoh.client import ask, myself
-    from coec.adapters.zenoh.proven import give
+    from coec.adapters.zenoh.client import myself, query_all
+    from coec.adapters.zenoh.proven import send_authenticated
 
     selector = _selector(key, _params(key, request))
     credentials = address.credentials
     if not _is_command(key):
-        return ask(session, selector, request.timeout_s, data)
+        return query_all(session, selector, request.timeout_s, data)
     if credentials is None or anonymous:
-        return ask(session, selector, request.timeout_s, data, myself())
-    speaker = Speaker(credentials, address.vehicle)
+        return query_all(session, selector, request.timeout_s, data, myself())
+    speaker = CommandSender(credentials, address.vehicle)
     encoding = MSGPACK if "format=msgpack" in request.params else JSON
     try:
-        return [give(session, selector, data, request.timeout_s, speaker, encoding)]
+        return [send_authenticated(session, selector, data, request.timeout_s, speaker, encoding)]
     except NotFoundError:  # nobody answered; treated as for every other key
         return []
 
@@ -288,11 +288,11 @@ def _resolve(session: zenoh.Session, request: Request, keys: Keys) -> tuple[str,
 
 def _only_pair(session: zenoh.Session, request: Request, keys: Keys) -> str:
     """The name of the vehicle's pair, if it has one."""
-    from coec.adapters.zenoh.client import ask_one
+    from coec.adapters.zenoh.client import query_one
     from coec.schemas.base import from_json
     from coec.schemas.replies import StatusReply
 
-    reply = ask_one(session, f"{keys.status}?format=json", request.timeout_s)
+    reply = query_one(session, f"{keys.status}?format=json", request.timeout_s)
     names = [pair.name for pair in from_json(StatusReply, reply.payload).pairs]
     if len(names) != 1:
         raise UsageError(f"several pairs are served, name one with --pair: {', '.join(names)}")
@@ -323,7 +323,7 @@ def _payload(request: Request, arguments: Mapping[str, str | bool | None], paylo
     Raises:
         UsageError: what was given does not fit the command; the message says what does.
     """
-    from coec.schemas.commands import NAMES, arguments_of
+    from coec.schemas.commands import COMMAND_NAMES, arguments_of
     from coec.schemas.keys import RIG
 
     given = {name: value for name, value in arguments.items() if value not in (None, False)}
@@ -341,8 +341,8 @@ def _payload(request: Request, arguments: Mapping[str, str | bool | None], paylo
             return json.dumps(json.loads(payload), separators=(",", ":")).encode()
         except ValueError as error:
             raise UsageError(f"--payload is not JSON: {error}") from error
-    if command not in NAMES:
-        raise UsageError(f"there is no command {command}; known: {', '.join(NAMES)}")
+    if command not in COMMAND_NAMES:
+        raise UsageError(f"there is no command {command}; known: {', '.join(COMMAND_NAMES)}")
     of_rig = request.pair == RIG or (request.pair is None and request.sensor is not None)
     known = {argument.name: argument.meaning for argument in arguments_of(command, for_rig=of_rig)}
     unknown = [name for name in given if name not in known]
@@ -423,10 +423,10 @@ def _json(reply: Reply) -> Any:
         ) from error
 
 
-def _save_picture(request: Request, way: Way, keys: Keys, path: Path, *, as_json: bool) -> int:
+def _save_picture(request: Request, way: RouterAddress, keys: Keys, path: Path, *, as_json: bool) -> int:
     """Saves `overlay`, or `evidence/ID` with `--param overlay=before`, as a JPEG file."""
     from coec.adapters.files import output as files
-    from coec.adapters.zenoh.client import ask_one, connected_by, single_key
+    from coec.adapters.zenoh.client import connected_by, query_one, single_key
     from coec.reports import console
 
     head, _, argument = request.key.partition("/")
@@ -441,10 +441,10 @@ def _save_picture(request: Request, way: Way, keys: Keys, path: Path, *, as_json
             key = keys.overlay(request.pair or _only_pair(session, request, keys))
         else:
             key = keys.evidence_of(_pair_of(session, request, keys, argument), argument)
-        reply = ask_one(session, _selector(single_key(key), request.params), request.timeout_s)
+        reply = query_one(session, _selector(single_key(key), request.params), request.timeout_s)
     if reply.encoding != JPEG:
         raise UsageError("the answer is no picture: give --param overlay=before or overlay=after")
-    files.replace(path, reply.payload)
+    files.replace_output(path, reply.payload)
     if as_json:
         console.print_json({"path": str(path), "size_bytes": len(reply.payload)})
     else:
@@ -453,7 +453,7 @@ def _save_picture(request: Request, way: Way, keys: Keys, path: Path, *, as_json
 
 
 def _download(
-    request: Request, way: Way, keys: Keys, window_id: str, output: Path | None, *, force: bool, as_json: bool
+    request: Request, way: RouterAddress, keys: Keys, window_id: str, output: Path | None, *, force: bool, as_json: bool
 ) -> int:
     from coec.adapters.zenoh.client import connected_by, single_key
     from coec.adapters.zenoh.window_fetch import fetch_window

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coec.adapters.files.output import write
+from coec.adapters.files.output import write_output
 from coec.adapters.files.rig import intrinsics_config, mask_to_png, matrix_rows
-from coec.adapters.ros.outgoing import Placed
-from coec.adapters.ros.sensor_topics import Vehicle
+from coec.adapters.ros.outgoing import PlacedFrame
+from coec.adapters.ros.sensor_topics import VehicleSensors
 from coec.adapters.zenoh.player import SensorKeys
 from coec.geometry.se3 import inverse
 
@@ -33,7 +33,7 @@ def document_of(drive: RigDrive, lidars: Sequence[str], folder: Path) -> dict[st
     cameras = []
     for name in drive.cameras:
         mask = f"{name}_mask.png"
-        write(folder / mask, mask_to_png(drive.mask(name)))
+        write_output(folder / mask, mask_to_png(drive.mask(name)))
         cameras.append(
             {"name": name, "key": keys[name], "intrinsics": intrinsics, "mask": mask, "T_vehicle_camera": poses[name]}
         )
@@ -45,9 +45,11 @@ def document_of(drive: RigDrive, lidars: Sequence[str], folder: Path) -> dict[st
     }
 
 
-def vehicle_of(drive: RigDrive) -> Vehicle:
+def vehicle_of(drive: RigDrive) -> VehicleSensors:
     """Description of the vehicle for ROS, with the poses that the workshop assumes."""
     lidar = drive.lidars[0]
     cameras = {camera: drive.pair(camera, lidar).rig for camera in drive.cameras}
     sensors = (*drive.lidars, *drive.cameras)
-    return Vehicle(cameras, [Placed("ego", name, inverse(drive.T_sensor_ego_nominal(name))) for name in sensors])
+    return VehicleSensors(
+        cameras, [PlacedFrame("ego", name, inverse(drive.T_sensor_ego_nominal(name))) for name in sensors]
+    )

@@ -24,11 +24,11 @@ def router(
     """Run a Zenoh router for the vehicle, with the access control of its configuration (deploy/router.json5)."""
     with success_on_sigterm():
         from coec.adapters.system import logs
-        from coec.adapters.system.notify import Notifier
+        from coec.adapters.system.notify import ServiceManagerNotifier
         from coec.adapters.zenoh.router import open_router
 
         logs.configure("info", "auto")
-        notifier = Notifier.from_environment()
+        notifier = ServiceManagerNotifier.from_environment()
         with until_signal() as stop, open_router(config) as session:
             _log.info("routing", extra={"fields": {"router": str(session.info.zid()), "configuration": str(config)}})
             notifier.ready()

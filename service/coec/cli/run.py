@@ -42,8 +42,8 @@ def run(
         from coec import daemon
         from coec.adapters.system import allocator
 
-        allocator.share_arenas()
-        allocator.reuse_frames()
+        allocator.limit_arenas()
+        allocator.reuse_frame_memory()
         return daemon.run(loaded, read)
 
 

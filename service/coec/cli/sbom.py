@@ -35,7 +35,7 @@ def sbom(
     as_json: Json = False,
 ) -> int:
     """List the packages of this installation: a table of licences, with --json a bill of materials (CycloneDX)."""
-    from coec.adapters.files.output import write
+    from coec.adapters.files.output import write_output
     from coec.adapters.system.installed import pinned_hashes
     from coec.reports import bill_of_materials, console
 
@@ -45,8 +45,8 @@ def sbom(
     if output is not None:
         text = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
         written = [
-            write(output / DOCUMENT, text.encode()),
-            write(output / TABLE, bill_of_materials.licence_table(inventory).encode()),
+            write_output(output / DOCUMENT, text.encode()),
+            write_output(output / TABLE, bill_of_materials.licence_table(inventory).encode()),
         ]
         console.say(f"coec: wrote {', '.join(str(path) for path in written)}")
     if as_json:
@@ -78,10 +78,10 @@ def inventory_here() -> Inventory:
     Raises:
         NotFoundError: coec is not installed as a package, or something it needs is not.
     """
-    from coec.adapters.system.installed import installed
+    from coec.adapters.system.installed import installed_packages
     from coec.reports.bill_of_materials import Inventory
 
-    packages = installed(APPLICATION)
+    packages = installed_packages(APPLICATION)
     application = packages.pop(APPLICATION)
     return Inventory(application, packages, platform.python_version(), _networks())
 

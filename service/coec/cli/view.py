@@ -24,7 +24,7 @@ from coec.cli.signals import until_signal
 from coec.errors import UsageError
 
 if TYPE_CHECKING:
-    from coec.adapters.foxglove.server import Screen
+    from coec.adapters.foxglove.server import ViewerServer
     from coec.calibration.types import Rig
 
 LAYOUT = "deploy/foxglove-layout.json"
@@ -131,10 +131,10 @@ def _show_vehicle(
     from coec.adapters.zenoh.client import connected_by
     from coec.cli.view_vehicle import VehiclePair, show_live
     from coec.config import load_config
-    from coec.runtime.nominal.kept import with_kept
+    from coec.runtime.nominal.kept import with_discovered
     from coec.schemas.keys import Keys
 
-    config = with_kept(load_config(file))
+    config = with_discovered(load_config(file))
     pair, limits = pair_named(config, name), config.limits
     rig = rig_of(pair)
     vehicle = VehiclePair(Keys(service.prefix, service.vehicle), pair, rig, config)
@@ -180,19 +180,19 @@ def _show_recording(
     return 0
 
 
-def _screen(address: ListenAddress, rig: Rig) -> Screen:
-    from coec.adapters.foxglove.server import Screen
+def _screen(address: ListenAddress, rig: Rig) -> ViewerServer:
+    from coec.adapters.foxglove.server import ViewerServer
 
-    return Screen(address.host, address.port, f"coec {rig.pair}", rig.camera)
+    return ViewerServer(address.host, address.port, f"coec {rig.pair}", rig.camera)
 
 
-def _announce(screen: Screen, rig: Rig, shown: str, *, as_json: bool) -> None:
+def _announce(screen: ViewerServer, rig: Rig, shown: str, *, as_json: bool) -> None:
     """Prints where viewers are served, and what."""
-    from coec.adapters.foxglove.topics import Pose, frame_of, topics_for
+    from coec.adapters.foxglove.topics import DisplayedPose, frame_of, topics_for
     from coec.reports import console
 
     if as_json:
-        frames = {pose.value: frame_of(rig.camera_frame, pose) for pose in Pose}
+        frames = {pose.value: frame_of(rig.camera_frame, pose) for pose in DisplayedPose}
         console.print_json(
             {
                 "url": screen.url,

@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 
 from coec.adapters.files.conversions import degrees_or_null, matrix_of
-from coec.adapters.foxglove.server import Screen
-from coec.adapters.foxglove.shown import Extrinsic, picture_of
-from coec.adapters.foxglove.timeline import NOT_SERVED, RECORDED, SILENT, Axes, Figure, Moment
-from coec.adapters.foxglove.topics import PICTURES, Pose
+from coec.adapters.foxglove.server import ViewerServer
+from coec.adapters.foxglove.shown import TitledExtrinsic, picture_of
+from coec.adapters.foxglove.timeline import NOT_SERVED, RECORDED, SILENT, PoseAxes, TimelineEntry, TimelineFigure
+from coec.adapters.foxglove.topics import PICTURE_TOPICS, DisplayedPose
 from coec.adapters.zenoh.cadence import repeated
 from coec.adapters.zenoh.player import shifted
 from coec.calibration.frames.pairing import Pairer
@@ -28,7 +28,7 @@ from coec.geometry import se3
 from coec.geometry.se3 import is_rigid
 from coec.schemas.base import from_json
 from coec.schemas.replies import CalibrationResult, MetricReply
-from coec.sources import Recording
+from coec.sources import RecordingSource
 from coec.sources.reading import read_bytes
 from coec.sources.windows import RECORDED_GAP_S
 
@@ -85,7 +85,7 @@ def load_candidate(path: Path) -> Candidate:
 class Playback:
     """What is played, and how. `rate`: multiple of the recorded speed, above zero. `candidate`: may be None."""
 
-    recording: Recording
+    recording: RecordingSource
     candidate: Candidate | None
     rate: float
     repeat: bool
@@ -94,7 +94,7 @@ class Playback:
 class PairOnScreen:
     """The pair that is on the screen, and the state that is shown with it."""
 
-    def __init__(self, playback: Playback, screen: Screen) -> None:
+    def __init__(self, playback: Playback, screen: ViewerServer) -> None:
         rig, served = playback.recording.rig, playback.recording.T_camera_lidar_start
         configuration = playback.recording.configuration
         self._rig = rig
@@ -117,7 +117,7 @@ class PairOnScreen:
             now_s = time.monotonic()
             if now_s - self._state_s >= AGAIN_S:
                 self._state_s = now_s
-                self._screen.tell(self._moment)
+                self._screen.send_entry(self._moment)
             if now_s - self._picture_s >= AGAIN_S:
                 self._show_picture()
             if until():
@@ -131,8 +131,8 @@ class PairOnScreen:
 
     def _show_picture(self) -> None:
         self._picture_s = time.monotonic()
-        requested = self._screen.wanted
-        if self._pair is None or not requested & PICTURES:
+        requested = self._screen.requested_topics
+        if self._pair is None or not requested & PICTURE_TOPICS:
             return
         try:
             picture = picture_of(
@@ -142,10 +142,10 @@ class PairOnScreen:
             self.refused[error.reason] += 1
             self._pair = None
         else:
-            self._screen.show(picture)
+            self._screen.send_picture(picture)
 
 
-def show_recording(playback: Playback, screen: Screen, stop: threading.Event) -> Counter[str]:
+def show_recording(playback: Playback, screen: ViewerServer, stop: threading.Event) -> Counter[str]:
     """Plays the recording from the arrival of the first viewer; its last pair stays on the screen until a signal.
     Returns the number of pairs that could not be shown, by cause.
 
@@ -153,7 +153,7 @@ def show_recording(playback: Playback, screen: Screen, stop: threading.Event) ->
         SourceError: a file cannot be read, or no camera frame has a sweep.
     """
     shown = PairOnScreen(playback, screen)
-    shown.rest(lambda: bool(screen.wanted & PICTURES), stop)
+    shown.rest(lambda: bool(screen.requested_topics & PICTURE_TOPICS), stop)
     due_s, before_ns = time.monotonic(), None
     for pair in _pairs(playback):
         # A recording that cannot be read as fast as it was recorded takes longer; nothing is left out.
@@ -192,10 +192,10 @@ def _pairs(playback: Playback) -> Iterator[FramePair]:
         )
 
 
-def moment_of_recording(rig: Rig, served: Matrix4, candidate: Candidate | None) -> Moment:
+def moment_of_recording(rig: Rig, served: Matrix4, candidate: Candidate | None) -> TimelineEntry:
     """The line for a recording and a candidate."""
     result = candidate.result if candidate else None
-    return Moment(
+    return TimelineEntry(
         pair=rig.pair,
         state=RECORDED,
         level=STALE,
@@ -211,25 +211,28 @@ def moment_of_recording(rig: Rig, served: Matrix4, candidate: Candidate | None) 
     )
 
 
-def extrinsics_of_recording(rig: Rig, served: Matrix4, candidate: Candidate | None) -> dict[Pose, Extrinsic]:
+def extrinsics_of_recording(
+    rig: Rig, served: Matrix4, candidate: Candidate | None
+) -> dict[DisplayedPose, TitledExtrinsic]:
     """The extrinsics that are drawn while a recording is played."""
     return {
-        Pose.SERVED: Extrinsic(served, "served: when this was recorded"),
-        Pose.NOMINAL: Extrinsic(rig.T_camera_lidar_nominal, "nominal: of the recording"),
-        Pose.CANDIDATE: (
-            Extrinsic(candidate.T_camera_lidar, f"candidate: {candidate.result.status}")
+        DisplayedPose.SERVED: TitledExtrinsic(served, "served: when this was recorded"),
+        DisplayedPose.NOMINAL: TitledExtrinsic(rig.T_camera_lidar_nominal, "nominal: of the recording"),
+        DisplayedPose.CANDIDATE: (
+            TitledExtrinsic(candidate.T_camera_lidar, f"candidate: {candidate.result.status}")
             if candidate
-            else Extrinsic(None, "candidate: none")
+            else TitledExtrinsic(None, "candidate: none")
         ),
     }
 
 
-def axes_of(values: Sequence[float | None]) -> Axes:
+def axes_of(values: Sequence[float | None]) -> PoseAxes:
     """Axes from six values, degrees and metres, or from none."""
-    return Axes(**dict(zip(Axes.model_fields, values, strict=False)))
+    return PoseAxes(**dict(zip(PoseAxes.model_fields, values, strict=False)))
 
 
-def figures_of(metrics: Mapping[str, MetricReply]) -> tuple[Figure, ...]:
+def figures_of(metrics: Mapping[str, MetricReply]) -> tuple[TimelineFigure, ...]:
     return tuple(
-        Figure(name=name, value=one.value, limit=one.limit, passed=one.passed) for name, one in sorted(metrics.items())
+        TimelineFigure(name=name, value=one.value, limit=one.limit, passed=one.passed)
+        for name, one in sorted(metrics.items())
     )

@@ -15,12 +15,12 @@ from typing import TypeVar
 import zenoh
 
 from coec.adapters.files.conversions import matrix_of
-from coec.adapters.foxglove.server import Screen
-from coec.adapters.foxglove.shown import Extrinsic, Picture, picture_of
-from coec.adapters.foxglove.timeline import NOT_SERVED, SILENT, Ages, Missed, Moment
-from coec.adapters.foxglove.topics import PICTURES, Pose
+from coec.adapters.foxglove.server import ViewerServer
+from coec.adapters.foxglove.shown import PairPicture, TitledExtrinsic, picture_of
+from coec.adapters.foxglove.timeline import NOT_SERVED, SILENT, MissedFrames, StreamAges, TimelineEntry
+from coec.adapters.foxglove.topics import PICTURE_TOPICS, DisplayedPose
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import Input, input_of
+from coec.adapters.zenoh.inputs import StreamInput, input_of
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.cli.view_recording import EXPLANATIONS, STALE, axes_of, figures_of
@@ -112,7 +112,7 @@ class ServiceState:
         return self.health.state
 
 
-def show_live(session: zenoh.Session, vehicle: VehiclePair, screen: Screen, stop: threading.Event) -> None:
+def show_live(session: zenoh.Session, vehicle: VehiclePair, screen: ViewerServer, stop: threading.Event) -> None:
     """Shows the pair until a signal."""
     name = vehicle.pair.name
     streams = SensorStreams(session, vehicle.pair, vehicle.config)
@@ -121,14 +121,14 @@ def show_live(session: zenoh.Session, vehicle: VehiclePair, screen: Screen, stop
     try:
         with service.listening():
             while not stop.is_set():
-                requested = screen.wanted
-                streams.listen(enabled=bool(requested & PICTURES))
+                requested = screen.requested_topics
+                streams.listen(enabled=bool(requested & PICTURE_TOPICS))
                 pair = streams.newest(WAIT_S)
                 state = service.update()
                 timeline.update(moment_of_service(name, state, streams.ages_s, streams.not_shown), streams.mute)
                 if pair is not None:
                     try:
-                        screen.show(_picture(pair, vehicle, state, requested))
+                        screen.send_picture(_picture(pair, vehicle, state, requested))
                     except DecodeError as error:
                         streams.refused(CAMERA, error.reason)
     finally:
@@ -138,45 +138,45 @@ def show_live(session: zenoh.Session, vehicle: VehiclePair, screen: Screen, stop
 class _Timeline:
     """Writes the timeline and the log: changes at once, and an unchanged state once a second."""
 
-    def __init__(self, screen: Screen, pair: str) -> None:
+    def __init__(self, screen: ViewerServer, pair: str) -> None:
         self._screen = screen
         self._pair = pair
-        self._shown: Moment | None = None
+        self._shown: TimelineEntry | None = None
         self._shown_s = -math.inf
         self._mute: tuple[str, ...] = ()
 
-    def update(self, moment: Moment, mute: tuple[str, ...]) -> None:
+    def update(self, moment: TimelineEntry, mute: tuple[str, ...]) -> None:
         """Update the present state; `mute` are subscribed keys on which nothing is received."""
         changed = self._shown is None or _essence(self._shown) != _essence(moment)
         if changed or time.monotonic() - self._shown_s >= REPEAT_S:
-            self._screen.tell(moment)
+            self._screen.send_entry(moment)
             self._shown, self._shown_s = moment, time.monotonic()
         if changed:
-            self._screen.remark(moment.level, f"{moment.state}: {moment.why}", self._pair)
+            self._screen.send_log(moment.level, f"{moment.state}: {moment.why}", self._pair)
         if mute and mute != self._mute:
-            self._screen.remark(1, MUTE.format(", ".join(mute)), self._pair)
+            self._screen.send_log(1, MUTE.format(", ".join(mute)), self._pair)
         self._mute = mute
 
 
-def _picture(pair: FramePair, vehicle: VehiclePair, service: ServiceState, requested: frozenset[str]) -> Picture:
+def _picture(pair: FramePair, vehicle: VehiclePair, service: ServiceState, requested: frozenset[str]) -> PairPicture:
     compensated = vehicle.pair.calibration.motion_compensation
     extrinsics = extrinsics_of_service(vehicle.rig, service)
     return picture_of(pair, vehicle.rig, extrinsics, requested, vehicle.config.limits, compensated=compensated)
 
 
-def _essence(moment: Moment) -> tuple[object, ...]:
+def _essence(moment: TimelineEntry) -> tuple[object, ...]:
     """The part of a moment whose change is worth a line in the log."""
     return moment.state, moment.reasons, moment.provenance, moment.candidate
 
 
 def moment_of_service(
     pair: str, service: ServiceState, ages_s: Mapping[str, float | None], not_shown: Counter[tuple[str, str]]
-) -> Moment:
+) -> TimelineEntry:
     """The line for a service and its sensors. `ages_s` is the time since a frame was received, by stream; `not_shown`
     counts frames by stream and cause. Figures are the last known ones, whatever the state; `answer_s` is their age."""
     health, extrinsic = service.health, service.extrinsic
     current = health is not None and service.state == health.state
-    return Moment(
+    return TimelineEntry(
         pair=pair,
         state=service.state,
         level=health.level if health is not None and current else STALE,
@@ -187,7 +187,7 @@ def moment_of_service(
         status=extrinsic.status if extrinsic else None,
         percent_complete=extrinsic.percent_complete if extrinsic else None,
         candidate=service.candidate is not None,
-        ages=Ages(
+        ages=StreamAges(
             camera_s=ages_s.get("camera"),
             lidar_s=ages_s.get("lidar"),
             ego_s=ages_s.get("ego"),
@@ -200,20 +200,21 @@ def moment_of_service(
         step=axes_of(extrinsic.pending.step or () if extrinsic and extrinsic.pending else ()),
         figures=figures_of(health.metrics if health else {}),
         not_shown=tuple(
-            Missed(stream=stream, cause=cause, count=count) for (stream, cause), count in sorted(not_shown.items())
+            MissedFrames(stream=stream, cause=cause, count=count)
+            for (stream, cause), count in sorted(not_shown.items())
         ),
     )
 
 
-def extrinsics_of_service(rig: Rig, service: ServiceState) -> dict[Pose, Extrinsic]:
+def extrinsics_of_service(rig: Rig, service: ServiceState) -> dict[DisplayedPose, TitledExtrinsic]:
     """The extrinsics that are drawn while a service is watched."""
     provenance = service.extrinsic.provenance if service.extrinsic else "not known"
     pending = service.extrinsic.pending if service.extrinsic else None
     waits = pending.waits.code if pending and pending.waits else "waits for apply"
     return {
-        Pose.SERVED: Extrinsic(service.served, f"served: {provenance}, {service.state}"),
-        Pose.NOMINAL: Extrinsic(rig.T_camera_lidar_nominal, "nominal: of the configuration"),
-        Pose.CANDIDATE: Extrinsic(
+        DisplayedPose.SERVED: TitledExtrinsic(service.served, f"served: {provenance}, {service.state}"),
+        DisplayedPose.NOMINAL: TitledExtrinsic(rig.T_camera_lidar_nominal, "nominal: of the configuration"),
+        DisplayedPose.CANDIDATE: TitledExtrinsic(
             service.candidate, f"candidate: {'none' if service.candidate is None else waits}"
         ),
     }  # fmt: skip
@@ -428,7 +429,7 @@ class SensorStreams:
             subscriber.undeclare()
         self._subscribers = []
 
-    def _subscribe(self, stream: str, key: str, source: Input) -> zenoh.Subscriber[None]:
+    def _subscribe(self, stream: str, key: str, source: StreamInput) -> zenoh.Subscriber[None]:
         inbox = self._inbox
 
         def receive(sample: zenoh.Sample) -> None:

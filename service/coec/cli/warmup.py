@@ -107,7 +107,7 @@ def _compile(lenses: Sequence[str]) -> int:
         def report(_: str) -> None:
             times.step("compiling kernels", compiled(len(lenses)).done, total)
 
-        with compile_news.heard_by(report), second_compiler(config):
+        with compile_news.listening(report), second_compiler(config):
             Solver(config, 1).warm_up()
     return total
 

@@ -19,7 +19,7 @@ from coec.errors import UsageError
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.adapters.zenoh.changes import Change
+    from coec.adapters.zenoh.changes import PairUpdate
 
 EVERY_VEHICLE = "*"
 
@@ -110,17 +110,17 @@ def _print_changes(address: ServiceAddress, seconds: float | None, timeout_s: fl
 
 
 @contextmanager
-def _changes(session: zenoh.Session, address: ServiceAddress, timeout_s: float) -> Iterator[queue.Queue[Change]]:
+def _changes(session: zenoh.Session, address: ServiceAddress, timeout_s: float) -> Iterator[queue.Queue[PairUpdate]]:
     """The present state, and every change from then on."""
-    from coec.adapters.zenoh.changes import listening
+    from coec.adapters.zenoh.changes import subscribed
     from coec.reports import console
     from coec.reports.page.words import count
     from coec.schemas.keys import Keys
 
-    waiting: queue.Queue[Change] = queue.Queue(WAITING)
+    waiting: queue.Queue[PairUpdate] = queue.Queue(WAITING)
     lost = Counter[str]()
 
-    def put(change: Change) -> None:
+    def put(change: PairUpdate) -> None:
         try:
             waiting.put_nowait(change)
         except queue.Full:
@@ -129,14 +129,14 @@ def _changes(session: zenoh.Session, address: ServiceAddress, timeout_s: float) 
     def refuse() -> None:
         lost["messages"] += 1
 
-    with listening(session, Keys(address.prefix, address.vehicle), "*", timeout_s, put, refuse):
+    with subscribed(session, Keys(address.prefix, address.vehicle), "*", timeout_s, put, refuse):
         yield waiting
     if lost:
         dropped = count(lost.total(), "message was", "messages were")
         console.say(f"coec: {dropped} not shown: invalid, or more than could be written")
 
 
-def _write(change: Change, vehicle: str, *, as_json: bool) -> None:
+def _write(change: PairUpdate, vehicle: str, *, as_json: bool) -> None:
     """Prints a change: for people with the time, and with its vehicle."""
     from coec.reports import console
     from coec.reports.instants import second

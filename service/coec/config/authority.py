@@ -6,23 +6,23 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from coec.config.base import FilePath, Stage
-from coec.schemas.commands import NAMES, CommandName
+from coec.config.base import ConfigModel, FilePath
+from coec.schemas.commands import COMMAND_NAMES, CommandName
 
 CommonName = Annotated[str, Field(pattern=r"^[A-Za-z0-9 ._:/@+=,-]{1,64}$")]
 """Common name of a certificate; X.509 allows 64 characters."""
 
 
-class SenderConfig(Stage):
+class SenderConfig(ConfigModel):
     """A sender who may give commands, known by the common name of its certificate."""
 
     name: CommonName = Field(description="common name of the certificate")
     commands: tuple[CommandName, ...] = Field(
-        default=NAMES, min_length=1, description="commands that this sender may give; all unless listed"
+        default=COMMAND_NAMES, min_length=1, description="commands that this sender may give; all unless listed"
     )
 
 
-class AuthorityConfig(Stage):
+class AuthorityConfig(ConfigModel):
     """Who may give commands, whatever the router lets through. A router does not tell the service who asks. A sender
     proves its name to the service itself, with a certificate signed by `root_ca`, in a TLS conversation inside the
     query (`coec query command/...` does this); a router in between can only hold such a command back. Senders without

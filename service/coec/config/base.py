@@ -26,7 +26,7 @@ MAX_PATH_BYTES = 2048
 relative to."""
 
 
-def _path(path: Path) -> Path:
+def _validated_path(path: Path) -> Path:
     if "\0" in str(path) or any(len(os.fsencode(name)) > MAX_NAME_BYTES for name in path.parts):
         raise ValueError(f"a name in a path has no zero byte, and at most {MAX_NAME_BYTES} bytes")
     if len(os.fsencode(path)) > MAX_PATH_BYTES:
@@ -34,7 +34,7 @@ def _path(path: Path) -> Path:
     return path
 
 
-FilePath = Annotated[Path, AfterValidator(_path)]
+FilePath = Annotated[Path, AfterValidator(_validated_path)]
 """A path that the operating system accepts. Text from a file may be no valid path, and Python raises various
 exceptions on such a path; `_path` refuses it first."""
 
@@ -48,7 +48,7 @@ Matrix4x4 = tuple[
 IDENTITY: Matrix4x4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-OUR_WORDS = {
+ERROR_MESSAGES = {
     # Pydantic's own message would name our class.
     "model_type": "give names with their values (a mapping)",
     "missing": "is missing",
@@ -57,29 +57,31 @@ OUR_WORDS = {
 """Error messages by pydantic's error type, where pydantic's own message is written for programmers."""
 
 
-class Stage(BaseModel):
+class ConfigModel(BaseModel):
     """Base of every configuration model: frozen, no unknown keys, no NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-INVERSE = "the pose is `T_camera_lidar`, which maps LiDAR to camera coordinates: write the inverse of this matrix there"
-SAME = "the pose is called `T_camera_lidar`: its four rows, mapping LiDAR to camera coordinates"
-OTHER_NAMES = {
-    "T_lidar_camera": INVERSE,
-    "lidar_from_camera": INVERSE,
-    "T_cam_lidar": SAME,
-    "camera_from_lidar": SAME,
-    "extrinsic": SAME,
-    "extrinsics": SAME,
+INVERSE_POSE = (
+    "the pose is `T_camera_lidar`, which maps LiDAR to camera coordinates: write the inverse of this matrix there"
+)
+SAME_POSE = "the pose is called `T_camera_lidar`: its four rows, mapping LiDAR to camera coordinates"
+FOREIGN_KEY_ADVICE = {
+    "T_lidar_camera": INVERSE_POSE,
+    "lidar_from_camera": INVERSE_POSE,
+    "T_cam_lidar": SAME_POSE,
+    "camera_from_lidar": SAME_POSE,
+    "extrinsic": SAME_POSE,
+    "extrinsics": SAME_POSE,
 }
 """What to write in place of a key that other programs, or other files of coec, have."""
 
 
 def _advice(name: str, kind: str) -> str:
     """What to do about a mistake at a key, beyond pydantic's own words; empty if they say it."""
-    if kind == "extra_forbidden" and name in OTHER_NAMES:
-        return f"; {OTHER_NAMES[name]}"
+    if kind == "extra_forbidden" and name in FOREIGN_KEY_ADVICE:
+        return f"; {FOREIGN_KEY_ADVICE[name]}"
     if kind.startswith("int") and name.endswith("_ns"):
         return "; it counts nanoseconds, a whole number: multiply seconds by 1000000000"
     if kind == "model_type" and name == "intrinsics":
@@ -93,11 +95,17 @@ def _advice(name: str, kind: str) -> str:
 def describe(error: ValidationError, names: Mapping[str, Sequence[str]] | None = None) -> str:
     """Pydantic's complaints in one line: where and what, with `; ` between them. `names` holds the names of the entries
     of each list at the top of the file; they stand in place of the entries' indices."""
-    known, lines = names or {}, []
+    entry_names, lines = names or {}, []
     for item in error.errors():
-        place = list(item["loc"])
-        if len(place) > 1 and isinstance(place[1], int) and place[1] < len(known.get(str(place[0]), ())):
-            place[1] = known[str(place[0])][place[1]]
-        what = OUR_WORDS.get(item["type"], item["msg"]) + _advice(str(place[-1]) if place else "", item["type"])
-        lines.append(f"{'.'.join(str(part) for part in place) or '(top)'}: {what}")
+        location = list(item["loc"])
+        if (
+            len(location) > 1
+            and isinstance(location[1], int)
+            and location[1] < len(entry_names.get(str(location[0]), ()))
+        ):
+            location[1] = entry_names[str(location[0])][location[1]]
+        message = ERROR_MESSAGES.get(item["type"], item["msg"]) + _advice(
+            str(location[-1]) if location else "", item["type"]
+        )
+        lines.append(f"{'.'.join(str(part) for part in location) or '(top)'}: {message}")
     return "; ".join(lines)

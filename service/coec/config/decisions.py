@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from coec.config.base import Stage
+from coec.config.base import ConfigModel
 
 
-class MonitorConfig(Stage):
+class MonitorConfig(ConfigModel):
     """When the monitor checks the latest pairs at the current extrinsic, between two windows."""
 
     period_s: float = Field(default=5.0, gt=0, le=86_400, description="sensor time from one check to the next, s")
@@ -39,7 +39,7 @@ class MonitorConfig(Stage):
         return self
 
 
-class PolicyConfig(Stage):
+class PolicyConfig(ConfigModel):
     """Which accepted estimates become current without a person. An estimate that is not applied waits for
     `command/apply`. Limits are per axis; the limits of a day count every step of the last 24 h of sensor time."""
 

@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
-from coec.config.base import Matrix4x4, Name, Stage, describe
+from coec.config.base import ConfigModel, Matrix4x4, Name, describe
 
 
-class _Written(Stage):
+class _QuaternionPose(ConfigModel):
     """A pose written in one line."""
 
     xyz: tuple[float, float, float]
@@ -20,24 +20,24 @@ QUATERNION_TOLERANCE = 0.01
 """How far the length of a quaternion may be from 1: within this it is rounding, beyond it a mistyped number."""
 
 
-def _rows(value: Any) -> Any:
+def _pose_rows(value: Any) -> Any:
     """The rows of a pose that is written as a position and a quaternion; any other value as it is."""
     if not isinstance(value, dict):
         return value
     from coec.config import poses
 
     try:
-        written = _Written.model_validate(value)
+        written = _QuaternionPose.model_validate(value)
     except ValidationError as error:
-        wanted = "rows of 4x4 numbers, or {xyz: [x, y, z], quaternion: [x, y, z, w]}"
-        raise ValueError(f"give {wanted}: {describe(error)}") from None
+        expected = "rows of 4x4 numbers, or {xyz: [x, y, z], quaternion: [x, y, z, w]}"
+        raise ValueError(f"give {expected}: {describe(error)}") from None
     length = sum(number * number for number in written.quaternion) ** 0.5
     if abs(length - 1.0) > QUATERNION_TOLERANCE:
         raise ValueError(f"quaternion: its length is {length:.3g}, not 1; its numbers are x, y, z, w")
     return poses.rows_of(written.xyz, written.quaternion)
 
 
-def _rigid(rows: Matrix4x4) -> Matrix4x4:
+def _validated_rigid(rows: Matrix4x4) -> Matrix4x4:
     from coec.config import poses
 
     if not poses.is_rigid(rows):
@@ -45,11 +45,11 @@ def _rigid(rows: Matrix4x4) -> Matrix4x4:
     return rows
 
 
-Pose = Annotated[Matrix4x4, BeforeValidator(_rows), AfterValidator(_rigid)]
+Pose = Annotated[Matrix4x4, BeforeValidator(_pose_rows), AfterValidator(_validated_rigid)]
 """A 4x4 matrix, or `{xyz: [x, y, z], quaternion: [x, y, z, w]}` in one line."""
 
 
-class LinkConfig(Stage):
+class LinkConfig(ConfigModel):
     """The known pose between two cameras, or between two LiDARs, for example on a stereo bar or a common mount."""
 
     camera_a: Name | None = Field(default=None, description="name of a camera")

@@ -7,10 +7,10 @@ import re
 
 from pydantic import Field, model_validator
 
-from coec.config.base import Stage
+from coec.config.base import ConfigModel
 
 
-class MetricsConfig(Stage):
+class MetricsConfig(ConfigModel):
     """HTTP for a scraper on the same computer: `/metrics` (OpenMetrics if asked for, else Prometheus text), `/health`
     (200, or 503 when a calibration is not known to be right) and `/live` (200 while the service makes progress).
     Everybody who reaches the address can read; nobody can change anything."""
@@ -32,7 +32,7 @@ class MetricsConfig(Stage):
         return self.address is not None and not is_loopback(self.address[0])
 
     @model_validator(mode="after")
-    def _nobody_from_outside(self) -> MetricsConfig:
+    def _validate_address(self) -> MetricsConfig:
         if self.http is None:
             return self
         if not re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]+):\d{1,5}", self.http) or not 0 < self._port < 65536:

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from coec.config.base import Matrix4x4, Name, Stage
+from coec.config.base import ConfigModel, Matrix4x4, Name
 from coec.config.decisions import MonitorConfig, PolicyConfig
 from coec.config.stages import CalibrationConfig, PairingConfig, TrackerConfig, WindowConfig
 from coec.config.streams import (
@@ -22,7 +22,7 @@ from coec.config.streams import (
 )
 
 
-class OpenPairConfig(Stage):
+class OpenPairConfig(ConfigModel):
     """One camera-LiDAR pair that may leave out what the service can read from ROS 2 topics: the frames of its sensors,
     the intrinsics (`CameraInfo`) and the poses between the sensors (`/tf_static`). `points: TEXT` is short for
     `lidar: {topic: TEXT}`."""
@@ -47,7 +47,7 @@ class OpenPairConfig(Stage):
 
     @model_validator(mode="before")
     @classmethod
-    def _points_are_the_lidars(cls, document: Any) -> Any:
+    def _points_as_lidar(cls, document: Any) -> Any:
         if not isinstance(document, dict) or "points" not in document:
             return document
         points = document["points"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coec.config.base import Matrix4x4
 from coec.geometry import cameras, se3
 
-LOOKED_AT_M = 15.0
+VIEW_DISTANCE_M = 15.0
 """Distance at which the common view of two sensors is judged. It is about the geometric middle of the 2 to 80 m in
 which points count, and large against half the width of a vehicle."""
 
@@ -46,7 +46,7 @@ def relative(T_vehicle_a: Matrix4x4, T_vehicle_b: Matrix4x4) -> Matrix4x4:
 
 
 @dataclass(frozen=True, slots=True)
-class Common:
+class CommonView:
     """How much a camera and a LiDAR see in common, as shares from 0 to 1.
 
     Attributes:
@@ -59,13 +59,13 @@ class Common:
     of_camera: float
 
 
-def common(
+def common_view(
     model: str,
     intrinsics: dict[str, float],
     T_camera_lidar: Matrix4x4,
     azimuth_deg: tuple[float, float],
     elevation_deg: tuple[float, float],
-) -> Common:
+) -> CommonView:
     """How much both see in common. Obstacles in between, such as the vehicle itself, are not taken into account.
 
     Args:
@@ -80,15 +80,15 @@ def common(
     low_deg, high_deg = elevation_deg
     up_deg = low_deg + (high_deg - low_deg) * (np.arange(ELEVATIONS) + 0.5) / ELEVATIONS
     turn_rad, up_rad = (np.radians(grid.ravel()) for grid in np.meshgrid(turn_deg + azimuth_deg[0], up_deg))
-    level = LOOKED_AT_M * np.cos(up_rad)
-    p_lidar = np.stack([level * np.cos(turn_rad), level * np.sin(turn_rad), LOOKED_AT_M * np.sin(up_rad)], axis=1)
+    level = VIEW_DISTANCE_M * np.cos(up_rad)
+    p_lidar = np.stack([level * np.cos(turn_rad), level * np.sin(turn_rad), VIEW_DISTANCE_M * np.sin(up_rad)], axis=1)
     T = np.array(T_camera_lidar)
     projected = [cameras.project_point(camera, *point) for point in (p_lidar @ T[:3, :3].T + T[:3, 3]).tolist()]
     seen = cameras.in_image(camera, np.array([(u, v) for u, v, _ in projected]))
     seen &= np.array([valid for _, _, valid in projected])
     measured = np.tile(turn_deg < azimuth_deg[1] - azimuth_deg[0], ELEVATIONS)
     both = float((seen & measured).sum())
-    return Common(both / max(float(measured.sum()), 1.0), both / max(float(seen.sum()), 1.0))
+    return CommonView(both / max(float(measured.sum()), 1.0), both / max(float(seen.sum()), 1.0))
 
 
 def _rows(T: NDArray[np.float64]) -> Matrix4x4:

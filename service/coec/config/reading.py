@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from coec.config.base import describe
 from coec.config.pair import OpenPairConfig
-from coec.config.rig import is_rig, written_out
+from coec.config.rig import expand_rig, is_rig
 from coec.config.whole import Config
 from coec.config.yaml_text import load_yaml
 from coec.errors import ConfigError
@@ -37,7 +37,7 @@ def config_of(document: Any) -> Config:
     if not isinstance(document, dict):
         raise ConfigError(f"expected a mapping at the top, found {type(document).__name__}")
     if is_rig(document):
-        document = written_out(document)
+        document = expand_rig(document)
     try:
         return Config.model_validate(document)
     except ValidationError as error:
@@ -49,14 +49,20 @@ def _resolve_paths(config: Config, folder: Path) -> Config:
     zenoh = config.zenoh
     if zenoh.file is not None:
         zenoh = zenoh.model_copy(update={"file": folder / zenoh.file})
-    own = config.authority
-    files = {"certificate": own.certificate, "private_key": own.private_key, "root_ca": own.root_ca}
-    authority = own.model_copy(update={name: None if path is None else folder / path for name, path in files.items()})
+    authority_paths = config.authority
+    files = {
+        "certificate": authority_paths.certificate,
+        "private_key": authority_paths.private_key,
+        "root_ca": authority_paths.root_ca,
+    }
+    authority = authority_paths.model_copy(
+        update={name: None if path is None else folder / path for name, path in files.items()}
+    )
     state = config.state.model_copy(update={"directory": folder / config.state.directory})
     pairs = tuple(_resolve_pair_paths(pair, folder) for pair in config.pairs)
-    awaited = tuple(_resolve_pair_paths(pair, folder) for pair in config.awaited)
+    incomplete = tuple(_resolve_pair_paths(pair, folder) for pair in config.awaited)
     return config.model_copy(
-        update={"pairs": pairs, "awaited": awaited, "state": state, "zenoh": zenoh, "authority": authority}
+        update={"pairs": pairs, "awaited": incomplete, "state": state, "zenoh": zenoh, "authority": authority}
     )
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
-from coec.config.base import IDENTITY, MAX_NAME, Name, Stage, describe
+from coec.config.base import IDENTITY, MAX_NAME, ConfigModel, Name, describe
 from coec.config.decisions import MonitorConfig, PolicyConfig
 from coec.config.links import LinkConfig, Pose
 from coec.config.stages import CalibrationConfig, PairingConfig, TrackerConfig, WindowConfig
@@ -24,11 +24,11 @@ MAX_SENSORS = 16
 
 MAX_LINKS = 64
 
-LEAST_OF_LIDAR = 0.005
+MIN_LIDAR_SHARE = 0.005
 """Least share of a LiDAR's directions that a camera must see. It stands for 500 of the 100,000 points of a sweep of 64
 beams: with fewer points in view a window takes no frame pair (`window.min_points_in_view`)."""
 
-LEAST_OF_CAMERA = 0.1
+MIN_CAMERA_SHARE = 0.1
 """Least share of the image that the LiDAR must cover: 1 is what a LiDAR that measures all around would cover. Less is a
 strip at the edge of the image. There the lens model is worst and the vehicle itself is in the way, and a strip cannot
 tell the three rotations apart."""
@@ -38,7 +38,7 @@ ALL = "all"
 T = TypeVar("T")
 
 
-class FieldOfView(Stage):
+class FieldOfView(ConfigModel):
     """Where a LiDAR measures, in its own frame: x ahead, y left, z up."""
 
     azimuth_deg: tuple[float, float] = Field(
@@ -79,7 +79,7 @@ class RigEgo(OpenEgoConfig):
     T_vehicle_ego: Pose = Field(default=IDENTITY, description="pose of the ego-motion's frame in the vehicle's frame")
 
 
-class RigStages(Stage):
+class RigStages(ConfigModel):
     """Everything that can be set for a pair except its sensors."""
 
     pairing: PairingConfig = PairingConfig()
@@ -98,7 +98,7 @@ class RigPair(RigStages):
     name: Name | None = Field(default=None, description="name of the pair; by default made from its sensors' names")
 
 
-def _listed(value: Any) -> Any:
+def _pair_list(value: Any) -> Any:
     if value == ALL:
         return None
     if isinstance(value, list | tuple):
@@ -106,20 +106,20 @@ def _listed(value: Any) -> Any:
     raise ValueError(f"give `{ALL}`, or a list of {{camera: NAME, lidar: NAME}}")
 
 
-class RigConfig(Stage):
+class RigConfig(ConfigModel):
     """The sensors of a vehicle."""
 
     cameras: tuple[RigCamera, ...] = Field(min_length=1, max_length=MAX_SENSORS, description="each listed once")
     lidars: tuple[RigLidar, ...] = Field(min_length=1, max_length=MAX_SENSORS, description="each listed once")
     ego: RigEgo | None = None
-    pairs: Annotated[tuple[RigPair, ...] | None, BeforeValidator(_listed)] = Field(
+    pairs: Annotated[tuple[RigPair, ...] | None, BeforeValidator(_pair_list)] = Field(
         description="`all`: every camera and LiDAR that see something in common; or a list"
     )
     stages: RigStages = Field(default=RigStages(), description="settings of every pair that does not set its own")
     links: tuple[LinkConfig, ...] = Field(default=(), max_length=MAX_LINKS, description="as in the whole configuration")
 
     @model_validator(mode="after")
-    def _each_once(self) -> Self:
+    def _unique_names(self) -> Self:
         for place, sensors in (("cameras", self.cameras), ("lidars", self.lidars)):
             names = [sensor.name for sensor in sensors]
             twice = sorted({name for name in names if names.count(name) > 1})
@@ -133,7 +133,7 @@ def is_rig(document: Mapping[str, Any]) -> bool:
     return "cameras" in document or "lidars" in document or document.get("pairs") == ALL
 
 
-def written_out(document: Mapping[str, Any]) -> dict[str, Any]:
+def expand_rig(document: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of a rig, as it is written, in the long form: each pair with its streams.
 
     Raises:
@@ -145,8 +145,8 @@ def written_out(document: Mapping[str, Any]) -> dict[str, Any]:
     except ValidationError as error:
         names = {kind: _names(document.get(kind)) for kind in ("cameras", "lidars")}
         raise ConfigError(describe(error, names)) from error
-    found = _Pairs(rig, native=document.get("middleware", "native") == "native")
-    pairs = list(found)
+    expansion = _PairExpansion(rig, native=document.get("middleware", "native") == "native")
+    pairs = list(expansion)
     if not pairs:
         raise ConfigError(
             "pairs: with the poses that are given, no camera sees what a LiDAR sees: check T_vehicle_camera, "
@@ -154,7 +154,7 @@ def written_out(document: Mapping[str, Any]) -> dict[str, Any]:
         )
     links = [link.model_dump(exclude_none=True) for link in rig.links]
     rest = {name: value for name, value in document.items() if name not in own}
-    return {**rest, "pairs": pairs, "links": links, "left_out": found.left_out}
+    return {**rest, "pairs": pairs, "links": links, "left_out": expansion.left_out}
 
 
 def _names(sensors: Any) -> list[str]:
@@ -165,7 +165,7 @@ def _names(sensors: Any) -> list[str]:
     return [name if isinstance(name, str) and len(name) <= MAX_NAME else str(i) for i, name in enumerate(names)]
 
 
-class _Pairs:
+class _PairExpansion:
     """The pairs of a rig in their long form.
 
     Attributes:
@@ -188,21 +188,21 @@ class _Pairs:
         if self._rig.pairs is None:
             for camera in self._rig.cameras:
                 for lidar in self._rig.lidars:
-                    if _see_something(camera, lidar):
+                    if _have_common_view(camera, lidar):
                         yield self._pair(camera, lidar, None)
                     else:
                         self.left_out.append(self._name(camera, lidar))
             return
         for index, pair in enumerate(self._rig.pairs):
-            camera_of = _found(self._cameras, pair.camera, f"pairs.{index}.camera", "camera")
-            yield self._pair(camera_of, _found(self._lidars, pair.lidar, f"pairs.{index}.lidar", "LiDAR"), pair)
+            camera_of = _sensor_named(self._cameras, pair.camera, f"pairs.{index}.camera", "camera")
+            yield self._pair(camera_of, _sensor_named(self._lidars, pair.lidar, f"pairs.{index}.lidar", "LiDAR"), pair)
 
     def _name(self, camera: RigCamera, lidar: RigLidar) -> str:
         return camera.name if len(self._lidars) == 1 else f"{camera.name}-{lidar.name}"
 
     def _pair(self, camera: RigCamera, lidar: RigLidar, written: RigPair | None) -> dict[str, Any]:
         if self._native:
-            _check_told(camera, lidar)
+            _require_calibration(camera, lidar)
         # On native keys each sensor's frames carry its own name, unless a `frame_id` is given.
         frames = {kind: {"frame_id": sensor.name} for kind, sensor in (("camera", camera), ("lidar", lidar))}
         frames = frames if self._native else {"camera": {}, "lidar": {}}
@@ -225,13 +225,13 @@ class _Pairs:
         return pair
 
 
-def _found(sensors: Mapping[str, T], name: str, where: str, kind: str) -> T:
+def _sensor_named(sensors: Mapping[str, T], name: str, where: str, kind: str) -> T:
     if name not in sensors:
         raise ConfigError(f"{where}: there is no {kind} {name}; there are {', '.join(sensors)}")
     return sensors[name]
 
 
-def _check_told(camera: RigCamera, lidar: RigLidar) -> None:
+def _require_calibration(camera: RigCamera, lidar: RigLidar) -> None:
     """Refuses sensors whose intrinsics or pose are missing: native frames do not tell them."""
     lacking = {
         f"cameras.{camera.name}.intrinsics": camera.intrinsics,
@@ -260,7 +260,7 @@ def _ego(ego: RigEgo, lidar: RigLidar) -> dict[str, Any]:
     return document
 
 
-def _see_something(camera: RigCamera, lidar: RigLidar) -> bool:
+def _have_common_view(camera: RigCamera, lidar: RigLidar) -> bool:
     """Whether both see enough in common; True where that is not known yet.
 
     Raises:
@@ -272,12 +272,12 @@ def _see_something(camera: RigCamera, lidar: RigLidar) -> bool:
     if nominal is None or intrinsics is None:
         return True
     field = lidar.field_of_view
-    told = (intrinsics.model, intrinsics.parameters(), nominal)
+    camera_model = (intrinsics.model, intrinsics.parameters(), nominal)
     try:
-        common = poses.common(*told, field.azimuth_deg, field.elevation_deg)
+        common = poses.common_view(*camera_model, field.azimuth_deg, field.elevation_deg)
     except ValueError as error:
         raise ConfigError(f"cameras.{camera.name}.intrinsics: {error}") from error
-    return common.of_lidar >= LEAST_OF_LIDAR and common.of_camera >= LEAST_OF_CAMERA
+    return common.of_lidar >= MIN_LIDAR_SHARE and common.of_camera >= MIN_CAMERA_SHARE
 
 
 def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,12 +6,12 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from coec.config.base import Stage
+from coec.config.base import ConfigModel
 
 RosOutput = Literal["diagnostics", "tf_static", "camera_info", "overlay"]
 
 
-class RosConfig(Stage):
+class RosConfig(ConfigModel):
     """ROS 2 on the bus, used if `middleware` is `rmw_zenoh` or `ros2dds`."""
 
     domain: int = Field(default=0, ge=0, le=232, description="ROS_DOMAIN_ID (rmw_zenoh)")
@@ -37,7 +37,7 @@ class RosConfig(Stage):
     )
 
     @model_validator(mode="after")
-    def _each_once(self) -> RosConfig:
+    def _unique_outputs(self) -> RosConfig:
         if len(set(self.publish)) != len(self.publish):
             raise ValueError("publish names something twice")
         return self

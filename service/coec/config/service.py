@@ -7,10 +7,10 @@ from typing import Literal
 
 from pydantic import Field
 
-from coec.config.base import FilePath, Stage
+from coec.config.base import ConfigModel, FilePath
 
 
-class LimitsConfig(Stage):
+class LimitsConfig(ConfigModel):
     """Hard limits on what a message may hold: larger messages are refused before they are decoded."""
 
     max_message_bytes: int = Field(
@@ -30,7 +30,7 @@ class LimitsConfig(Stage):
     )
 
 
-class StateConfig(Stage):
+class StateConfig(ConfigModel):
     """The state directory; deleting it returns the vehicle to its nominal calibration."""
 
     directory: FilePath = Field(
@@ -64,7 +64,7 @@ class StateConfig(Stage):
     evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
 
 
-class SnippetsConfig(Stage):
+class SnippetsConfig(ConfigModel):
     """Full-rate recordings of the seconds around an event (suspect, degraded, miscalibrated), from frames in memory."""
 
     memory_bytes: int = Field(
@@ -81,7 +81,7 @@ class SnippetsConfig(Stage):
     )
 
 
-class BudgetConfig(Stage):
+class BudgetConfig(ConfigModel):
     """How much processor time all pairs together may spend. If it does not suffice for every check and every window,
     all periods are stretched evenly, and `status` says by how much."""
 
@@ -95,7 +95,7 @@ class BudgetConfig(Stage):
     )
 
 
-class LidarEdgesConfig(Stage):
+class LidarEdgesConfig(ConfigModel):
     """Measures the poses between the LiDARs of a vehicle, from the surfaces that two of them both see."""
 
     period_s: float = Field(
@@ -107,7 +107,7 @@ class LidarEdgesConfig(Stage):
     )
 
 
-class WorkerConfig(Stage):
+class WorkerConfig(ConfigModel):
     """The process that runs the depth network and solves windows."""
 
     timeout_s: float = Field(
@@ -125,7 +125,7 @@ class WorkerConfig(Stage):
     )
 
 
-class ZenohConfig(Stage):
+class ZenohConfig(ConfigModel):
     """The Zenoh session. `file` is a Zenoh configuration (JSON5) for TLS, access control and the like."""
 
     connect: tuple[str, ...] = Field(
@@ -147,7 +147,7 @@ class ZenohConfig(Stage):
         return self.listen if self.embedded_router else self.connect
 
 
-class LogConfig(Stage):
+class LogConfig(ConfigModel):
     """The log, on standard output."""
 
     level: Literal["debug", "info", "warning", "error"] = Field(

@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from coec.config.base import Stage
+from coec.config.base import ConfigModel
 
 
-class PairingConfig(Stage):
+class PairingConfig(ConfigModel):
     """Which camera frame belongs to which sweep."""
 
     tolerance_s: float = Field(default=0.05, gt=0, le=1, description="largest stamp difference; half a 10 Hz period")
@@ -28,7 +28,7 @@ MAX_SLICE_S = 3600.0
 """Longest slice, s: within an hour, light and weather are those of one drive."""
 
 
-class WindowConfig(Stage):
+class WindowConfig(ConfigModel):
     """How a window is chosen from the stream (the paper: 25 pairs over three minutes)."""
 
     pairs: int = Field(default=25, ge=1, le=400, description="frame pairs of a full window")
@@ -69,7 +69,7 @@ class WindowConfig(Stage):
         return self
 
 
-class DepthConfig(Stage):
+class DepthConfig(ConfigModel):
     """The depth network."""
 
     model: str = Field(
@@ -82,7 +82,7 @@ class DepthConfig(Stage):
     threads: int = Field(default=2, ge=1, le=64, description="threads of the inference")
 
 
-class ObjectiveConfig(Stage):
+class ObjectiveConfig(ConfigModel):
     """The objective: equation (1) of the paper, and the guard against poses that look away from the points."""
 
     kind: Literal["mi", "fused", "intensity"] = Field(
@@ -101,7 +101,7 @@ class ObjectiveConfig(Stage):
         return self
 
 
-class SearchConfig(Stage):
+class SearchConfig(ConfigModel):
     """The box and the steps of the search (BOBYQA)."""
 
     dof: Literal[3, 6] = Field(default=3, description="3: rotation only, the translation is known; 6: both")
@@ -121,7 +121,7 @@ class SearchConfig(Stage):
     reach_m: float = Field(default=0.65, gt=0, le=2, description="radius of the global search about the start (fused)")
 
 
-class VerdictConfig(Stage):
+class VerdictConfig(ConfigModel):
     """Limits of equation (2) for a rig that is not commissioned yet. Each compares the window with itself, so that the
     limits do not depend on the scene, the bins or the network."""
 
@@ -185,7 +185,7 @@ class VerdictConfig(Stage):
     )
 
 
-class TimeOffsetConfig(Stage):
+class TimeOffsetConfig(ConfigModel):
     """When the offset between the clocks of camera and LiDAR counts as observed."""
 
     reach_s: float = Field(default=0.1, gt=0, le=0.5, description="largest offset that is searched, s")
@@ -205,7 +205,7 @@ class TimeOffsetConfig(Stage):
     )
 
 
-class CalibrationConfig(Stage):
+class CalibrationConfig(ConfigModel):
     """Everything that decides the result of a given window. Its hash is the `config_hash` of the result."""
 
     depth: DepthConfig = DepthConfig()
@@ -219,7 +219,7 @@ class CalibrationConfig(Stage):
     )
 
 
-class TrackerConfig(Stage):
+class TrackerConfig(ConfigModel):
     """How accepted windows combine into the served extrinsic. Per axis, rotations in degrees, translations in
     metres."""
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from coec.config.base import IDENTITY, FilePath, KeyExpression, Matrix4x4, Name, Stage
+from coec.config.base import IDENTITY, ConfigModel, FilePath, KeyExpression, Matrix4x4, Name
 
 ROS_NAMES = {
     "plumb_bob": "radtan",
@@ -19,7 +19,7 @@ ROS_NAMES = {
 """Models of lenses by the names that ROS (sensor_msgs/distortion_models.hpp), OpenCV and Kalibr have for them."""
 
 
-class CameraIntrinsics(Stage):
+class CameraIntrinsics(ConfigModel):
     """Intrinsics of a camera; `model` determines which of the optional parameters are needed. The names are those of
     `dataset.yaml`."""
 
@@ -56,7 +56,7 @@ class CameraIntrinsics(Stage):
         return self.model_dump(exclude={"model"}, exclude_none=True)
 
 
-class SweepConfig(Stage):
+class SweepConfig(ConfigModel):
     """Azimuth timing of a spinning LiDAR without per-point time: a point at azimuth a was measured
     `sign · wrap(a - stamp_azimuth_deg) / 360°` revolutions after the stamp."""
 
@@ -69,7 +69,7 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 TimeBase = Literal["stamp", "clock"]
 
 
-class PointTimeConfig(Stage):
+class PointTimeConfig(ConfigModel):
     """How the points of a `PointCloud2` are timed, for clouds whose values do not show it."""
 
     field: str = Field(min_length=1, max_length=64, description="name of the field with the time")
@@ -95,7 +95,7 @@ EgoMessage = Literal[
 ]
 
 
-class StreamConfig(Stage):
+class StreamConfig(ConfigModel):
     """Where the samples of a stream come from; a text in its place is short for `topic`."""
 
     key: KeyExpression | None = Field(default=None, description="Zenoh key of the frames")
@@ -128,7 +128,7 @@ class StreamConfig(Stage):
         return document
 
     @model_validator(mode="after")
-    def _one_place(self) -> Self:
+    def _key_or_topic(self) -> Self:
         if (self.key is None) == (self.topic is None):
             raise ValueError("give `key`, a key of Zenoh, or `topic`, a name of ROS 2 that begins with /: one of them")
         return self

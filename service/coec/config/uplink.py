@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from coec.config.base import Stage
+from coec.config.base import ConfigModel
 
 
-class UplinkConfig(Stage):
+class UplinkConfig(ConfigModel):
     """Limits for the link to a fleet centre, often a modem that others need, too. The service does not know who asks,
     so that it meters queries from the vehicle itself alike."""
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, model_validator
 
 from coec.config.authority import AuthorityConfig
-from coec.config.base import KeyExpression, Name, Stage
+from coec.config.base import ConfigModel, KeyExpression, Name
 from coec.config.links import LinkConfig
 from coec.config.metrics import MetricsConfig
 from coec.config.pair import OpenPairConfig, PairConfig
@@ -32,7 +32,7 @@ from coec.schemas.ros_names import ros_name
 MAX_PAIRS = 32
 
 
-class Config(Stage):
+class Config(ConfigModel):
     """The one configuration file of a daemon."""
 
     vehicle: Name = Field(default="vehicle", description="name of the vehicle, unique, part of every key")
@@ -82,17 +82,21 @@ class Config(Stage):
 
     @model_validator(mode="before")
     @classmethod
-    def _open_pairs_are_awaited(cls, document: Any) -> Any:
+    def _separate_incomplete_pairs(cls, document: Any) -> Any:
         if not isinstance(document, dict) or document.get("middleware", "native") == "native":
             return document
-        pairs, awaited = document.get("pairs", ()), document.get("awaited", ())
-        if not isinstance(pairs, list | tuple) or not isinstance(awaited, list | tuple):
+        pairs, incomplete = document.get("pairs", ()), document.get("awaited", ())
+        if not isinstance(pairs, list | tuple) or not isinstance(incomplete, list | tuple):
             return document
-        still = [pair for pair in pairs if _leaves_out(pair)]
-        return {**document, "pairs": [pair for pair in pairs if pair not in still], "awaited": [*still, *awaited]}
+        open_pairs = [pair for pair in pairs if _is_incomplete(pair)]
+        return {
+            **document,
+            "pairs": [pair for pair in pairs if pair not in open_pairs],
+            "awaited": [*open_pairs, *incomplete],
+        }
 
     @model_validator(mode="after")
-    def _some_pairs(self) -> Config:
+    def _pair_count_in_range(self) -> Config:
         if not 0 < len(self.every_pair) <= MAX_PAIRS:
             raise ValueError(f"pairs: give 1 to {MAX_PAIRS}")
         if self.awaited and self.middleware == "native":
@@ -100,7 +104,7 @@ class Config(Stage):
         return self
 
     @model_validator(mode="after")
-    def _names_unique(self) -> Config:
+    def _unique_pair_names(self) -> Config:
         names = [pair.name for pair in self.every_pair]
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
@@ -110,18 +114,18 @@ class Config(Stage):
         return self
 
     @model_validator(mode="after")
-    def _one_sensor_a_name(self) -> Config:
+    def _consistent_sensor_names(self) -> Config:
         for kind in ("camera", "lidar"):
-            places: dict[str, str] = {}
+            locations: dict[str, str] = {}
             for sensor in (pair.streams[kind] for pair in self.every_pair):
                 name = getattr(sensor, "name", None)
-                if name is not None and places.setdefault(name, sensor.place) != sensor.place:
-                    raise ValueError(f"pairs: {kind} {name} cannot be on {places[name]} and on {sensor.place}")
+                if name is not None and locations.setdefault(name, sensor.place) != sensor.place:
+                    raise ValueError(f"pairs: {kind} {name} cannot be on {locations[name]} and on {sensor.place}")
             for index, link in enumerate(self.links):
                 ends = [end for end in (getattr(link, f"{kind}_a"), getattr(link, f"{kind}_b")) if end is not None]
-                absent = [end for end in ends if end not in places]
+                absent = [end for end in ends if end not in locations]
                 if absent:
-                    known = ", ".join(places) or "none has a `name`"
+                    known = ", ".join(locations) or "none has a `name`"
                     raise ValueError(f"links.{index}: no pair has a {kind} of the name {absent[0]}; there are: {known}")
         return self
 
@@ -138,7 +142,7 @@ class Config(Stage):
         return self
 
     @model_validator(mode="after")
-    def _ros_can_be_told(self) -> Config:
+    def _ros_output_possible(self) -> Config:
         if not self.ros.publish:
             return self
         if self.middleware == "native":
@@ -153,14 +157,14 @@ class Config(Stage):
         return self
 
 
-def _leaves_out(pair: Any) -> bool:
+def _is_incomplete(pair: Any) -> bool:
     """Whether a pair, as it is written, leaves out something that ROS 2 topics tell."""
     if not isinstance(pair, dict):
         return False
     lidar, ego = pair.get("lidar", pair.get("points")), pair.get("ego")
-    places = [(pair, "T_camera_lidar"), (pair.get("camera"), "intrinsics"), (pair.get("camera"), "frame_id")]
-    places += [(lidar, "frame_id"), *([] if ego is None else [(ego, "T_lidar_ego")])]
-    return any(isinstance(part, str) or (isinstance(part, dict) and part.get(name) is None) for part, name in places)
+    locations = [(pair, "T_camera_lidar"), (pair.get("camera"), "intrinsics"), (pair.get("camera"), "frame_id")]
+    locations += [(lidar, "frame_id"), *([] if ego is None else [(ego, "T_lidar_ego")])]
+    return any(isinstance(part, str) or (isinstance(part, dict) and part.get(name) is None) for part, name in locations)
 
 
 def config_hash(*parts: BaseModel | str) -> str:

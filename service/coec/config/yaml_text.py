@@ -41,8 +41,8 @@ def load_yaml(path: Path) -> Any:
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError as error:
-        told = f"byte {error.start} is no text in UTF-8"
-        raise ConfigError(f"{path} is not valid YAML: {told}; is it the right file?") from error
+        detail = f"byte {error.start} is no text in UTF-8"
+        raise ConfigError(f"{path} is not valid YAML: {detail}; is it the right file?") from error
     try:
         return parse_yaml(text)
     except ConfigError as error:
@@ -59,13 +59,13 @@ def parse_yaml(text: str) -> Any:
         raise ConfigError(f"it has more than {MAX_YAML_BYTES} bytes")
     reader = YAML(typ="safe", pure=True)
     reader.max_depth = MAX_YAML_DEPTH
-    reader.Composer = _Bounded
+    reader.Composer = _BoundedComposer
     try:
         document = reader.load(text)
     except ConfigError:
         raise
     except MarkedYAMLError as error:
-        raise ConfigError(_told(error)) from error
+        raise ConfigError(_error_with_position(error)) from error
     except YAMLError as error:
         raise ConfigError(" ".join(str(error).split())) from error
     except (
@@ -76,14 +76,14 @@ def parse_yaml(text: str) -> Any:
     return document
 
 
-def _told(error: MarkedYAMLError) -> str:
+def _error_with_position(error: MarkedYAMLError) -> str:
     """One line that says what is wrong and where."""
     mark = error.problem_mark
     where = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
     return " ".join(f"{where}{error.problem or error.context or 'no YAML'}".split())
 
 
-class _Bounded(Composer):
+class _BoundedComposer(Composer):
     """Refuses a document while reading it, as soon as it has too many values. It also refuses merge keys: YAML 1.2 does
     not have them, and they would copy values over and over."""
 
@@ -104,13 +104,13 @@ class _Bounded(Composer):
 def _check_extent(document: object) -> None:
     """Checks depth and number of values again with all aliases followed, as a validator would: with aliases a short
     text can make a huge, even endless document."""
-    waiting, values = [(document, 0)], 0
-    while waiting:
-        value, depth = waiting.pop()
+    stack, values = [(document, 0)], 0
+    while stack:
+        value, depth = stack.pop()
         values += 1
         if depth > MAX_YAML_DEPTH or values > MAX_YAML_VALUES:
             raise ConfigError(f"it is nested deeper than {MAX_YAML_DEPTH}, or has more than {MAX_YAML_VALUES} values")
         if isinstance(value, dict):
-            waiting += ((item, depth + 1) for item in value.values())
+            stack += ((item, depth + 1) for item in value.values())
         elif isinstance(value, list):
-            waiting += ((item, depth + 1) for item in value)
+            stack += ((item, depth + 1) for item in value)

@@ -7,9 +7,9 @@ import sys
 from collections.abc import Callable
 
 from coec.adapters.system import logs
-from coec.adapters.system.notify import Notifier
+from coec.adapters.system.notify import ServiceManagerNotifier
 from coec.config import Config
-from coec.daemon.asked import received
+from coec.daemon.asked import handled_signals
 from coec.daemon.service import Daemon, exit_code_of
 from coec.daemon.state_folder import locked
 from coec.errors import CoecError, UnavailableError
@@ -27,8 +27,8 @@ def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
     logs.configure(config.log.level, config.log.format)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     try:
-        with received() as signals, locked(config.state.directory) as lock:
-            return Daemon(config, Notifier.from_environment(), lock).serve(signals, reread)
+        with handled_signals() as signals, locked(config.state.directory) as lock:
+            return Daemon(config, ServiceManagerNotifier.from_environment(), lock).serve(signals, reread)
     except CoecError as error:
         _log.error(str(error), extra={"fields": {"code": error.reply_code}})
         return exit_code_of(error)

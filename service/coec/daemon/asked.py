@@ -22,7 +22,7 @@ class Signals:
 
 
 @contextmanager
-def received() -> Iterator[Signals]:
+def handled_signals() -> Iterator[Signals]:
     """Handles the signals of the process within the block, and restores the earlier handlers after it."""
     signals = Signals()
     numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)

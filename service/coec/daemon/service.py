@@ -12,15 +12,15 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Literal
 
 from coec import __version__
-from coec.adapters.files.scribe import Scribe
+from coec.adapters.files.scribe import DiskWriter
 from coec.adapters.system import allocator, logs
 from coec.adapters.system.memory import resident_bytes
-from coec.adapters.system.notify import Notifier
+from coec.adapters.system.notify import ServiceManagerNotifier
 from coec.adapters.system.threads import ServiceThread
-from coec.adapters.tls.conversation import Listener, credentials_of
+from coec.adapters.tls.conversation import CommandListener, credentials_of
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.endpoints import redacted
-from coec.adapters.zenoh.presence import Presence, told, unproven_text
+from coec.adapters.zenoh.presence import SingletonGuard, rival_text, unproven_text
 from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.ros_publisher import RosPublishers
 from coec.adapters.zenoh.ros_side import RosSide
@@ -34,39 +34,39 @@ from coec.errors import CoecError, ConfigError, ModelError, UsageError
 from coec.exit_codes import ExitCode
 from coec.runtime.api import metrics
 from coec.runtime.api.authority import Authority
-from coec.runtime.api.awaited import AwaitedAnswers, AwaitedCommands
+from coec.runtime.api.awaited import PendingPairAnswers, PendingPairCommands
 from coec.runtime.api.commands import Commands
-from coec.runtime.api.configuration import shown
+from coec.runtime.api.configuration import redacted_configuration
 from coec.runtime.api.health import reasons_of
-from coec.runtime.api.http_door import HttpDoor
-from coec.runtime.api.last_words import LastWords
-from coec.runtime.api.metrics import TextFormat, Took, View
+from coec.runtime.api.http_door import MetricsServer
+from coec.runtime.api.last_words import Heartbeats
+from coec.runtime.api.metrics import LabelledHistogram, MetricsInput, TextFormat
 from coec.runtime.api.pages import pages
 from coec.runtime.api.pair_answers import PairAnswers
-from coec.runtime.api.reception import Reception, Rules
+from coec.runtime.api.reception import CommandHandler, CommandRules
 from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.rig_commands import RigCommands
-from coec.runtime.api.router_watch import RouterWatch
-from coec.runtime.api.routes import VehicleAnswers
-from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.api.router_watch import RouterMonitor
+from coec.runtime.api.routes import VehicleRoutes
+from coec.runtime.api.snapshots import SerializedReply
 from coec.runtime.api.status import budget_status_of, worker_status_of
 from coec.runtime.api.uplink import Uplink
 from coec.runtime.budget.budget import Budget
-from coec.runtime.decisions.decider import Decider
+from coec.runtime.decisions.decider import CalibrationManager
 from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.edges.all import LidarEdges
+from coec.runtime.edges.all import LidarPairs
 from coec.runtime.ingest.intake import Intake
 from coec.runtime.nominal.kept import completed
-from coec.runtime.outside import Outside
+from coec.runtime.outside import VehicleContext
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.snippet_store import SnippetStore
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.reload import reload_of, settings_hash
-from coec.runtime.rig.keeper import RigKeeper
+from coec.runtime.rig.keeper import RigEstimatorThread
 from coec.runtime.ros import told as ros
 from coec.runtime.ros.outputs import RosOutputs
-from coec.runtime.waiting_room import WaitingRoom
+from coec.runtime.waiting_room import PendingPairs
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
@@ -93,8 +93,8 @@ STALLED_S = 20.0
 start gets no more time."""
 
 # With these time limits, and because the worker is killed, the service ends in less than 15 s.
-INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, RIG_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 0.5, 1.5
-QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
+INGEST_STOP_S, RECORDER_STOP_S, MANAGER_STOP_S, RIG_STOP_S, DISK_WRITER_STOP_S = 2.0, 4.0, 0.5, 0.5, 1.5
+QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LISTENER_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
 
 
 def exit_code_of(error: CoecError) -> ExitCode:
@@ -108,7 +108,7 @@ def exit_code_of(error: CoecError) -> ExitCode:
 class Daemon:
     """Composes the service from its parts."""
 
-    def __init__(self, config: Config, notifier: Notifier, lock: FolderLock) -> None:
+    def __init__(self, config: Config, notifier: ServiceManagerNotifier, lock: FolderLock) -> None:
         """Builds everything and opens the Zenoh session. No thread runs yet. `lock` is that of the state directory.
 
         Raises:
@@ -116,8 +116,8 @@ class Daemon:
             UnavailableError: a port is taken.
             RecordingError: the state directory cannot be used.
         """
-        self._room = WaitingRoom(config, config.state.directory)
-        config = self._config = self._room.complete(config)
+        self._pending_pairs = PendingPairs(config, config.state.directory)
+        config = self._config = self._pending_pairs.complete(config)
         self._notifier = notifier
         self._started_s, self._started_ns = time.monotonic(), time.time_ns()
         self._given_back_s = self._progress_s = self._started_s
@@ -134,55 +134,59 @@ class Daemon:
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
         self._ros_side = RosSide(session, config)
-        self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
+        self._presence = SingletonGuard(session, config.zenoh, config.limits, self._keys, self._started_ns)
         others = () if mode_of(settings) == "router" else connected_of(settings)
-        self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
-        self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health, self._is_alive))
+        self._router = RouterMonitor([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
+        self._metrics_server = MetricsServer(
+            pages(self._metrics, lambda: self._status_reply, self._health, self._is_alive)
+        )
         node = self._ros_side.node
         publishers = None if node is None else RosPublishers(session, node)
         self._ros_outputs = RosOutputs(publishers, config, self._worker)
         store = StateStore(config.state.directory, config.vehicle)
-        self._scribe = Scribe(config.state.directory)
-        self._scribe.keep(lock, self._folder)
-        self._rig = RigKeeper(config.state.directory, config.links, self._scribe)
+        self._disk_writer = DiskWriter(config.state.directory)
+        self._disk_writer.register(lock, self._folder)
+        self._rig = RigEstimatorThread(config.state.directory, config.links, self._disk_writer)
         self._rig_answers = RigAnswers(self._keys, self._publish)
-        own = (self._worker, self._budget, self._rig, self._publish, self._troubles, self._ros_outputs.show)
-        of_ros = (self._ros_side.topics, self._room.nominal)
+        own = (self._worker, self._budget, self._rig, self._publish, self._problems, self._ros_outputs.show)
+        of_ros = (self._ros_side.topics, self._pending_pairs.nominal)
         self._intake = Intake(config.limits, config.snippets.memory_bytes)
-        told = (*own, *of_ros, self._rig_answers.troubles)
+        shared = (*own, *of_ros, self._rig_answers.problems)
         snippets = _snippets_of(config)
         if snippets is not None:
-            self._scribe.keep(snippets)
-        self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *told, snippets=snippets)
-        self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
-        self._lidars = LidarEdges(config.lidar_edges, self._intake, self._worker, self._budget, self._rig)
+            self._disk_writer.register(snippets)
+        self._context = VehicleContext(
+            self._keys, self._intake, store, self._disk_writer, self._folder, *shared, snippets=snippets
+        )
+        self._pairs = {pair.name: Pair(pair, config, self._context) for pair in config.pairs}
+        self._lidars = LidarPairs(config.lidar_edges, self._intake, self._worker, self._budget, self._rig)
         self._lidars.grow(config.pairs)
-        self._rig.listen(self._rig_answers.hear, self._intake.inbox.wake)
+        self._rig.connect(self._rig_answers.on_update, self._intake.inbox.wake)
         while self._rig.work(0.0):  # so that a reply exists before the first question
             pass
-        awaited = self._room.open(config, self._outside)
-        self._commands: dict[str, Commands | AwaitedCommands] = {
+        pending = self._pending_pairs.open(config, self._context)
+        self._commands: dict[str, Commands | PendingPairCommands] = {
             **{name: pair.commands for name, pair in self._pairs.items()},
-            **{name: answers.commands for name, answers in awaited.items()},
+            **{name: answers.commands for name, answers in pending.items()},
         }
         of_rig = RigCommands(config.vehicle, self._commands, lambda: self._rig_answers.reply)
-        self._reception = Reception(self._rules, self._commands, of_rig)
+        self._command_handler = CommandHandler(self._rules, self._commands, of_rig)
         self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
-        self._last_words = LastWords(self._keys, __version__, config.uplink, self._bus.publish)
+        self._heartbeats = Heartbeats(self._keys, __version__, config.uplink, self._bus.publish)
         self._uplink = Uplink(config.uplink)
-        self._answers = VehicleAnswers(
+        self._answers = VehicleRoutes(
             self._keys,
-            {**{name: pair.answers for name, pair in self._pairs.items()}, **awaited},
-            self._reception,
+            {**{name: pair.answers for name, pair in self._pairs.items()}, **pending},
+            self._command_handler,
             lambda: self._status,
             self._metrics,
             lambda: self._shown,
             self._rig_answers,
-            self._last_words,
+            self._heartbeats,
             self._uplink,
         )
         self._status_reply = self._status_now()
-        self._status = Snapshot.of(self._status_reply)
+        self._status = SerializedReply.of(self._status_reply)
         self._shown = self._shown_now()
 
     def serve(self, signals: Signals, reread: Callable[[], Config] | None) -> int:
@@ -212,20 +216,20 @@ class Daemon:
 
     def _start(self) -> None:
         for thread in (
-            self._scribe.thread,
+            self._disk_writer.thread,
             self._rig.thread,
             self._presence.thread,
             self._intake.thread,
             *self._bus.threads,
         ):
             thread.start()
-        self._ros_outputs.start(self._told)
+        self._ros_outputs.start(self._ros_status)
         _log.info("the worker starts: where it has not run before it compiles its kernels, once, for about a minute")
         self._worker.start()
         self._answers.declare(self._bus)
-        self._door.use(self._config.metrics)
+        self._metrics_server.reconfigure(self._config.metrics)
         self._run(self._pairs.values())
-        self._room.listen(self._bus, self._ros_side)
+        self._pending_pairs.listen(self._bus, self._ros_side)
         for name in (each.name for each in self._config.every_pair):
             self._bus.declare_alive(self._keys.alive(name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
@@ -235,7 +239,7 @@ class Daemon:
                 "fields": {
                     **fields,
                     "pairs": list(self._pairs),
-                    "awaited": list(self._room.answers),
+                    "awaited": list(self._pending_pairs.answers),
                     "left_out": list(self._config.left_out),
                 }
             },
@@ -244,18 +248,18 @@ class Daemon:
     def _run(self, pairs: Iterable[Pair]) -> None:
         """Starts pairs that are built, and subscribes to their streams that no earlier pair has."""
         for pair in pairs:
-            for thread in (pair.decider.thread, pair.recorder.thread):
+            for thread in (pair.manager.thread, pair.recorder.thread):
                 thread.start()
         self._intake.listen(lambda stream, take: self._bus.subscribe(self._ros_side.input_of(stream), take))
 
     def _admit(self) -> None:
         """Builds and starts the awaited pairs whose configuration is complete by now."""
-        found = self._room.found()
-        if not found:
+        discovered = self._pending_pairs.pop_discovered()
+        if not discovered:
             return
-        whole = completed(self._config, found)
-        self._worker.use(whole.model_dump_json())
-        fresh = {name: Pair(config, whole, self._outside) for name, config in found.items()}
+        whole = completed(self._config, discovered)
+        self._worker.reconfigure(whole.model_dump_json())
+        fresh = {name: Pair(config, whole, self._context) for name, config in discovered.items()}
         self._pairs = {**self._pairs, **fresh}  # first, because the configuration names them
         self._config = whole
         self._lidars.grow(whole.pairs)
@@ -263,23 +267,23 @@ class Daemon:
             self._commands[name] = pair.commands
             self._answers.replace(pair.answers)
         self._run(fresh.values())
-        self._reception.use(self._rules)  # for the commands of new pairs, too
+        self._command_handler.reconfigure(self._rules)  # for the commands of new pairs, too
         self._shown = self._shown_now()
-        fields = {"pairs": list(found), "config_hash": config_hash(self._config)}
+        fields = {"pairs": list(discovered), "config_hash": config_hash(self._config)}
         _log.info("pairs that were awaited are served", extra={"fields": fields})
 
     def _tick(self) -> int:
         """Runs once a second: looks at every thread, renews what is served, and returns unused memory to the system.
         Returns an exit status; 0: go on."""
         if time.monotonic() - self._given_back_s >= GIVE_BACK_S:
-            allocator.give_back()
+            allocator.trim_heap()
             self._given_back_s = time.monotonic()
         threads = self._threads()
         dead = [thread for thread in threads if thread.dead]
         if dead:
             self._fault = Reason("thread_died", f"The thread {dead[0].name} died: {dead[0].failure!r}.")
         elif self._presence.rival is not None:
-            self._fault = Reason("two_daemons", told(self._config.vehicle, self._presence.rival))
+            self._fault = Reason("two_daemons", rival_text(self._config.vehicle, self._presence.rival))
         elif self._worker.unusable is not None:
             self._fault = self._worker.unusable
         elif self._state == "starting" and self._worker.status().state is not WorkerState.STARTING:
@@ -293,8 +297,8 @@ class Daemon:
             _log.error(self._fault.text, extra={"fields": {"code": self._fault.code}})
             for pair in self._pairs.values():
                 pair.answers.fail(self._fault)
-            self._room.fail(self._fault)
-        self._router.look()
+            self._pending_pairs.fail(self._fault)
+        self._router.check()
         self._renew()
         if self._fault is not None:
             if dead:
@@ -303,7 +307,7 @@ class Daemon:
             return ExitCode.CONFIGURATION if self._presence.rival is None else ExitCode.UNAVAILABLE
         if all(thread.silence_s < STALLED_S for thread in self._prompt_threads()):
             self._progress_s = time.monotonic()
-            self._notifier.watchdog(None if self._door.server is None else self._config.metrics.address)
+            self._notifier.watchdog(None if self._metrics_server.server is None else self._config.metrics.address)
             if self._state == "starting":
                 self._notifier.starting(STALLED_S)
         return 0
@@ -319,30 +323,30 @@ class Daemon:
             ("announce", self._notifier.stopping),
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
-            ("look for no more pairs", lambda: stopped(self._room.threads, LOOK_OUT_STOP_S)),
+            ("look for no more pairs", lambda: stopped(self._pending_pairs.threads, LISTENER_STOP_S)),
             ("end the intake", self._end_intake),
             ("finish the open windows", self._finish_windows),
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
-            ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
+            ("end the deciders", lambda: self._end(pairs, lambda pair: pair.manager, MANAGER_STOP_S)),
             ("end the rig", self._end_rig),
-            ("write all that is to be remembered", self._end_scribe),
+            ("write all that is to be remembered", self._end_disk_writer),
             ("end the answers", lambda: stopped(self._bus.threads, QUERIES_STOP_S)),
-            ("stop serving HTTP", lambda: self._door.close(HTTP_STOP_S)),
+            ("stop serving HTTP", lambda: self._metrics_server.close(HTTP_STOP_S)),
             ("stop publishing to ROS", lambda: self._ros_outputs.close(ROS_STOP_S)),
             ("withdraw the answers", self._bus.undeclare_queryables),
             ("leave the ROS graph", self._ros_side.close),
         )
         for name, step in steps:
             attempt(name, step)
-        ended = attempt("look for no other daemon", lambda: self._presence.close(LOOK_OUT_STOP_S))
+        guard_closed = attempt("look for no other daemon", lambda: self._presence.close(LISTENER_STOP_S))
         closed = attempt("close the session", lambda: self._bus.close(SESSION_STOP_S))
         attempt("wait for the worker", lambda: joined([self._worker.thread], WORKER_STOP_S))
         _log.info("stopped", extra={"fields": {"session_closed": closed}})
-        return bool(ended and closed)
+        return bool(guard_closed and closed)
 
     @staticmethod
-    def _end(pairs: Iterable[Pair], part: Callable[[Pair], Recorder | Decider], within_s: float) -> None:
+    def _end(pairs: Iterable[Pair], part: Callable[[Pair], Recorder | CalibrationManager], within_s: float) -> None:
         for pair in pairs:
             part(pair).request_stop()
         joined([part(pair).thread for pair in pairs], within_s)
@@ -355,9 +359,9 @@ class Daemon:
         self._rig.request_stop()
         joined([self._rig.thread], RIG_STOP_S)
 
-    def _end_scribe(self) -> None:
-        self._scribe.request_stop()
-        joined([self._scribe.thread], SCRIBE_STOP_S)
+    def _end_disk_writer(self) -> None:
+        self._disk_writer.request_stop()
+        joined([self._disk_writer.thread], DISK_WRITER_STOP_S)
 
     def _finish_windows(self) -> None:
         """Finishes the open windows if the intake has ended. While it runs, only its thread may touch them."""
@@ -372,12 +376,12 @@ class Daemon:
             _log.warning("no configuration file to read again")
             return
         self._notifier.reloading()
-        told = self._configuration
+        previous = self._configuration
         try:
-            fresh = reload_of(self._config, self._room.complete(reread()))
+            fresh = reload_of(self._config, self._pending_pairs.complete(reread()))
             rules = self._rules_of(fresh.config.authority, self._rules.listener)
         except Exception as error:  # whatever is wrong with the file, the running service goes on
-            self._configuration = told.model_copy(update={"read_ns": time.time_ns(), "refused": str(error)})
+            self._configuration = previous.model_copy(update={"read_ns": time.time_ns(), "refused": str(error)})
             expected = isinstance(error, CoecError)
             _log.error(f"the configuration on the disk is refused, the old one stays: {error}", exc_info=not expected)
         else:
@@ -385,9 +389,9 @@ class Daemon:
             if rules.digest != self._rules.digest and CERTIFICATE not in taken:
                 taken = (*taken, CERTIFICATE)
             self._configuration = replies.ConfigurationStatus(
-                read_ns=time.time_ns(), reloads=told.reloads + bool(taken), taken=taken, waiting=fresh.waiting
+                read_ns=time.time_ns(), reloads=previous.reloads + bool(taken), taken=taken, waiting=fresh.waiting
             )
-            self._take(fresh.config, rules)
+            self._reconfigure(fresh.config, rules)
             changed = "it is taken" if taken else "it changes nothing that runs"
             waits = "; what differs besides waits for a restart" if fresh.waiting else ""
             places = {"taken": list(taken), "waiting": list(fresh.waiting)}
@@ -397,37 +401,37 @@ class Daemon:
         if self._state == "running":
             self._notifier.ready()
 
-    def _rules_of(self, config: AuthorityConfig, before: Listener | None) -> Rules:
+    def _rules_of(self, config: AuthorityConfig, before: CommandListener | None) -> CommandRules:
         """Who may give commands, according to the files as they are now. Conversations of the listener `before` go on.
 
         Raises:
             ConfigError: a file cannot be used.
         """
-        credentials, authority = credentials_of(config), Authority(config, self._reach.outside)
+        credentials, authority = credentials_of(config), Authority(config, self._reach.exposure)
         if credentials is None:
-            return Rules(authority, None)
-        return Rules(authority, Listener(credentials) if before is None else before.renewed(credentials))
+            return CommandRules(authority, None)
+        return CommandRules(authority, CommandListener(credentials) if before is None else before.renewed(credentials))
 
-    def _take(self, config: Config, rules: Rules) -> None:
+    def _reconfigure(self, config: Config, rules: CommandRules) -> None:
         """Goes on with another configuration and its rules. It differs only in what can change without a restart."""
         before, self._config = self._config, config
         self._rules = rules
-        self._reception.use(rules)  # even if nothing differs, because certificates are renewed in place
-        self._door.use(config.metrics)  # even if nothing differs, because its port may be free by now
+        self._command_handler.reconfigure(rules)  # even if nothing differs, because certificates are renewed in place
+        self._metrics_server.reconfigure(config.metrics)  # even if nothing differs, because its port may be free by now
         if config == before:
             return
         logs.configure(config.log.level, config.log.format)
-        self._folder.use(config.state)
-        self._budget.use(config.budget)
-        self._uplink.use(config.uplink)
-        self._last_words.use(config.uplink)
+        self._folder.reconfigure(config.state)
+        self._budget.reconfigure(config.budget)
+        self._uplink.reconfigure(config.uplink)
+        self._heartbeats.reconfigure(config.uplink)
         self._shown = self._shown_now()
         for old, new in zip(before.pairs, config.pairs, strict=True):
             if old == new and before.stale_after_s == config.stale_after_s:
                 continue
             hashes = f"settings {settings_hash(old)}, now {settings_hash(new)}; service {config_hash(config)}"
-            told = f"The configuration was read again: {hashes}."
-            self._pairs[new.name].use(new, config.stale_after_s, told)
+            history_text = f"The configuration was read again: {hashes}."
+            self._pairs[new.name].reconfigure(new, config.stale_after_s, history_text)
 
     # --- what the parts ask of the whole ----------------------------------------------------------------------------
 
@@ -435,7 +439,7 @@ class Daemon:
         self._bus.publish(key, answer)
         self._ros_outputs.wake()
 
-    def _troubles(self) -> tuple[Reason, ...]:
+    def _problems(self) -> tuple[Reason, ...]:
         """Troubles that concern every pair alike."""
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
@@ -443,7 +447,14 @@ class Daemon:
         hidden = TOKENS_HIDDEN if self._presence.hidden else None
         tokens = self._presence.unproven
         unproven = Reason("rival_unproven", unproven_text(tokens)) if tokens else None
-        own = (self._scribe.trouble, self._insecure, hidden, unproven, self._router.trouble, self._door.insecure)
+        own = (
+            self._disk_writer.problem,
+            self._insecure,
+            hidden,
+            unproven,
+            self._router.problem,
+            self._metrics_server.insecure,
+        )
         return tuple(reason for reason in (self._fault, failing, compiling, *own) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
@@ -451,31 +462,31 @@ class Daemon:
     def _threads(self) -> list[ServiceThread]:
         """All of them."""
         recorders = [pair.recorder.thread for pair in self._pairs.values()]
-        door = [] if self._door.server is None else [self._door.server.thread]
+        door = [] if self._metrics_server.server is None else [self._metrics_server.server.thread]
         waiting = [thread for thread in self._bus.threads if thread not in self._bus.prompt_threads]
-        return [*self._prompt_threads(), self._scribe.thread, *waiting, *door, *recorders]
+        return [*self._prompt_threads(), self._disk_writer.thread, *waiting, *door, *recorders]
 
     def _prompt_threads(self) -> list[ServiceThread]:
         """The threads that never wait for a disk. Only these must beat: a thread that waits for a slow disk may stand
         still as long as the disk takes. `health` reports that, and a restart would not make the disk quicker."""
-        own = [self._intake.thread, self._rig.thread, *(pair.decider.thread for pair in self._pairs.values())]
-        of_ros = (*self._room.threads, *self._ros_outputs.threads)
+        own = [self._intake.thread, self._rig.thread, *(pair.manager.thread for pair in self._pairs.values())]
+        of_ros = (*self._pending_pairs.threads, *self._ros_outputs.threads)
         return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *of_ros, *own]
 
     def _renew(self) -> None:
-        self._room.renew()
+        self._pending_pairs.renew()
         self._status_reply = self._status_now()
-        self._status = Snapshot.of(self._status_reply)
-        self._last_words.renew(self._state, self._status_reply.config_hash, self._answering())
+        self._status = SerializedReply.of(self._status_reply)
+        self._heartbeats.renew(self._state, self._status_reply.config_hash, self._answering())
 
     def _status_now(self) -> replies.StatusReply:
         usage = self._folder.usage()
-        own = tuple(reason for reason in (self._door.trouble, self._lidars.trouble) if reason is not None)
+        own = tuple(reason for reason in (self._metrics_server.problem, self._lidars.problem) if reason is not None)
         return replies.StatusReply(
             version=__version__,
             vehicle=self._config.vehicle,
             state=self._state,
-            reasons=reasons_of((*self._troubles(), *own)),
+            reasons=reasons_of((*self._problems(), *own)),
             started_ns=self._started_ns,
             uptime_s=time.monotonic() - self._started_s,
             config_hash=config_hash(self._config),
@@ -491,26 +502,26 @@ class Daemon:
             queries_waiting=self._bus.waiting,
         )
 
-    def _shown_now(self) -> Snapshot:
+    def _shown_now(self) -> SerializedReply:
         """The configuration as it is served."""
-        return Snapshot.of_document(
+        return SerializedReply.of_document(
             {
                 "schema_version": 1,
                 "config_hash": config_hash(self._config),
-                "config": shown(self._config),
-                "found": self._room.origins(),
+                "config": redacted_configuration(self._config),
+                "found": self._pending_pairs.origins(),
             }
         )
 
-    def _told(self) -> ros.View:
+    def _ros_status(self) -> ros.VehicleOutput:
         """The present state, from which the messages to ROS are made."""
         serials = {pair.name: pair.camera.hardware_id for pair in self._config.every_pair}
-        return ros.View(
+        return ros.VehicleOutput(
             self._state,
             tuple(
-                ros.PairTold(answers.health_reply, serials[answers.name], answers.extrinsic_reply, answers.rig)
+                ros.PairOutput(answers.health_reply, serials[answers.name], answers.extrinsic_reply, answers.rig)
                 if isinstance(answers, PairAnswers)
-                else ros.PairTold(answers.health_reply, serials[answers.name], None, None)
+                else ros.PairOutput(answers.health_reply, serials[answers.name], None, None)
                 for answers in self._answering()
             ),
             self._rig_answers.reply if len(self._pairs) > 1 else None,
@@ -519,9 +530,9 @@ class Daemon:
     def _health(self) -> dict[str, replies.HealthReply]:
         return {answers.name: answers.health_reply for answers in self._answering()}
 
-    def _answering(self) -> list[PairAnswers | AwaitedAnswers]:
+    def _answering(self) -> list[PairAnswers | PendingPairAnswers]:
         """The answers of every pair: running pairs first, then the awaited ones."""
-        return [*(pair.answers for pair in self._pairs.values()), *self._room.answers.values()]
+        return [*(pair.answers for pair in self._pairs.values()), *self._pending_pairs.answers.values()]
 
     def _is_alive(self) -> bool:
         """Whether the main loop runs and no thread is stuck, by the measure of the watchdog."""
@@ -530,15 +541,17 @@ class Daemon:
     def _metrics(self, text_format: TextFormat = TextFormat.OPEN_METRICS) -> bytes:
         pairs = self._pairs.items()
         took = {
-            metrics.QUERY: [Took((), self._answers.took)],
-            metrics.DECODE: [Took((sensor.config.sensor,), sensor.took) for sensor in self._intake.sensors],
-            metrics.PAIR_WAIT: [Took((name,), pair.stream.waiting_took) for name, pair in pairs],
-            metrics.WRITE: [Took((name,), pair.recorder.writing_took) for name, pair in pairs],
-            metrics.JOB: [Took((), self._worker.jobs_took)],
-            metrics.WORK: [Took((), self._worker.work_took)],
+            metrics.QUERY: [LabelledHistogram((), self._answers.took)],
+            metrics.DECODE: [
+                LabelledHistogram((sensor.config.sensor,), sensor.took) for sensor in self._intake.sensors
+            ],
+            metrics.PAIR_WAIT: [LabelledHistogram((name,), pair.stream.waiting_took) for name, pair in pairs],
+            metrics.WRITE: [LabelledHistogram((name,), pair.recorder.writing_took) for name, pair in pairs],
+            metrics.JOB: [LabelledHistogram((), self._worker.jobs_took)],
+            metrics.WORK: [LabelledHistogram((), self._worker.work_took)],
         }
         memory = (resident_bytes(), self._worker.status().rss_bytes)
-        view = View(self._status_reply, self._health(), *memory, took, self._rig_answers.reply, self._uplink)
+        view = MetricsInput(self._status_reply, self._health(), *memory, took, self._rig_answers.reply, self._uplink)
         return metrics.render(view, text_format)
 
 

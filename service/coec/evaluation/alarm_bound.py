@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from coec.calibration.monitor.change_detector import doubtful_after
 from coec.schemas.checks import Judged
 
-SETTLED_CHECKS = 24
+SETTLED_BEFORE_PLACE = 24
 """Checks of a right mount before a place: two minutes at one every five seconds."""
 
 DISPLACEMENTS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0)
@@ -35,17 +35,17 @@ MIN_CHECKS = 3
 MIN_PLACES = 20
 """With fewer places no tail is fitted, because only half of them lie beyond the threshold."""
 
-SHAPES = np.linspace(-0.5, 0.5, 41)
+TAIL_SHAPES = np.linspace(-0.5, 0.5, 41)
 """Shapes of the tails considered, all equally likely beforehand: from a tail that ends soon after what was seen to one
 without a variance."""
 
-SCALES = np.geomspace(0.05, 20.0, 121)
+TAIL_SCALES = np.geomspace(0.05, 20.0, 121)
 """Scales of the tails considered, over the mean excess; every factor is equally likely beforehand."""
 
-CONFIDENCE = 0.95
+BOUND_CONFIDENCE = 0.95
 """Confidence of the bound."""
 
-SEED = 20_230_617
+PLACE_SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
 Alarms = Callable[[Sequence[Judged]], bool]
@@ -53,7 +53,7 @@ Alarms = Callable[[Sequence[Judged]], bool]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Places:
+class PlaceChecks:
     """What clear checks of a right mount say about the places where they were made.
 
     Attributes:
@@ -66,11 +66,11 @@ class Places:
     displacement: NDArray[np.float64]
 
     @classmethod
-    def of(cls, drives: Sequence[Sequence[Judged]]) -> Places:
+    def from_drives(cls, drives: Sequence[Sequence[Judged]]) -> PlaceChecks:
         """Every drive is one place; drives with fewer than `MIN_CHECKS` clear checks are left out."""
-        kept = tuple(checks for checks in map(_clear, drives) if len(checks) >= MIN_CHECKS)
-        far = [float(np.max(np.abs(_centre(checks)) / _place(checks))) for checks in kept]
-        return cls(kept, np.array(far))
+        eligible = tuple(checks for checks in map(_clear, drives) if len(checks) >= MIN_CHECKS)
+        far = [float(np.max(np.abs(_centre(checks)) / _place_sigma(checks))) for checks in eligible]
+        return cls(eligible, np.array(far))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def _clear(drive: Sequence[Judged]) -> tuple[Judged, ...]:
     return tuple(clear)
 
 
-def bound(places: Places, stay_checks: int, places_per_h: float, alarms: Alarms) -> Bound | None:
+def bound(places: PlaceChecks, stay_checks: int, places_per_h: float, alarms: Alarms) -> Bound | None:
     """The bound for a vehicle that stays `stay_checks` checks at each place and meets `places_per_h` places an hour;
     None with fewer than `MIN_PLACES` places."""
     if len(places.checks) < MIN_PLACES:
@@ -105,7 +105,7 @@ def bound(places: Places, stay_checks: int, places_per_h: float, alarms: Alarms)
     weight, beyond = tail(places.displacement, np.array(DISPLACEMENTS))
     rates = 100.0 * places_per_h * np.sum(np.diff(share, prepend=0.0) * beyond, axis=1)
     order = np.argsort(rates, kind="stable")
-    place = int(np.searchsorted(np.cumsum(weight[order]), CONFIDENCE))
+    place = int(np.searchsorted(np.cumsum(weight[order]), BOUND_CONFIDENCE))
     half = next((far for far, part in zip(DISPLACEMENTS, share, strict=True) if part >= 0.5), None)
     return Bound(float(np.sum(weight * rates)), float(rates[order][min(place, len(rates) - 1)]), half)
 
@@ -117,8 +117,8 @@ def tail(seen: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np
     excess = seen[seen > threshold] - threshold
     mean = float(excess.mean())
     likelihood, shares = [], []
-    for shape in SHAPES.tolist():
-        for scale in (SCALES * mean).tolist():
+    for shape in TAIL_SHAPES.tolist():
+        for scale in (TAIL_SCALES * mean).tolist():
             likelihood.append(float(np.sum(_log_density(excess, shape, scale))))
             shares.append(len(excess) / len(seen) * _survival(np.maximum(at - threshold, 0.0), shape, scale))
     weight = np.exp(np.array(likelihood) - max(likelihood))
@@ -140,13 +140,13 @@ def _survival(excess: NDArray[np.float64], shape: float, scale: float) -> NDArra
     return np.asarray(np.maximum(1.0 + shape * excess / scale, 0.0) ** (-1.0 / shape))
 
 
-def _accused(places: Places, displacement: float, stay_checks: int, alarms: Alarms) -> float:
+def _accused(places: PlaceChecks, displacement: float, stay_checks: int, alarms: Alarms) -> float:
     """The share of drawn places of one displacement at which the mount is accused."""
-    rng = np.random.default_rng([SEED, round(100.0 * displacement), stay_checks])
+    rng = np.random.default_rng([PLACE_SEED, round(100.0 * displacement), stay_checks])
     return float(np.mean([alarms(_stay(places, displacement, stay_checks, rng)) for _ in range(DRAWS)]))
 
 
-def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.Generator) -> list[Judged]:
+def _stay(places: PlaceChecks, displacement: float, stay_checks: int, rng: np.random.Generator) -> list[Judged]:
     """Checks of a right mount, followed by checks of a place that is off about or along one axis."""
     checks = places.checks[int(rng.integers(len(places.checks)))]
     offsets = _offsets(checks)
@@ -154,15 +154,15 @@ def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.
     about = (offsets - _centre(checks)) * np.sqrt(len(checks) / (len(checks) - 1.0))
     off = np.zeros(6)
     axis = int(rng.integers(6))
-    off[axis] = displacement * _place(checks)[axis] * float(rng.choice([-1.0, 1.0]))
-    drawn = rng.integers(len(checks), size=SETTLED_CHECKS + stay_checks)
+    off[axis] = displacement * _place_sigma(checks)[axis] * float(rng.choice([-1.0, 1.0]))
+    sampled = rng.integers(len(checks), size=SETTLED_BEFORE_PLACE + stay_checks)
     return [
-        checks[one].model_copy(update={"offset": tuple((about[one] + off * (number >= SETTLED_CHECKS)).tolist())})
-        for number, one in enumerate(drawn.tolist())
+        checks[one].model_copy(update={"offset": tuple((about[one] + off * (number >= SETTLED_BEFORE_PLACE)).tolist())})
+        for number, one in enumerate(sampled.tolist())
     ]
 
 
-def _place(checks: Sequence[Judged]) -> NDArray[np.float64]:
+def _place_sigma(checks: Sequence[Judged]) -> NDArray[np.float64]:
     """(6,) the standard deviation of a place, given the dispersions of its checks."""
     return np.asarray(np.mean([np.array(check.place) * check.dispersion for check in checks], axis=0))
 

@@ -63,11 +63,11 @@ noticed: a minute at one every five seconds."""
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
-Heard = Callable[[int, int], None]
+OnProgress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class FalseAlarms:
+class FalseAlarmCount:
     """How often the evidence of a right mount reached the alarm level that belongs to a stated time between false
     alarms (h), in so many hours of driving."""
 
@@ -103,38 +103,38 @@ class FromStart:
     the estimator off instead; the detector weighs that by the bias of estimators on other rigs."""
 
     off_deg: float
-    wanted_s: tuple[float, ...]
+    requested_s: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Alarms:
+class AlarmExperiments:
     """All experiments at one configuration."""
 
     config: MonitorConfig
-    false: tuple[FalseAlarms, ...]
+    false: tuple[FalseAlarmCount, ...]
     delays: tuple[Delay, ...]
     creep: Creep
     from_start: tuple[FromStart, ...]
 
 
-def measured(config: MonitorConfig, hours: float, steps: int, heard: Heard) -> Alarms:
+def measured(config: MonitorConfig, hours: float, steps: int, on_progress: OnProgress) -> AlarmExperiments:
     """Runs all experiments: `hours` of a right mount, and `steps` steps of every size (seeded)."""
     total = 2 + len(STEPS_DEG) + len(WRONG_DEG)
     false = false_alarms(config, hours)
-    heard(1, total)
+    on_progress(1, total)
     delays = []
     for place, step_deg in enumerate(STEPS_DEG):
         delays.append(delay(config, step_deg, steps))
-        heard(2 + place, total)
+        on_progress(2 + place, total)
     crept = creep(config)
     started = []
     for place, off_deg in enumerate(WRONG_DEG):
         started.append(from_start(config, off_deg, steps))
-        heard(3 + len(STEPS_DEG) + place, total)
-    return Alarms(config, false, tuple(delays), crept, tuple(started))
+        on_progress(3 + len(STEPS_DEG) + place, total)
+    return AlarmExperiments(config, false, tuple(delays), crept, tuple(started))
 
 
-def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarms, ...]:
+def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarmCount, ...]:
     """Counts how often the evidence of a right mount rises to the level of each stated time. A rise counts once; the
     next can count only after the suspicion is over."""
     levels = alarm_levels(config)
@@ -147,7 +147,7 @@ def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarms, ...]
                 above[place], alarms[place] = True, alarms[place] + 1
             elif state.evidence < levels.clear:
                 above[place] = False
-    return tuple(FalseAlarms(stated, hours, count) for stated, count in zip(STATED_H, alarms, strict=True))
+    return tuple(FalseAlarmCount(stated, hours, count) for stated, count in zip(STATED_H, alarms, strict=True))
 
 
 def delay(config: MonitorConfig, step_deg: float, steps: int) -> Delay:
@@ -180,14 +180,14 @@ def creep(config: MonitorConfig) -> Creep:
 
 def from_start(config: MonitorConfig, off_deg: float, rigs: int) -> FromStart:
     """Rigs that are wrong about drawn axes from the first check on."""
-    wanted, levels = [], alarm_levels(config)
+    requested_s, levels = [], alarm_levels(config)
     for number in range(rigs):
         rng = np.random.default_rng([SEED, round(off_deg * 1000), number, WRONG_CHECKS])
         truth = np.zeros((WRONG_CHECKS, 6))
         truth[:, :3] = radians(off_deg) * random_direction(rng)
         states = enumerate(_states(_stream(rng, truth, config), levels), start=1)
-        wanted.append(next((check * config.period_s for check, state in states if state.outcome in ACCUSING), inf))
-    return FromStart(off_deg, tuple(wanted))
+        requested_s.append(next((check * config.period_s for check, state in states if state.outcome in ACCUSING), inf))
+    return FromStart(off_deg, tuple(requested_s))
 
 
 def _first(config: MonitorConfig, stream: Iterator[Observation], after: int) -> tuple[float, float]:
@@ -256,7 +256,7 @@ def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: Monito
 def _bad(rng: np.random.Generator, checks: int) -> list[bool]:
     """(n,) which checks lie in poor stretches."""
     bad, within = [], False
-    for draw in rng.random(checks):
-        within = draw >= 1.0 / BURST_CHECKS if within else draw < 1.0 / BURST_EVERY
+    for sample in rng.random(checks):
+        within = sample >= 1.0 / BURST_CHECKS if within else sample < 1.0 / BURST_EVERY
         bad.append(bool(within))
     return bad

@@ -61,8 +61,8 @@ class CheckDrive:
         """The SOURCE that draws so many checks of it."""
         # A moment longer, so that the last pair is begun.
         seconds = checks * PERIOD_S + 0.5 / HERTZ
-        words = [f"seed={self.seed}", f"seconds={seconds:g}", f"camera_hz={HERTZ:g}", f"lidar_hz={HERTZ:g}"]
-        return "sim:" + "&".join([*words, "ego_hz=20", RIGS[self.rig], *filter(None, [PLACES[self.place]])])
+        parameters = [f"seed={self.seed}", f"seconds={seconds:g}", f"camera_hz={HERTZ:g}", f"lidar_hz={HERTZ:g}"]
+        return "sim:" + "&".join([*parameters, "ego_hz=20", RIGS[self.rig], *filter(None, [PLACES[self.place]])])
 
 
 def drives(rounds: int, first: int = 1) -> Iterator[tuple[CheckDrive, ...]]:

@@ -15,7 +15,7 @@ from coec.adapters.depth.maps import CachedDepth, open_depth
 from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.commissioning.baseline import Baseline, learned_hash
 from coec.calibration.commissioning.learning import FAR_RAD, learn_accuracy, learn_limits
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
 from coec.calibration.monitor.check_verdict import (
@@ -52,7 +52,7 @@ along an axis of the camera that checks can observe (m). Each drive is checked a
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Stage:
+class _PreparedDrive:
     """A drawn drive: its pairs, the truth (4, 4), and readers that decode each pair only once."""
 
     rig: Rig
@@ -73,7 +73,7 @@ def commissioned(rig: str) -> Baseline:
     Raises:
         CalibrationError: these drives show nothing.
     """
-    stages = [_draw([CheckDrive(rig, *where).source(COMMISSIONED_CHECKS)])[0] for where in COMMISSIONED_ON]
+    stages = [_simulate([CheckDrive(rig, *where).source(COMMISSIONED_CHECKS)])[0] for where in COMMISSIONED_ON]
     pairs = [
         # All drives begin at the same time: later ones are shifted, as if they had come one after the other.
         _later(pair, number * 3_600_000_000_000)
@@ -83,7 +83,7 @@ def commissioned(rig: str) -> Baseline:
     whole = stages[0].window(pairs)
     configuration = _configuration()
     depth = open_depth(configuration.depth, LimitsConfig())
-    evidence = gather(sight_of(whole, depth, GreyImages(LimitsConfig()), configuration, Silence()), FAR_RAD)
+    evidence = gather(prepare_window_data(whole, depth, GreyImages(LimitsConfig()), configuration, Silence()), FAR_RAD)
     rotation, pose = learn_accuracy(evidence, stages[0].truth)
     limits = learn_limits(evidence, stages[0].truth, configuration, (rotation, pose), FALSE_ALARM_RATE)
     return Baseline(
@@ -103,7 +103,7 @@ def run(drives: Sequence[CheckDrive], baselines: Mapping[str, Baseline]) -> list
         for source in [drive.source(CHECKS)]
     ]
     try:
-        stages = _draw([row.source for row in rows])
+        stages = _simulate([row.source for row in rows])
     except CoecError as error:
         return [_failed(row, error) for row in rows]
     checked = []
@@ -119,17 +119,19 @@ def _failed(row: CheckedDrive, error: CoecError) -> CheckedDrive:
     return row.model_copy(update={"failure": f"{type(error).__name__}: {error}"})
 
 
-def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tuple[CheckedPose, ...]:
+def _checked(stage: _PreparedDrive, drive: CheckDrive, baseline: Baseline | None) -> tuple[CheckedPose, ...]:
     configuration = _configuration()
     expected = expected_of(baseline)
     starts = range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS)
     windows = [stage.window(stage.pairs[first : first + CHECK_PAIRS]) for first in starts]
-    sights = [sight_of(window, stage.depth, stage.images, configuration, Silence()) for window in windows]
-    gathered = [gather(sight, radians(max(turn_deg for _, turn_deg, _ in MOVES))) for sight in sights]
+    windows_data = [
+        prepare_window_data(window, stage.depth, stage.images, configuration, Silence()) for window in windows
+    ]
+    gathered = [gather(window_data, radians(max(turn_deg for _, turn_deg, _ in MOVES))) for window_data in windows_data]
     rows = []
-    drawn = zlib.crc32(drive.name.encode())
-    rng = np.random.default_rng(drawn)
-    for name, turn_deg, shift_m in ((RIGHT, 0.0, 0.0), MOVES[drawn % len(MOVES)]):
+    drive_hash = zlib.crc32(drive.name.encode())
+    rng = np.random.default_rng(drive_hash)
+    for name, turn_deg, shift_m in ((RIGHT, 0.0, 0.0), MOVES[drive_hash % len(MOVES)]):
         xi = _move(rng, turn_deg, shift_m, baseline)
         if xi is None:
             continue
@@ -157,7 +159,7 @@ def _move(
     return xi
 
 
-def _draw(sources: Sequence[str]) -> list[_Stage]:
+def _simulate(sources: Sequence[str]) -> list[_PreparedDrive]:
     """Draws drives that differ only in their lens."""
     first: SimulatedDrive = open_sim(parse_spec(sources[0]).query)
     configs = [drive_config_of(parse_spec(source).query) for source in sources[1:]]
@@ -175,10 +177,10 @@ def _draw(sources: Sequence[str]) -> list[_Stage]:
     ]
 
 
-def _stage(drive: SimulatedDrive, pairs: Sequence[FramePair]) -> _Stage:
+def _stage(drive: SimulatedDrive, pairs: Sequence[FramePair]) -> _PreparedDrive:
     depth = CachedDepth(open_depth(_configuration().depth, LimitsConfig()), len(pairs))
     images = CachedGreys(GreyImages(LimitsConfig()), len(pairs))
-    return _Stage(drive.rig, drive.truth(pairs[0].stamp_ns), tuple(pairs), depth, images)
+    return _PreparedDrive(drive.rig, drive.truth(pairs[0].stamp_ns), tuple(pairs), depth, images)
 
 
 def _later(pair: FramePair, by_ns: int) -> FramePair:

@@ -19,7 +19,7 @@ from coec.calibration.commissioning.quantiles import poisson_most
 from coec.calibration.monitor.change_detector import (
     S_PER_H,
     AlarmLevels,
-    Finding,
+    MonitorOutcome,
     MonitorState,
     Observation,
     after_observation,
@@ -27,7 +27,7 @@ from coec.calibration.monitor.change_detector import (
 )
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.config import MonitorConfig
-from coec.evaluation.alarm_bound import Places, bound
+from coec.evaluation.alarm_bound import PlaceChecks, bound
 from coec.evaluation.check_drives import CHECK_PAIRS, CHECKS, PERIOD_S
 from coec.evaluation.check_run import MOVES, RIGHT
 from coec.evaluation.detection import CONFIDENCE, interval
@@ -73,7 +73,7 @@ def _of_rigs(rows: Sequence[CheckedDrive], commissioned: bool, resampled_h: floa
     if known and resampled_h > 0.0:
         most = round(resampled_h * S_PER_H / PERIOD_S)
         hours.append(_hours("resampled", _at_most(_resampled(known, right), most)))
-    settled = Places.of([right[row.name] for row in known])
+    settled = PlaceChecks.from_drives([right[row.name] for row in known])
     tails = [one for stay in (CHECKS, PLACE_CHECKS) if (one := _tail(settled, stay)) is not None]
     moved = [_moved(name, known, right, commissioned) for name in (RIGHT, *(name for name, _, _ in MOVES))]
     places = tuple(
@@ -133,8 +133,10 @@ def _hours(how: str, vehicles: Iterable[list[Where]]) -> HoursStatistics:
         for (where, _), state in zip(driven, states([check for _, check in driven], levels), strict=True):
             checks += 1
             worse = state.outcome is not before.outcome
-            suspicions += worse and state.outcome is Finding.SUSPECT and before.outcome is not Finding.CONFIRMED
-            if worse and state.outcome is Finding.CONFIRMED:
+            suspicions += (
+                worse and state.outcome is MonitorOutcome.SUSPECT and before.outcome is not MonitorOutcome.CONFIRMED
+            )
+            if worse and state.outcome is MonitorOutcome.CONFIRMED:
                 alarmed.append(where)
             before = state
     driven_h = checks * PERIOD_S / S_PER_H
@@ -149,7 +151,7 @@ def _hours(how: str, vehicles: Iterable[list[Where]]) -> HoursStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class _CheckTally:
     """How many of some checks cannot tell, and why, and the checks that can."""
 
     blind: int
@@ -158,34 +160,34 @@ class _Told:
     decided: tuple[Judged, ...]
 
 
-def _told(checks: Sequence[Judged]) -> _Told:
+def _tally(checks: Sequence[Judged]) -> _CheckTally:
     seeing = [check for check in checks if not check.causes]
     clear = [check for check in seeing if not check.faint]
     decided = tuple(check for check in clear if not check.undecided)
-    return _Told(len(checks) - len(seeing), len(seeing) - len(clear), len(clear) - len(decided), decided)
+    return _CheckTally(len(checks) - len(seeing), len(seeing) - len(clear), len(clear) - len(decided), decided)
 
 
 def _place(place: str, checks: Sequence[Judged]) -> PlaceStatistics:
-    told = _told(checks)
+    tally = _tally(checks)
     return PlaceStatistics(
-        place=place, checks=len(checks), blind=told.blind, weak=told.weak, undecided=told.undecided,
-        flagged=sum(check.flagged for check in told.decided),
+        place=place, checks=len(checks), blind=tally.blind, weak=tally.weak, undecided=tally.undecided,
+        flagged=sum(check.flagged for check in tally.decided),
     )  # fmt: skip
 
 
-def _tail(places: Places, stay_checks: int) -> TailStatistics | None:
+def _tail(places: PlaceChecks, stay_checks: int) -> TailStatistics | None:
     """The bound for a vehicle that comes to another place after every `stay_checks` checks."""
     levels = alarm_levels(CONFIG)
 
     def alarms(checks: Sequence[Judged]) -> bool:
-        return any(state.outcome is Finding.CONFIRMED for state in states(checks, levels))
+        return any(state.outcome is MonitorOutcome.CONFIRMED for state in states(checks, levels))
 
-    found = bound(places, stay_checks, S_PER_H / PERIOD_S / stay_checks, alarms)
-    if found is None:
+    estimate = bound(places, stay_checks, S_PER_H / PERIOD_S / stay_checks, alarms)
+    if estimate is None:
         return None
     return TailStatistics(
         stay_checks=stay_checks, places=len(places.checks), farthest=float(places.displacement.max()),
-        accused_at=found.half, alarms_per_100_h=found.mean, alarms_per_100_h_at_most=found.at_most,
+        accused_at=estimate.half, alarms_per_100_h=estimate.mean, alarms_per_100_h_at_most=estimate.at_most,
     )  # fmt: skip
 
 
@@ -208,12 +210,12 @@ def _moved(
         suspected += any(state.evidence >= levels.suspect for state in after)
         confirmed = next((number for number, state in enumerate(after, 1) if state.evidence >= levels.confirmed), None)
         delays += [] if confirmed is None else [confirmed]
-    told = _told(everything)
-    clear = told.decided
+    tally = _tally(everything)
+    clear = tally.decided
     flagged = sum(check.flagged for check in clear)
     low, high = interval(flagged, len(clear)) if clear else (None, None)
     return MovedStatistics(
-        moved=name, drives=drives, checks=len(everything), blind=told.blind, weak=told.weak, undecided=told.undecided,
+        moved=name, drives=drives, checks=len(everything), blind=tally.blind, weak=tally.weak, undecided=tally.undecided,
         clear=len(clear), flagged=flagged,
         flagged_low=low, flagged_high=high, suspected=suspected, confirmed=len(delays), delay_checks=tuple(delays),
     )  # fmt: skip

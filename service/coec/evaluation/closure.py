@@ -24,7 +24,7 @@ from coec.evaluation.normalised_errors import (
     gathered,
     normalise,
 )
-from coec.evaluation.statistics import Outcome, Spread
+from coec.evaluation.statistics import SolveOutcome, SpreadStatistics
 from coec.geometry import se3
 
 
@@ -35,7 +35,7 @@ class Relation(StrEnum):
     LIDARS = "two LiDARs, one camera"
 
 
-class Frames(StrEnum):
+class FrameChoice(StrEnum):
     """On which frames both are calibrated."""
 
     ALL = "all frames"
@@ -61,7 +61,7 @@ class Between:
         """(6, 6) how an error of A's calibration carries over to the prediction for B, about the axes of camera B."""
         return se3.adjoint(self.T_b_a) if self.relation is Relation.CAMERAS else np.eye(6)
 
-    def error(self, a: Outcome, b: Outcome) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def error(self, a: SolveOutcome, b: SolveOutcome) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """ξ (6,) from what A predicts to what B found, and its covariance (6, 6) by both claims; None unless both were
         accepted and claim something."""
         of_a, of_b = claimed(a), claimed(b)
@@ -82,14 +82,14 @@ class Closure:
         rotation_rad, translation_m: sizes of the errors; NaN for a translation that was not searched.
     """
 
-    frames: Frames
+    frames: FrameChoice
     pairs: tuple[int, int]
     normalised: NormalisedErrors
-    rotation_rad: Spread
-    translation_m: Spread
+    rotation_rad: SpreadStatistics
+    translation_m: SpreadStatistics
 
 
-Solve = Callable[[int, Sequence[int] | None], Outcome]
+Solve = Callable[[int, Sequence[int] | None], SolveOutcome]
 """Solves from the start of a trial, on the frames of the given indices (None: all of them)."""
 
 
@@ -120,33 +120,39 @@ def close(
     pairs: tuple[int, int],
     trials: int,
     dof: int,
-    heard: Callable[[int, str], None],
+    on_progress: Callable[[int, str], None],
 ) -> tuple[Closure, ...]:
     """Calibrates A and B by themselves, `trials` times from different starts: on all their frames (`pairs` of each), on
     the same half, and on halves that have no instant in common.
 
     Halves are drawn by index: two sources share instants if they have equal numbers of frames taken together.
     """
-    found: dict[Frames, list[tuple[Outcome, Outcome]]] = {frames: [] for frames in Frames}
+    outcomes_by_frames: dict[FrameChoice, list[tuple[SolveOutcome, SolveOutcome]]] = {
+        frames: [] for frames in FrameChoice
+    }
     halved = min(pairs) >= 2
     for trial in range(trials):
-        found[Frames.ALL].append((solve_a(trial, None), solve_b(trial, None)))
+        outcomes_by_frames[FrameChoice.ALL].append((solve_a(trial, None), solve_b(trial, None)))
         if halved:
             one, other = split_halves.split(min(pairs), trial)
             a = solve_a(trial, one)
-            found[Frames.SHARED].append((a, solve_b(trial, one)))
-            found[Frames.DISJOINT].append((a, solve_b(trial, other)))
-        heard(trial + 1, "")
+            outcomes_by_frames[FrameChoice.SHARED].append((a, solve_b(trial, one)))
+            outcomes_by_frames[FrameChoice.DISJOINT].append((a, solve_b(trial, other)))
+        on_progress(trial + 1, "")
     half = (min(pairs) // 2, min(pairs) // 2)
     return tuple(
-        _closure(known, frames, pairs if frames is Frames.ALL else half, outcomes, dof)
-        for frames, outcomes in found.items()
+        _closure(known, frames, pairs if frames is FrameChoice.ALL else half, outcomes, dof)
+        for frames, outcomes in outcomes_by_frames.items()
         if outcomes
     )
 
 
 def _closure(
-    known: Between, frames: Frames, pairs: tuple[int, int], outcomes: Sequence[tuple[Outcome, Outcome]], dof: int
+    known: Between,
+    frames: FrameChoice,
+    pairs: tuple[int, int],
+    outcomes: Sequence[tuple[SolveOutcome, SolveOutcome]],
+    dof: int,
 ) -> Closure:
     results = [known.error(a, b) for a, b in outcomes]
     errors = [result[0] for result in results if result is not None]

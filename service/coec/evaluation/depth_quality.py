@@ -15,7 +15,7 @@ from math import degrees, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.estimators import Sight
+from coec.calibration.estimators import WindowData
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.objective.mutual_information import (
     SearchBox,
@@ -26,7 +26,7 @@ from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import maximise
 from coec.calibration.types import DepthMap, Matrix4, Rig
 from coec.config import CalibrationConfig, ObjectiveConfig
-from coec.evaluation.profiles import ObjectiveLandscape, Scan, Span, scan
+from coec.evaluation.profiles import ObjectiveLandscape, Scan, ScanSpan, scan
 from coec.evaluation.statistics import HIT_RAD
 from coec.geometry import se3
 from coec.geometry.cameras import in_image
@@ -37,7 +37,7 @@ SEARCH_DEG = 8.0
 """Half-width of the box in which the optimum is searched: several times the worst bias of a network that was of any use
 (3 degrees, METHOD section 3)."""
 
-SPAN = Span(radians(15.0), 0.0, 91)
+SPAN = ScanSpan(radians(15.0), 0.0, 91)
 """Span of the curves along the axes: wide enough for the peak of a weak network to fall to half on either side."""
 
 GOOD_RANK, GOOD_BIAS_RAD = 0.85, HIT_RAD
@@ -128,31 +128,31 @@ class Suitability(StrEnum):
     UNSUITED = "do_not_use"
 
 
-def assess(sight: Sight, config: CalibrationConfig, heard: Callable[[int, str], None]) -> DepthQuality:
+def assess(window_data: WindowData, config: CalibrationConfig, on_progress: Callable[[int, str], None]) -> DepthQuality:
     """The maps of a window against its sweeps, at the calibration of its rig.
 
     Raises:
         CalibrationError: a frame has no depth, or no point comes into view.
     """
-    rig = sight.window.rig
+    rig = window_data.window.rig
     reference = rig.T_camera_lidar_nominal
-    maps = sight.depths()
-    clouds = [sight.points(index) for index in range(len(maps))]
+    maps = window_data.depths()
+    clouds = [window_data.points(index) for index in range(len(maps))]
     pairings = tuple(
         pair_up(xyz_m, depth, rig, reference, config.objective) for xyz_m, depth in zip(clouds, maps, strict=True)
     )
-    heard(1, "ranks")
+    on_progress(1, "ranks")
     features = [distance_and_depth(xyz_m, depth, reference) for xyz_m, depth in zip(clouds, maps, strict=True)]
     box = SearchBox(radians(SEARCH_DEG), 0.0)
     objective = build_mutual_information(features, rig, reference, box, config.objective)
     search = config.search.model_copy(update={"dof": 3, "rotation_deg": SEARCH_DEG})
     optimum = maximise(objective, reference, search, Silence()).T_camera_lidar
-    heard(2, "optimum")
+    on_progress(2, "optimum")
     landscape = ObjectiveLandscape(objective)
     scans = scan(landscape, reference, 3, SPAN)
     unrelated = objective.mi_of_unrelated(reference)
     through = scan(landscape, optimum, 3, SPAN)
-    heard(3, "curves")
+    on_progress(3, "curves")
     curvature = measure_curvature(objective, optimum, 3)
     return DepthQuality(
         pairings=pairings,

@@ -19,7 +19,7 @@ from coec.calibration.commissioning.learning import learn_accuracy, learn_limits
 from coec.calibration.commissioning.quantiles import normal_quantile
 from coec.calibration.monitor.check import Check, CheckInput, Expected, check_at
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, Opinion, opinion
-from coec.calibration.monitor.depth_witness import ask_depth
+from coec.calibration.monitor.depth_witness import depth_cue
 from coec.calibration.types import Matrix4
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
@@ -68,7 +68,7 @@ class Detection:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tried:
+class TriedCheck:
     """One check: the move before it, and what both classifiers said."""
 
     name: str
@@ -96,8 +96,8 @@ def try_detection(
     config: CalibrationConfig,
     splits: int,
     checks: int,
-    heard: Callable[[int, int], None],
-) -> list[Tried]:
+    on_progress: Callable[[int, int], None],
+) -> list[TriedCheck]:
     """Cuts the pairs, taken as a ring, into two halves `splits` times (seeded), learns on one half, and tries `checks`
     checks after every move on the other; `heard(done, total)` counts the splits. `evidence` must be prepared for poses
     up to `FAR_RAD` from the right one.
@@ -112,28 +112,28 @@ def try_detection(
         rng = np.random.default_rng([SEED, split])
         # Neighbouring pairs stay in one half, so that limits are tried at places where they were not learned.
         order = (int(rng.integers(count)) + np.arange(count)) % count
-        learned, kept = sorted(order[: (count + 1) // 2].tolist()), order[(count + 1) // 2 :].tolist()
+        learned, held_out = sorted(order[: (count + 1) // 2].tolist()), order[(count + 1) // 2 :].tolist()
         of_learned = evidence.of(learned)
         accuracies = learn_accuracy(of_learned, right)
         limits = learn_limits(of_learned, right, config, accuracies, FALSE_ALARM_RATE)
         expected = Expected(*(accuracy.expected for accuracy in accuracies))
-        known = [axis for axis in range(3, 6) if accuracies[1].sigma(len(kept))[axis] <= OBSERVABLE_M]
+        known = [axis for axis in range(3, 6) if accuracies[1].sigma(len(held_out))[axis] <= OBSERVABLE_M]
         for name, turn_rad, shift_m in MOVES:
             if shift_m > 0.0 and not known:
                 continue
             for _ in range(checks):
-                size = int(rng.integers(MIN_PAIRS, len(kept) + 1))
-                indices = sorted(rng.permutation(kept)[:size].tolist())
+                size = int(rng.integers(MIN_PAIRS, len(held_out) + 1))
+                indices = sorted(rng.permutation(held_out)[:size].tolist())
                 xi = _move(rng, turn_rad, shift_m, known)
                 part, pose = evidence.of(indices), se3.perturb(right, xi)
                 seen = check_at(part, pose, expected)
-                by_paper = limits.of_paper.flags(ask_depth(part, seen, pose, config))
-                tried.append(Tried(name, opinion(seen, *accuracies, limits), by_paper, seen))
-        heard(split + 1, splits)
+                by_paper = limits.of_paper.flags(depth_cue(part, seen, pose, config))
+                tried.append(TriedCheck(name, opinion(seen, *accuracies, limits), by_paper, seen))
+        on_progress(split + 1, splits)
     return tried
 
 
-def table(tried: Sequence[Tried]) -> tuple[Detection, ...]:
+def table(tried: Sequence[TriedCheck]) -> tuple[Detection, ...]:
     """The shares by move, in the order of `MOVES`."""
     rows = []
     for name, _, _ in MOVES:

@@ -13,16 +13,16 @@ from coec.adapters.depth.maps import CachedDepth
 from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.learning import FAR_RAD
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.monitor.check import gather
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.errors import CalibrationError, DecodeError, SourceError
 from coec.evaluation import split_halves, starts, statistics
-from coec.evaluation.detection import Tried, try_detection
-from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint, Trial
-from coec.evaluation.steps import KNOCKS, TriedKnock, try_knocks
+from coec.evaluation.detection import TriedCheck, try_detection
+from coec.evaluation.statistics import FrameCountStatistics, SliceStatistics, SolveOutcome, Trial
+from coec.evaluation.steps import MOUNT_STEPS, MountStepTrial, try_mount_steps
 
 SUBSETS = 20
 """Solves for every number of frames and for every length of a slice, each from another start."""
@@ -51,13 +51,13 @@ class Stages:
         """Begins a stage; returns a function to call with the number of parts done and a note."""
         task = self._bars.add_task(self._prefix + stage, total=total, note="")
 
-        def heard(done: int, note: str = "") -> None:
+        def on_progress(done: int, note: str = "") -> None:
             now_s = time.perf_counter()
             self._elapsed_s[stage] = self._elapsed_s.get(stage, 0.0) + now_s - self._mark_s
             self._mark_s = now_s
             self._bars.update(task, completed=done, note=note)
 
-        return heard
+        return on_progress
 
     def elapsed_s(self) -> dict[str, float]:
         """Seconds by stage, and in `total`."""
@@ -78,7 +78,7 @@ class Bench:
         """The source's calibration, (4, 4)."""
         return self.window.rig.T_camera_lidar_nominal
 
-    def solve(self, start: Matrix4, frames: Sequence[int] | None = None) -> Outcome:
+    def solve(self, start: Matrix4, frames: Sequence[int] | None = None) -> SolveOutcome:
         """Solves from one start, which is taken as a guess, on all frames or on those with the given indices."""
         pairs = self.window.pairs if frames is None else tuple(self.window.pairs[index] for index in frames)
         window = replace(self.window, T_camera_lidar_start=start, start_known_to_rad=pi, pairs=pairs)
@@ -91,7 +91,7 @@ class Bench:
         return statistics.score(trial, self.reference, self.configuration.search.dof)
 
 
-def inferred(window: Window, model: DepthModel, heard: Callable[[int, str], None]) -> DepthModel:
+def inferred(window: Window, model: DepthModel, on_progress: Callable[[int, str], None]) -> DepthModel:
     """A model that holds the depth of every frame, inferred once for all solves.
 
     Raises:
@@ -103,7 +103,7 @@ def inferred(window: Window, model: DepthModel, heard: Callable[[int, str], None
             depth.infer(pair.camera)
         except DecodeError as error:
             raise CalibrationError(f"no depth for the camera frame at {pair.stamp_ns} ns: {error}") from error
-        heard(done, "")
+        on_progress(done, "")
     return depth
 
 
@@ -112,44 +112,44 @@ def greys_of(window: Window) -> ImageReader:
     return CachedGreys(GreyImages(LimitsConfig()), len(window.pairs) + len(window.between))
 
 
-def from_reference(bench: Bench, stages: Stages) -> Outcome:
+def from_reference(bench: Bench, stages: Stages) -> SolveOutcome:
     """The solve that starts at the reference, the best of all starts. It also compiles the kernels, so that the other
     solves are timed without compiling.
 
     Raises:
         CalibrationError: no start would give an estimate.
     """
-    heard = stages.begin("reference", 1)
+    on_progress = stages.begin("reference", 1)
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
     calibrate(window, bench.depth, bench.images, bench.configuration, Silence())
     outcome = bench.solve(bench.reference)
-    heard(1, "")
+    on_progress(1, "")
     return outcome
 
 
-def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> Iterator[Outcome]:
+def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> Iterator[SolveOutcome]:
     """One solve from each of the poses (4, 4), yielded as soon as it is done."""
-    heard = stages.begin("starts", len(poses))
+    on_progress = stages.begin("starts", len(poses))
     hits = 0
     for done, pose in enumerate(poses, start=1):
         outcome = bench.solve(pose)
         hits += outcome.hit
-        heard(done, f"{hits} hits, {100 * hits / done:.1f} %")
+        on_progress(done, f"{hits} hits, {100 * hits / done:.1f} %")
         yield outcome
 
 
-def against_frames(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> tuple[FramesPoint, ...]:
+def against_frames(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> tuple[FrameCountStatistics, ...]:
     """Solves with different numbers of frames. Every number gets the same starts, spread over all `poses`, so that only
     the numbers of frames are compared."""
     available = len(bench.window.pairs)
     counts = starts.frame_counts(available)
-    heard = stages.begin("frames", len(counts) * SUBSETS)
+    on_progress = stages.begin("frames", len(counts) * SUBSETS)
     points = []
     for row, frames in enumerate(counts):
         outcomes = []
         for trial in range(SUBSETS):
-            outcomes.append(bench.solve(_spread(poses, trial), starts.subset(available, frames, trial)))
-            heard(row * SUBSETS + trial + 1, f"{frames} of {available}")
+            outcomes.append(bench.solve(_spread(poses, trial), starts.frame_subset(available, frames, trial)))
+            on_progress(row * SUBSETS + trial + 1, f"{frames} of {available}")
         points.append(statistics.frames_point(frames, outcomes))
     return tuple(points)
 
@@ -160,7 +160,7 @@ def against_slice(
     cut: Callable[[float, float], Window],
     poses: Sequence[Matrix4],
     stages: Stages,
-) -> tuple[SlicePoint, ...]:
+) -> tuple[SliceStatistics, ...]:
     """Solves on slices of several lengths. Every length gets the same starts, divided among slices at several places of
     the recording, the first at its beginning.
 
@@ -173,19 +173,19 @@ def against_slice(
     """
     pairs = bench.window.pairs
     whole_s = (pairs[-1].stamp_ns - pairs[0].stamp_ns) * 1e-9
-    heard = stages.begin("slices", len(SLICE_SHARES) * SUBSETS)
+    on_progress = stages.begin("slices", len(SLICE_SHARES) * SUBSETS)
     points = []
     for row, share in enumerate(SLICE_SHARES):
         length_s = share * whole_s
         slices = []
-        for begin_s in _places(length_s, whole_s):
+        for begin_s in _slice_begins(length_s, whole_s):
             try:
                 window = cut(begin_s, begin_s + length_s)
             except SourceError:
                 # A slice without a camera frame is no window.
                 continue
             slices.append(window)
-        outcomes: list[tuple[int, list[Outcome]]] = []
+        outcomes: list[tuple[int, list[SolveOutcome]]] = []
         for place, window in enumerate(slices):
             of_slice = replace(
                 bench, window=window, depth=inferred(window, model, lambda *_: None), images=greys_of(window)
@@ -195,7 +195,7 @@ def against_slice(
             for trial in trials:
                 solved.append(of_slice.solve(_spread(poses, trial)))
                 done = sum(len(of_place) for _, of_place in outcomes) + len(solved)
-                heard(row * SUBSETS + done, f"{length_s:.1f} s")
+                on_progress(row * SUBSETS + done, f"{length_s:.1f} s")
             outcomes.append((len(window.pairs), solved))
         if outcomes:
             points.append(statistics.slice_point(length_s, outcomes))
@@ -204,16 +204,16 @@ def against_slice(
 
 def in_halves(
     bench: Bench, splits: int, rotation_rad: float, translation_m: float, stages: Stages
-) -> list[tuple[Outcome, Outcome]]:
+) -> list[tuple[SolveOutcome, SolveOutcome]]:
     """Solves disjoint halves of the frames, each from another start, this far from the reference."""
     available = len(bench.window.pairs)
-    poses = starts.starts(bench.reference, 2 * splits, rotation_rad, translation_m)
-    heard = stages.begin("halves", splits)
+    poses = starts.start_poses(bench.reference, 2 * splits, rotation_rad, translation_m)
+    on_progress = stages.begin("halves", splits)
     outcomes = []
     for trial in range(splits):
         one, other = split_halves.split(available, trial)
         outcomes.append((bench.solve(poses[2 * trial], one), bench.solve(poses[2 * trial + 1], other)))
-        heard(trial + 1, "")
+        on_progress(trial + 1, "")
     return outcomes
 
 
@@ -224,7 +224,7 @@ def in_windows(
     poses: Sequence[Matrix4],
     true_pose: Callable[[int], Matrix4],
     stages: Stages,
-) -> list[Outcome]:
+) -> list[SolveOutcome]:
     """Cuts the recording into as many consecutive windows as there are starts; they share no frame. Each is solved from
     its start and compared with `true_pose` at the time of its last pair (ns). Windows without a camera frame are left
     out.
@@ -238,10 +238,10 @@ def in_windows(
     stamps_ns = [pair.stamp_ns for pair in bench.window.pairs]
     # A microsecond more, so that the last frame belongs to the last window.
     length_s = ((stamps_ns[-1] - stamps_ns[0]) * 1e-9 + 1e-6) / len(poses)
-    heard = stages.begin("windows", len(poses))
+    on_progress = stages.begin("windows", len(poses))
     outcomes = []
     for index, pose in enumerate(poses):
-        heard(index, "")
+        on_progress(index, "")
         try:
             # Ends a nanosecond before the next window begins.
             window = cut(index * length_s, (index + 1) * length_s - 1e-9)
@@ -250,44 +250,44 @@ def in_windows(
         depth = inferred(window, model, lambda *_: None)
         solved = replace(bench, window=window, depth=depth, images=greys_of(window)).solve(pose)
         outcomes.append(statistics.score(solved.trial, true_pose(window.stamp_ns), bench.configuration.search.dof))
-    heard(len(poses), "")
+    on_progress(len(poses), "")
     return outcomes
 
 
-def detected(bench: Bench, splits: int, checks: int, stages: Stages) -> list[Tried]:
+def detected(bench: Bench, splits: int, checks: int, stages: Stages) -> list[TriedCheck]:
     """How well the monitor detects a wrong extrinsic: limits are learned on some pairs, and `checks` checks per split
     and move are made on the others."""
-    decode, heard = stages.begin("checks", None), stages.begin("detection", splits)
+    decode, on_progress = stages.begin("checks", None), stages.begin("detection", splits)
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
-    evidence = gather(sight_of(window, bench.depth, bench.images, bench.configuration, Silence()), FAR_RAD)
+    evidence = gather(prepare_window_data(window, bench.depth, bench.images, bench.configuration, Silence()), FAR_RAD)
     decode(1, "")
     return try_detection(
-        evidence, bench.reference, bench.configuration, splits, checks, lambda done, _: heard(done, "")
+        evidence, bench.reference, bench.configuration, splits, checks, lambda done, _: on_progress(done, "")
     )
 
 
-def knocked(bench: Bench, trials: int, stages: Stages) -> list[TriedKnock]:
+def mount_step_trials(bench: Bench, trials: int, stages: Stages) -> list[MountStepTrial]:
     """What calibrations say about the recording with knocks applied to it, `trials` times each kind."""
-    total = 1 + trials * sum(knock.moves for knock in KNOCKS)
-    heard = stages.begin("steps", total)
+    total = 1 + trials * sum(knock.moves for knock in MOUNT_STEPS)
+    on_progress = stages.begin("steps", total)
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
-    return try_knocks(
-        window, bench.depth, bench.images, bench.configuration, trials, KNOCKS, lambda done: heard(done, "")
+    return try_mount_steps(
+        window, bench.depth, bench.images, bench.configuration, trials, MOUNT_STEPS, lambda done: on_progress(done, "")
     )
 
 
 def poses_of(bench: Bench, directions: int, rotation_deg: float, translation_m: float) -> list[Matrix4]:
     """The starts of the protocol about the reference, (4, 4) each."""
-    return starts.starts(bench.reference, directions, radians(rotation_deg), translation_m)
+    return starts.start_poses(bench.reference, directions, radians(rotation_deg), translation_m)
 
 
 def _spread(poses: Sequence[Matrix4], trial: int) -> Matrix4:
     return poses[trial * len(poses) // SUBSETS]
 
 
-def _places(length_s: float, whole_s: float) -> list[float]:
+def _slice_begins(length_s: float, whole_s: float) -> list[float]:
     """Where slices of a length begin, seconds: at the beginning, then evenly up to the last that does not overlap."""
     # 1e-9 of tolerance, so that a slice as long as the recording fits once.
     fits = int(whole_s / length_s + 1e-9) if length_s > 0 else 1
-    chosen = {round(index * (fits - 1) / max(min(fits, SLICES) - 1, 1)) for index in range(min(fits, SLICES))}
-    return [index * length_s for index in sorted(chosen)]
+    indices = {round(index * (fits - 1) / max(min(fits, SLICES) - 1, 1)) for index in range(min(fits, SLICES))}
+    return [index * length_s for index in sorted(indices)]

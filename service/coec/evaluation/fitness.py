@@ -19,12 +19,12 @@ from coec.config import PairingConfig, WindowConfig
 from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
 from coec.geometry.vectors import lengths
-from coec.sources.recording import Recording
-from coec.sources.windows import clocks_text, evenly
+from coec.sources.recording import RecordingSource
+from coec.sources.windows import clocks_text, evenly_spread
 
 NS_PER_S = 1e9
 
-LOOKED_AT = 12
+SAMPLED_FRAMES = 12
 """Camera frames that are loaded."""
 
 LITTLE_IN_VIEW = 0.03
@@ -55,7 +55,7 @@ class Cadence:
 
 
 @dataclass(frozen=True, slots=True)
-class Remark:
+class Notice:
     """Something that a person should know: a machine-readable code, and a sentence that says what to do."""
 
     level: Level
@@ -107,23 +107,23 @@ class Fitness:
     in_view: float
     not_finite: float
     clocks: str
-    remarks: tuple[Remark, ...]
+    remarks: tuple[Notice, ...]
 
 
-def fitness_of(recording: Recording) -> Fitness:
+def fitness_of(recording: RecordingSource) -> Fitness:
     """What a recording holds, and remarks on it.
 
     Raises:
         SourceError: a file cannot be read, or a cloud contradicts its origin; names the file.
     """
     stamps_ns = recording.camera_stamps_ns
-    chosen = evenly(len(stamps_ns), min(LOOKED_AT, len(stamps_ns)))
+    sampled = evenly_spread(len(stamps_ns), min(SAMPLED_FRAMES, len(stamps_ns)))
     pairer = Pairer(PairingConfig(max_stamp_jump_s=1e9), expects_motion=bool(recording.motion_stamps_ns))
     pairs: list[FramePair] = []
     sweeps: list[LidarFrame] = []
     motions: list[EgoMotion] = []
     image: CameraFrame | None = None
-    for message in recording.messages(chosen):
+    for message in recording.messages(sampled):
         match message:
             case CameraFrame():
                 image = message
@@ -155,7 +155,7 @@ def fitness_of(recording: Recording) -> Fitness:
         speed_mps=_spread(_known(motion.speed_mps for motion in motions)),
         turn_degps=_spread([float(np.degrees(np.linalg.norm(motion.angular_radps))) for motion in motions]),
         standing=standing,
-        paired=len(pairs) / len(chosen) if chosen else 0.0,
+        paired=len(pairs) / len(sampled) if sampled else 0.0,
         sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
         in_view=float(np.median([in_view(sweep, rig) for sweep in sweeps])) if sweeps else 0.0,
         not_finite=float(np.median([_not_finite(sweep) for sweep in sweeps])) if sweeps else 0.0,
@@ -194,14 +194,14 @@ def passes(sweep: LidarFrame) -> int:
 
 
 def _with_remarks(seen: Fitness) -> Fitness:
-    remarks = [remark for remark in _remarks(seen) if remark is not None]
-    return replace(seen, remarks=tuple(sorted(remarks, key=lambda remark: _ORDER[remark.level])))
+    remarks = [notice for notice in _remarks(seen) if notice is not None]
+    return replace(seen, remarks=tuple(sorted(remarks, key=lambda notice: _ORDER[notice.level])))
 
 
 _ORDER: dict[Level, int] = {"fail": 0, "warn": 1, "ok": 2}
 
 
-def _remarks(seen: Fitness) -> list[Remark | None]:
+def _remarks(seen: Fitness) -> list[Notice | None]:
     return [
         _too_short(seen),
         _unpaired(seen),
@@ -215,36 +215,36 @@ def _remarks(seen: Fitness) -> list[Remark | None]:
     ]
 
 
-def _too_short(seen: Fitness) -> Remark | None:
+def _too_short(seen: Fitness) -> Notice | None:
     if seen.camera.frames >= MIN_PAIRS:
         return None
-    return Remark("fail", "too_few_frames", f"{seen.camera.frames} camera frames; a calibration needs {MIN_PAIRS}.")
+    return Notice("fail", "too_few_frames", f"{seen.camera.frames} camera frames; a calibration needs {MIN_PAIRS}.")
 
 
-def _unpaired(seen: Fitness) -> Remark | None:
+def _unpaired(seen: Fitness) -> Notice | None:
     tolerance_ms = 1e3 * PairingConfig().tolerance_s
     if seen.paired == 0.0:
-        return Remark("fail", "no_pairs", f"No camera frame has a sweep within {tolerance_ms:.0f} ms: {seen.clocks}.")
+        return Notice("fail", "no_pairs", f"No camera frame has a sweep within {tolerance_ms:.0f} ms: {seen.clocks}.")
     if seen.paired < 0.9:
-        return Remark("warn", "few_pairs", f"{1 - seen.paired:.0%} of the camera frames have no sweep near them.")
+        return Notice("warn", "few_pairs", f"{1 - seen.paired:.0%} of the camera frames have no sweep near them.")
     return None
 
 
-def _view(seen: Fitness) -> Remark | None:
+def _view(seen: Fitness) -> Notice | None:
     if seen.in_view >= LITTLE_IN_VIEW:
         return None
     text = f"{seen.in_view:.1%} of the points lie in the image at the nominal extrinsic: is it from LiDAR to camera?"
-    return Remark("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
+    return Notice("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
 
 
 def _not_finite(sweep: LidarFrame) -> float:
     return sweep.not_finite / (sweep.not_finite + len(sweep.xyz_m))
 
 
-def _finite(seen: Fitness) -> Remark | None:
+def _finite(seen: Fitness) -> Notice | None:
     if seen.not_finite < SOME_NOT_FINITE:
         return None
-    return Remark(
+    return Notice(
         "ok",
         "not_finite",
         f"{seen.not_finite:.0%} of the points have no finite position or time and are left out. This is so in "
@@ -252,40 +252,40 @@ def _finite(seen: Fitness) -> Remark | None:
     )
 
 
-def _motion(seen: Fitness) -> Remark | None:
+def _motion(seen: Fitness) -> Notice | None:
     if seen.motion is None:
-        return Remark("warn", "no_ego_motion", "No ego-motion: sweeps taken while driving cannot be compensated.")
+        return Notice("warn", "no_ego_motion", "No ego-motion: sweeps taken while driving cannot be compensated.")
     if seen.speed_mps is None:
         text = "Ego-motion is rotation only: sweeps are turned back, not shifted; drive slowly, or add an odometry."
-        return Remark("warn", "rotation_only", text)
+        return Notice("warn", "rotation_only", text)
     if not seen.point_time and seen.speed_mps is not None and seen.speed_mps[1] > SMEARING_MPS:
         text = "Points have no time and the rig no sweep timing: sweeps taken while driving cannot be compensated."
-        return Remark("warn", "no_point_time", text)
+        return Notice("warn", "no_point_time", text)
     return None
 
 
-def _standing(seen: Fitness) -> Remark | None:
+def _standing(seen: Fitness) -> Notice | None:
     if seen.standing is None or seen.standing < 0.5:
         return None
-    return Remark(
+    return Notice(
         "warn", "standing", f"The vehicle stood in {seen.standing:.0%} of the pairs: they count as few looks."
     )
 
 
-def _rings(seen: Fitness) -> Remark | None:
+def _rings(seen: Fitness) -> Notice | None:
     if seen.rings != 1:
         return None
-    return Remark(
+    return Notice(
         "warn",
         "constant_ring",
         "The field `ring` holds one number and is ignored: beams are told apart by their elevation.",
     )
 
 
-def _joined(seen: Fitness) -> Remark | None:
+def _joined(seen: Fitness) -> Notice | None:
     if seen.rings > 0 or seen.passes not in FEW_PASSES:
         return None
-    return Remark(
+    return Notice(
         "warn",
         "perhaps_concatenated",
         f"The points' times begin anew {seen.passes} times in a sweep, and no ring tells beams apart: if the cloud is "
@@ -293,11 +293,11 @@ def _joined(seen: Fitness) -> Remark | None:
     )
 
 
-def _gaps(seen: Fitness) -> Remark | None:
+def _gaps(seen: Fitness) -> Notice | None:
     for name, stream in (("camera", seen.camera), ("LiDAR", seen.lidar)):
         if stream.rate_hz > 1.0 and stream.longest_gap_s * stream.rate_hz > MANY_GAPS:
             text = f"The {name} is silent for {stream.longest_gap_s:.1f} s, at {stream.rate_hz:.1f} Hz otherwise."
-            return Remark("ok", "gaps", text)
+            return Notice("ok", "gaps", text)
     return None
 
 

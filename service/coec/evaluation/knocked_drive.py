@@ -18,8 +18,8 @@ from coec.evaluation.rig_evidence import WINDOW
 from coec.evaluation.rig_looks import ROWS, graph_of
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
-from coec.simulation.faults import SensorFault, Step
-from coec.simulation.rig_drive import RigConfig, RigDrive
+from coec.simulation.faults import SensorFault, StepFault
+from coec.simulation.rig_drive import RigDrive, RigDriveConfig
 
 LIDAR = "roof"
 """Name of the rig's LiDAR; the rig has four fisheyes and one LiDAR of 64 beams."""
@@ -37,7 +37,7 @@ FIRST_SEED = 1_760_001
 
 
 @dataclass(frozen=True)
-class KnockedDrive:
+class DisplacedRigDrive:
     """A drive by its number.
 
     Attributes:
@@ -53,9 +53,9 @@ class KnockedDrive:
         return f"{self.camera}_{FIRST_SEED + self.number}"
 
     @cached_property
-    def _drawn(self) -> tuple[float, tuple[str, str], dict[str, NDArray[np.float64]]]:
+    def _sampled(self) -> tuple[float, tuple[str, str], dict[str, NDArray[np.float64]]]:
         rng = np.random.default_rng([FIRST_SEED, self.number])
-        one, other = (str(name) for name in rng.permutation(RigConfig().drive().cameras)[:2])
+        one, other = (str(name) for name in rng.permutation(RigDriveConfig().drive().cameras)[:2])
         at_s = float(rng.uniform(*AT_S))
         turns = {name: STEP_RAD * random_direction(rng) for name in (one, other, LIDAR)}
         return at_s, (one, other), turns
@@ -63,12 +63,12 @@ class KnockedDrive:
     @property
     def at_s(self) -> float:
         """When sensors are knocked."""
-        return self._drawn[0]
+        return self._sampled[0]
 
     @property
     def cameras(self) -> tuple[str, str]:
         """The cameras that may be knocked: a fault takes the first alone, or both."""
-        return self._drawn[1]
+        return self._sampled[1]
 
     @cached_property
     def right(self) -> RigDrive:
@@ -76,12 +76,12 @@ class KnockedDrive:
         return self._config(()).drive()
 
     @cached_property
-    def knocked(self) -> RigDrive:
+    def displaced(self) -> RigDrive:
         """Both cameras and the LiDAR turned, each about an axis of its own."""
         faults = []
-        for name, turn in self._drawn[2].items():
+        for name, turn in self._sampled[2].items():
             rx, ry, rz = (degrees(angle) for angle in turn)
-            faults.append(SensorFault(name, Step(self.at_s, float("inf"), rx=rx, ry=ry, rz=rz)))
+            faults.append(SensorFault(name, StepFault(self.at_s, float("inf"), rx=rx, ry=ry, rz=rz)))
         return self._config(tuple(faults)).drive()
 
     @cached_property
@@ -95,8 +95,8 @@ class KnockedDrive:
         rng = np.random.default_rng([FIRST_SEED, self.number, 1])
         return {edge.name: se3.perturb(edge.T_a_b, WINDOW * rng.normal(size=6)) for edge in self.graph.edges}
 
-    def _config(self, faults: tuple[SensorFault, ...]) -> RigConfig:
+    def _config(self, faults: tuple[SensorFault, ...]) -> RigDriveConfig:
         seconds = self.at_s + AFTER_S
-        return RigConfig(
+        return RigDriveConfig(
             seed=FIRST_SEED + self.number, seconds=seconds, camera=self.camera, ego_hz=20.0, faults=faults, rows=ROWS
         )  # fmt: skip

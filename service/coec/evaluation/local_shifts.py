@@ -69,7 +69,7 @@ class LocalShifts:
     reach_px: int
 
     @property
-    def told(self) -> NDArray[np.bool_]:
+    def known(self) -> NDArray[np.bool_]:
         """(R, C) cells that tell where their range edges belong."""
         return np.asarray(np.isfinite(self.shift_px).all(axis=2))
 
@@ -91,14 +91,14 @@ def local_shifts(window: Window, images: ImageReader, T_camera_lidar: Matrix4, *
     scales = EdgeScales(lit, 0, 0, upright=rig.T_camera_lidar_nominal[:2, 2])
     side = max(camera.width, camera.height)
     reach = max(LEAST_REACH_PX, round(REACH_SHARE * side))
-    chosen = [window.pairs[index] for index in evenly(len(window.pairs), FRAMES)]
-    placed = [_placed(pair, rig, T_camera_lidar, compensated=compensated) for pair in chosen]
+    sampled = [window.pairs[index] for index in evenly(len(window.pairs), FRAMES)]
+    placed = [_placed(pair, rig, T_camera_lidar, compensated=compensated) for pair in sampled]
     rows, columns = _grid(np.concatenate([each.uv_px for each in placed]), camera)
     cells = rows * columns
     moves = np.arange(-reach, reach + 1)
     sums = np.zeros((len(moves), len(moves), cells))
     squares, edges, spread = np.zeros(cells), np.zeros(cells, np.int64), np.zeros(cells)
-    for pair, each in zip(chosen, placed, strict=True):
+    for pair, each in zip(sampled, placed, strict=True):
         grey = images.grey(pair.camera)
         if grey.shape != scales.shape:
             (height, width), model = grey.shape, f"{camera.width} x {camera.height}"
@@ -124,25 +124,25 @@ def local_shifts(window: Window, images: ImageReader, T_camera_lidar: Matrix4, *
         edges.reshape(rows, columns),
         shift.reshape(rows, columns, 2),
         np.where(edges > 0, mean, np.nan).reshape(rows, columns),
-        len(chosen),
+        len(sampled),
         reach,
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
+class _ImageEdgePoints:
     """The range edges of a pair in its image: (n, 2) the pixels nearest to them, and (n,) their weights."""
 
     uv_px: NDArray[np.int64]
     weight: NDArray[np.float64]
 
 
-def _placed(pair: FramePair, rig: Rig, T_camera_lidar: Matrix4, *, compensated: bool) -> _Placed:
-    found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
-    xyz_m = compensate(pair, rig, enabled=compensated, chosen=found.index) + found.shift_m
+def _placed(pair: FramePair, rig: Rig, T_camera_lidar: Matrix4, *, compensated: bool) -> _ImageEdgePoints:
+    edges = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
+    xyz_m = compensate(pair, rig, enabled=compensated, selection=edges.index) + edges.shift_m
     seen = points_in_view(rig.camera, T_camera_lidar, xyz_m, rig.mask, 0.0)
     nearest = np.clip(np.rint(seen.uv_px).astype(np.int64), 0, (rig.camera.width - 1, rig.camera.height - 1))
-    return _Placed(nearest, found.weight[seen.which].astype(np.float64))
+    return _ImageEdgePoints(nearest, edges.weight[seen.which].astype(np.float64))
 
 
 def _grid(uv_px: NDArray[np.int64], camera: Camera) -> tuple[int, int]:

@@ -112,17 +112,17 @@ def wrong_axes(name: str, window: SolvedWindow) -> list[str]:
     """The axes on which an accepted window is wrong, each with its figures; none for a refused window."""
     if not window.accepted:
         return []
-    found = []
+    wrong = []
     for axis, (error, sigma) in enumerate(zip(window.error, window.sigma, strict=True)):
         unit, limit = ("deg", WRONG_DEG) if axis < 3 else ("m", WRONG_M)
         if error is not None and abs(error) > max(limit, WRONG_SIGMAS * (sigma or 0.0)):
-            found.append(f"{name} {AXES[axis]} {error:+.3f} ± {sigma or 0.0:.3f} {unit}")
-    return found
+            wrong.append(f"{name} {AXES[axis]} {error:+.3f} ± {sigma or 0.0:.3f} {unit}")
+    return wrong
 
 
 def of_watches(moved: str, watches: Sequence[tuple[str, Watched]]) -> WatchStatistics:
     """Figures of all checks of one served pose; `watches` are given with the names of their drives."""
-    told = sum(watch.checks - watch.blind for _, watch in watches)
+    usable = sum(watch.checks - watch.blind for _, watch in watches)
     hours = fsum(watch.seconds for _, watch in watches) / 3600.0
     alarms = sum(watch.alarms for _, watch in watches)
     delays = [watch.delay_checks for _, watch in watches if watch.delay_checks is not None]
@@ -131,7 +131,7 @@ def of_watches(moved: str, watches: Sequence[tuple[str, Watched]]) -> WatchStati
         moved=moved,
         drives=len(watches),
         checks=sum(watch.checks for _, watch in watches),
-        flagged=sum(watch.flagged for _, watch in watches) / told if told else None,
+        flagged=sum(watch.flagged for _, watch in watches) / usable if usable else None,
         blind=sum(watch.blind for _, watch in watches),
         alarms=alarms,
         alarmed=len(delays),
@@ -151,7 +151,7 @@ def _groups(solves: Solves) -> Iterable[GroupStatistics]:
     for of, value_of in PROPERTIES.items():
         for value in dict.fromkeys(value_of(row) for row, _, _ in solves):
             some = [solve for solve in solves if value_of(solve[0]) == value]
-            found = [window.rotation_deg for _, _, window in some if window.rotation_deg is not None]
+            rotations_deg = [window.rotation_deg for _, _, window in some if window.rotation_deg is not None]
             yield GroupStatistics(
                 of=of,
                 value=value,
@@ -159,7 +159,7 @@ def _groups(solves: Solves) -> Iterable[GroupStatistics]:
                 hits=sum(window.hit for _, _, window in some),
                 accepted=sum(window.accepted for _, _, window in some),
                 accepted_wrong=_wrong(some),
-                median_deg=median(found) if found else None,
+                median_deg=median(rotations_deg) if rotations_deg else None,
             )
 
 

@@ -67,8 +67,8 @@ class MatrixDrive:
     @property
     def name(self) -> str:
         """Its name: all its words, and the number of its seed."""
-        words = (self.scene, self.lens, self.lidar, self.light, self.fault, f"s{self.seed - FIRST_SEED + 1}")
-        return "_".join(words)
+        parts = (self.scene, self.lens, self.lidar, self.light, self.fault, f"s{self.seed - FIRST_SEED + 1}")
+        return "_".join(parts)
 
     @property
     def moving_mount(self) -> bool:
@@ -77,13 +77,13 @@ class MatrixDrive:
 
     def source(self, seconds: float, hertz: float, *, depth: bool) -> str:
         """The SOURCE that draws it, with pictures and sweeps at `hertz`, and with exact depth maps if `depth`."""
-        words = [f"seed={self.seed}", f"seconds={seconds:g}", f"camera_hz={hertz:g}", f"lidar_hz={hertz:g}"]
-        words += ["ego_hz=20", f"lidar={self.lidar}", *(["depth=yes"] if depth else [])]
+        parameters = [f"seed={self.seed}", f"seconds={seconds:g}", f"camera_hz={hertz:g}", f"lidar_hz={hertz:g}"]
+        parameters += ["ego_hz=20", f"lidar={self.lidar}", *(["depth=yes"] if depth else [])]
         faults = []
         for part in (SCENES[self.scene], LENSES[self.lens], LIGHTS[self.light], FAULTS[self.fault]):
             for word in filter(None, part.split("&")):
-                faults.append(word.removeprefix("faults=")) if word.startswith("faults=") else words.append(word)
-        return "sim:" + "&".join([*words, *([f"faults={';'.join(faults)}"] if faults else [])])
+                faults.append(word.removeprefix("faults=")) if word.startswith("faults=") else parameters.append(word)
+        return "sim:" + "&".join([*parameters, *([f"faults={';'.join(faults)}"] if faults else [])])
 
 
 KINDS: tuple[tuple[str, str, str, str, str], ...] = (
@@ -151,6 +151,6 @@ def drives(number: int) -> tuple[MatrixDrive, ...]:
     )
 
 
-def chosen(number: int, pattern: str | None) -> tuple[MatrixDrive, ...]:
+def selected_drives(number: int, pattern: str | None) -> tuple[MatrixDrive, ...]:
     """The drives of a round whose name matches a shell pattern (`*`, `?`); all for None."""
     return tuple(drive for drive in drives(number) if pattern is None or fnmatchcase(drive.name, pattern))

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
 from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.calibrator import calibrate
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.frames.sampling import stands
-from coec.calibration.monitor.change_detector import Finding, MonitorState, after_observation, alarm_levels
+from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState, after_observation, alarm_levels
 from coec.calibration.monitor.check import check_at, gather
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, judge_check
 from coec.calibration.ports import DepthModel, ImageReader, Silence
@@ -65,7 +65,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Stage:
+class _PreparedMatrixDrive:
     """A drawn drive, ready to be solved: all its pairs, and readers that decode each of them only once."""
 
     drive: SimulatedDrive
@@ -90,7 +90,7 @@ def run(drive: MatrixDrive, settings: Settings) -> MatrixRow:
     )  # fmt: skip
     update: dict[str, object] = {}
     try:
-        stage = _draw(source, settings)
+        stage = _simulate(source, settings)
         configuration = _configuration(settings)
         update["windows"] = {str(dof): _solved(stage, drive, settings, dof, configuration) for dof in settings.dofs}
         update["watched"] = () if drive.moving_mount else _watched(stage, drive, configuration)
@@ -106,18 +106,18 @@ def _configuration(settings: Settings) -> CalibrationConfig:
     return CalibrationConfig.model_validate(values)
 
 
-def _draw(source: str, settings: Settings) -> _Stage:
+def _simulate(source: str, settings: Settings) -> _PreparedMatrixDrive:
     made = open_sim(parse_spec(source).query)
     pairer = Pairer(PairingConfig(), expects_motion=True)
     pairs = [pair for message in made.messages() for pair in pairer.push(message)] + pairer.flush()
     if len(pairs) < 2:
         raise SourceError(f"{made.name}: {len(pairs)} pairs of a picture and a sweep; lost: {dict(pairer.losses)}")
     depth = CachedDepth(open_depth(_configuration(settings).depth, LimitsConfig()), len(pairs))
-    return _Stage(made, tuple(pairs), depth, CachedGreys(GreyImages(LimitsConfig()), len(pairs)))
+    return _PreparedMatrixDrive(made, tuple(pairs), depth, CachedGreys(GreyImages(LimitsConfig()), len(pairs)))
 
 
 def _solved(
-    stage: _Stage, drive: MatrixDrive, settings: Settings, dof: int, base: CalibrationConfig
+    stage: _PreparedMatrixDrive, drive: MatrixDrive, settings: Settings, dof: int, base: CalibrationConfig
 ) -> tuple[SolvedWindow, ...]:
     configuration = base.model_copy(update={"search": base.search.model_copy(update={"dof": dof})})
     rows = []
@@ -126,12 +126,12 @@ def _solved(
         if not pairs:
             continue
         truth = stage.drive.truth(pairs[-1].stamp_ns)
-        xi = drawn_start(drive.name, place, dof, configuration.verdict.held_translation_sigma_m)
+        xi = sampled_start(drive.name, place, dof, configuration.verdict.held_translation_sigma_m)
         rows.append(_solve(stage, pairs, truth, xi, dof, configuration))
     return tuple(rows)
 
 
-def drawn_start(name: str, place: int, dof: int, held_m: float) -> NDArray[np.float64]:
+def sampled_start(name: str, place: int, dof: int, held_m: float) -> NDArray[np.float64]:
     """(6,) ξ from the truth to the start of the `place`-th window of the drive of this name. A held translation is
     wrong by what the budget of σ assumes, `held_m` along each axis, because an exact one would flatter the estimate."""
     rng = np.random.default_rng([_number_of(name), place, dof])
@@ -141,7 +141,7 @@ def drawn_start(name: str, place: int, dof: int, held_m: float) -> NDArray[np.fl
 
 
 def _solve(
-    stage: _Stage,
+    stage: _PreparedMatrixDrive,
     pairs: Sequence[FramePair],
     truth: Matrix4,
     xi: NDArray[np.float64],
@@ -174,14 +174,14 @@ def _solve(
     )
 
 
-def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig) -> tuple[Watched, ...]:
+def _watched(stage: _PreparedMatrixDrive, drive: MatrixDrive, configuration: CalibrationConfig) -> tuple[Watched, ...]:
     """The checks of an uncommissioned rig that serves the truth, and of one that serves a pose turned from it."""
     if len(stage.pairs) < CHECK_PAIRS:
         return ()
     truth = stage.drive.truth(stage.pairs[0].stamp_ns)
     window = stage.window(stage.pairs, truth)
     most_rad = radians(max(turn_deg for _, turn_deg in MOVES_DEG))
-    evidence = gather(sight_of(window, stage.depth, stage.images, configuration, Silence()), most_rad)
+    evidence = gather(prepare_window_data(window, stage.depth, stage.images, configuration, Silence()), most_rad)
     levels, rows = alarm_levels(MonitorConfig()), []
     for number, (name, turn_deg) in enumerate(MOVES_DEG):
         rng = np.random.default_rng([_number_of(drive.name), 1000 + number])
@@ -196,7 +196,7 @@ def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig
             checks += 1
             flagged += seen.flagged and not seen.causes
             blind += bool(seen.causes)
-            if state.outcome is Finding.CONFIRMED and before.outcome is not Finding.CONFIRMED:
+            if state.outcome is MonitorOutcome.CONFIRMED and before.outcome is not MonitorOutcome.CONFIRMED:
                 alarms += 1
                 delay = checks if delay is None else delay
         rows.append(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.types import Estimate
-from coec.evaluation.statistics import Outcome
+from coec.evaluation.statistics import SolveOutcome
 from coec.geometry import se3
 
 SIGMAS = (1.0, 2.0, 3.0)
@@ -86,8 +86,8 @@ def normalise(claims: Claims, independent: int) -> NormalisedErrors:
     known = np.isfinite(sigma)
     some = np.where(known.any(axis=0), known.sum(axis=0), np.nan)
     z = np.where(known, errors / np.where(known, sigma, 1.0), np.nan)
-    told = np.where(known, errors, 0.0)
-    rms = np.sqrt((told**2).sum(axis=0) / some)
+    known_errors = np.where(known, errors, 0.0)
+    rms = np.sqrt((known_errors**2).sum(axis=0) / some)
     mean_sigma = np.where(known, sigma, 0.0).sum(axis=0) / some
     nees, axes = _nees(errors, covariances, known)
     used = min(independent, len(errors))
@@ -96,7 +96,7 @@ def normalise(claims: Claims, independent: int) -> NormalisedErrors:
         refused=claims.refused,
         independent=used,
         rms=rms,
-        largest=np.where(np.isfinite(some), np.abs(told).max(axis=0, initial=0.0), np.nan),
+        largest=np.where(np.isfinite(some), np.abs(known_errors).max(axis=0, initial=0.0), np.nan),
         sigma=mean_sigma,
         sigma_over_rms=mean_sigma / np.where(rms > 0.0, rms, np.nan),
         coverage=np.array([(np.abs(z) <= limit).sum(axis=0) / some for limit in SIGMAS]),
@@ -112,13 +112,13 @@ def within(share: float) -> float:
     return NormalDist().inv_cdf(0.5 + 0.5 * share)
 
 
-def of_outcomes(outcomes: Sequence[Outcome]) -> Claims:
+def of_outcomes(outcomes: Sequence[SolveOutcome]) -> Claims:
     """Errors of accepted outcomes against their reference."""
     judged = [(outcome.error, claimed(outcome)) for outcome in outcomes]
     return gathered([None if claim is None else (error, claim) for error, claim in judged])
 
 
-def of_differences(outcomes: Sequence[tuple[Outcome, Outcome]]) -> Claims:
+def of_differences(outcomes: Sequence[tuple[SolveOutcome, SolveOutcome]]) -> Claims:
     """Differences of results that share no frame, so their variances add up."""
     differences: list[tuple[NDArray[np.float64], NDArray[np.float64]] | None] = []
     for a, b in outcomes:
@@ -132,15 +132,15 @@ def of_differences(outcomes: Sequence[tuple[Outcome, Outcome]]) -> Claims:
 
 def gathered(results: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]] | None]) -> Claims:
     """Claims from error (6,) and covariance (6, 6) of each result; None stands for a refused one."""
-    told = [result for result in results if result is not None]
+    accepted = [result for result in results if result is not None]
     return Claims(
-        errors=np.array([error for error, _ in told]).reshape(-1, 6),
-        covariances=np.array([covariance for _, covariance in told]).reshape(-1, 6, 6),
-        refused=len(results) - len(told),
+        errors=np.array([error for error, _ in accepted]).reshape(-1, 6),
+        covariances=np.array([covariance for _, covariance in accepted]).reshape(-1, 6, 6),
+        refused=len(results) - len(accepted),
     )
 
 
-def claimed(outcome: Outcome) -> NDArray[np.float64] | None:
+def claimed(outcome: SolveOutcome) -> NDArray[np.float64] | None:
     """The covariance (6, 6) that an outcome claims; None if it was not accepted or claims nothing at all."""
     estimate = outcome.trial.estimate
     if estimate is None or not outcome.accepted:
@@ -173,9 +173,9 @@ def _bounds(dof: int) -> tuple[float, float]:
     """Interval of a mean of χ² per degree of freedom."""
     if dof < 1:
         return (float("nan"), float("nan"))
-    outside = 0.5 * (1.0 - BOUNDS)
+    tail = 0.5 * (1.0 - BOUNDS)
     # The approximation of the quantile falls below zero in the lower tail of one degree of freedom.
-    return max(chi2_quantile(outside, dof), 0.0) / dof, chi2_quantile(1.0 - outside, dof) / dof
+    return max(chi2_quantile(tail, dof), 0.0) / dof, chi2_quantile(1.0 - tail, dof) / dof
 
 
 def _histogram(values: NDArray[np.float64]) -> NDArray[np.int64]:

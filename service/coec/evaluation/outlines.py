@@ -24,7 +24,7 @@ NEXT_LINE_RAD = (radians(0.05), radians(2.2))
 """Elevation from a range edge to the one above it: more than the noise of one scan line, no more than the spacing of a
 LiDAR of 16 beams (data sheet of the VLP-16: 2 degrees)."""
 
-ASIDE_RAD = radians(0.6)
+SAME_AZIMUTH_RAD = radians(0.6)
 """Azimuth between the two, at most: two columns of a slow sensor."""
 
 ALIKE_SHARE = 0.03
@@ -56,7 +56,7 @@ class Outlines:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class ProjectedOutlines:
     """Range edges in an image: (E, 2) pixels, and (E,) whether each lies in the image and not on the mask."""
 
     uv_px: NDArray[np.float64]
@@ -65,27 +65,27 @@ class Drawn:
 
 def outlines_of(pair: FramePair, rig: Rig, *, compensated: bool) -> Outlines:
     """The outlines of the sweep of a pair; none where the sweep has no jump in range."""
-    found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
+    edges = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
     # Found as measured, placed motion-compensated, as the estimator does.
-    xyz_m = compensate(pair, rig, enabled=compensated, chosen=found.index) + found.shift_m
+    xyz_m = compensate(pair, rig, enabled=compensated, selection=edges.index) + edges.shift_m
     joined = _joined(xyz_m)
-    return Outlines(xyz_m, found.weight, joined[:, :2], joined[:, 2])
+    return Outlines(xyz_m, edges.weight, joined[:, :2], joined[:, 2])
 
 
-def drawn_at(outlines: Outlines, rig: Rig, T_camera_lidar: Matrix4) -> Drawn:
+def project_outlines(outlines: Outlines, rig: Rig, T_camera_lidar: Matrix4) -> ProjectedOutlines:
     """The range edges in the image at an extrinsic (4, 4)."""
     return _pixels(outlines.xyz_m, rig.camera, T_camera_lidar, rig.mask)
 
 
 def _pixels(
     xyz_m: NDArray[np.float32], camera: Camera, T_camera_lidar: Matrix4, mask: NDArray[np.bool_] | None
-) -> Drawn:
+) -> ProjectedOutlines:
     uv_px, valid = project(camera, xyz_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
     seen = valid & in_image(camera, uv_px)
     if mask is not None:
         nearest = np.rint(uv_px[seen]).astype(np.int64)
         seen[np.flatnonzero(seen)[~mask[nearest[:, 1], nearest[:, 0]]]] = False
-    return Drawn(uv_px, seen)
+    return ProjectedOutlines(uv_px, seen)
 
 
 def _joined(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -104,8 +104,8 @@ def _joined(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:
     cosine = (ahead * behind).sum(axis=1) / np.hypot(*ahead.T) / np.hypot(*behind.T)
     goes_on = np.zeros(count, np.bool_)
     goes_on[through[cosine >= cos(BEND_RAD)]] = True
-    kept = goes_on[below] | goes_on[above]
-    below, above = below[kept], above[kept]
+    connected = goes_on[below] | goes_on[above]
+    below, above = below[connected], above[connected]
     # The lowest edge of each outline: where no piece arrives from below, or the one that does bends too much.
     lowest = np.arange(count)
     for lower in below[np.argsort(seen.elevation[below], kind="stable")]:
@@ -119,9 +119,9 @@ def _mutual(seen: Bearings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     the nearest of all below the upper."""
     order = np.argsort(seen.azimuth, kind="stable")
     azimuth, elevation, range_m = seen.azimuth[order], seen.elevation[order], seen.range_m[order]
-    lower, upper, apart = [], [], []
+    lower, upper, distances = [], [], []
     for step in range(1, min(COMPARED, len(order) - 1) + 1):
-        near = azimuth[step:] - azimuth[:-step] <= ASIDE_RAD
+        near = azimuth[step:] - azimuth[:-step] <= SAME_AZIMUTH_RAD
         if not near.any():
             break
         rise = elevation[step:] - elevation[:-step]
@@ -130,10 +130,10 @@ def _mutual(seen: Bearings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         is_above = rise[first] > 0
         lower.append(np.where(is_above, first, first + step))
         upper.append(np.where(is_above, first + step, first))
-        apart.append(np.hypot(rise[first], azimuth[first + step] - azimuth[first]))
+        distances.append(np.hypot(rise[first], azimuth[first + step] - azimuth[first]))
     if not lower:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    below, above, distance = np.concatenate(lower), np.concatenate(upper), np.concatenate(apart)
+    below, above, distance = np.concatenate(lower), np.concatenate(upper), np.concatenate(distances)
     both = np.intersect1d(_nearest(below, distance), _nearest(above, distance))
     return order[below[both]], order[above[both]]
 

@@ -31,7 +31,7 @@ SEED = 20_230_617
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class FailureFigures:
     """The three figures at one pose of one sample of pairs: MI (nats), largest |f'| (nats per radian) and least f''
     (nats per radian²) of the rotations."""
 
@@ -47,36 +47,36 @@ def failure_figures(
     right: Matrix4,
     config: CalibrationConfig,
     samples: int,
-    heard: Callable[[int, int], None],
-) -> list[Figures]:
+    on_progress: Callable[[int, int], None],
+) -> list[FailureFigures]:
     """The figures at the right pose and about it: `samples` times (seeded), on a random half of the frames and about a
     random axis.
 
     Raises:
         CalibrationError: no point can come into view.
     """
-    found = []
+    figures = []
     box = SearchBox(radians(max(MOVES_DEG) + 1.0), 0.0)
     for sample in range(samples):
         rng = np.random.default_rng([SEED, sample])
-        chosen = sorted(rng.permutation(len(frames))[: max(len(frames) // 2, 1)].tolist())
-        mutual = build_mutual_information([frames[i] for i in chosen], rig, right, box, config.objective)
+        sampled = sorted(rng.permutation(len(frames))[: max(len(frames) // 2, 1)].tolist())
+        mutual = build_mutual_information([frames[i] for i in sampled], rig, right, box, config.objective)
         for moved_deg in MOVES_DEG:
             pose = se3.perturb(right, np.concatenate([radians(moved_deg) * random_direction(rng), np.zeros(3)]))
             shape = measure_curvature(mutual, pose, 3)
-            found.append(
-                Figures(
+            figures.append(
+                FailureFigures(
                     moved_deg,
                     mutual.evaluate(pose).mi,
                     float(np.max(np.abs(shape.first_derivative[:3]))),
                     float(np.min(shape.second_derivative[:3])),
                 )
             )
-        heard(sample + 1, samples)
-    return found
+        on_progress(sample + 1, samples)
+    return figures
 
 
-def learned(figures: Sequence[Figures]) -> PaperLimits:
+def learned(figures: Sequence[FailureFigures]) -> PaperLimits:
     """Limits from the figures at the right pose."""
     return PaperLimits.learned([f for f in figures if f.moved_deg == 0.0], FALSE_ALARM_RATE)
 

@@ -10,7 +10,7 @@ from math import radians
 import numpy as np
 
 from coec.adapters.depth.maps import open_depth
-from coec.calibration.estimators import depth_features, sight_of
+from coec.calibration.estimators import depth_features, prepare_window_data
 from coec.calibration.objective.mutual_information import build_mutual_information
 from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import box_of
@@ -45,28 +45,28 @@ def run_times(source: str, configuration: CalibrationConfig, stages: Stages) -> 
         CoecError: the source cannot be read, or cannot be solved.
     """
     load = stages.begin("load 50", None)
-    window = windows.load(source, None, FRAME_COUNTS[-1], lambda done, _: load(done, "")).window
+    window = windows.load_window(source, None, FRAME_COUNTS[-1], lambda done, _: load(done, "")).window
     depth = inferred(window, open_depth(configuration.depth, LimitsConfig()), stages.begin("depth", len(window.pairs)))
     bench = Bench(window, depth, greys_of(window), configuration)
-    heard = stages.begin("run time", len(FRAME_COUNTS))
-    found = []
+    on_progress = stages.begin("run time", len(FRAME_COUNTS))
+    times = []
     for count in sorted({min(count, len(window.pairs)) for count in FRAME_COUNTS}):
-        found.append(_run_time(bench, windows.evenly(len(window.pairs), count)))
-        heard(len(found), f"{count} frames")
-    return found
+        times.append(_run_time(bench, windows.evenly_spread(len(window.pairs), count)))
+        on_progress(len(times), f"{count} frames")
+    return times
 
 
-def _run_time(bench: Bench, chosen: list[int]) -> RunTime:
-    window = replace(bench.window, pairs=tuple(bench.window.pairs[index] for index in chosen))
-    sight = sight_of(window, bench.depth, bench.images, bench.configuration, Silence())
-    features = depth_features(sight, bench.reference)
+def _run_time(bench: Bench, indices: list[int]) -> RunTime:
+    window = replace(bench.window, pairs=tuple(bench.window.pairs[index] for index in indices))
+    window_data = prepare_window_data(window, bench.depth, bench.images, bench.configuration, Silence())
+    features = depth_features(window_data, bench.reference)
     box = box_of(bench.configuration.search)
     mutual = build_mutual_information(features, window.rig, bench.reference, box, bench.configuration.objective)
     start = se3.perturb(bench.reference, START)
     return RunTime(
-        frames=len(chosen),
+        frames=len(indices),
         mi_ms=_fastest_ms(lambda: mutual.evaluate(start), REPEATS),
-        solve_ms=_fastest_ms(lambda: bench.solve(start, chosen), SOLVES),
+        solve_ms=_fastest_ms(lambda: bench.solve(start, indices), SOLVES),
     )
 
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from coec.calibration.ports import ImageReader
 from coec.calibration.types import Matrix4, Rig, Window
 from coec.errors import CalibrationError
-from coec.evaluation.outlines import Outlines, drawn_at, outlines_of
+from coec.evaluation.outlines import Outlines, outlines_of, project_outlines
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales, Rectangle
 
 STRIDES = 4
 """Rectangles are tried in steps of a fourth of their width and height."""
 
-UNTOLD = 0.05
+BASE_CONTRAST = 0.05
 """Worth of a swept area, standard deviations, where the image tells nothing: if both extrinsics are wrong, neither puts
 outlines on edges."""
 
@@ -51,15 +51,17 @@ class Swept:
     strength: NDArray[np.float64]
 
     @property
-    def worth(self) -> NDArray[np.float64]:
+    def information(self) -> NDArray[np.float64]:
         """(L,) the area times the square of how clearly the image tells the two apart, px² · σ², whichever it prefers.
         Squared, because one clear outline shows more than many vague ones."""
-        told = np.abs(self.strength[:, 0] - self.strength[:, 1])
-        return self.area_px2 * (UNTOLD + np.where(self.strength.max(axis=1, initial=0.0) > 0.0, told, 0.0)) ** 2
+        contrast = np.abs(self.strength[:, 0] - self.strength[:, 1])
+        return (
+            self.area_px2 * (BASE_CONTRAST + np.where(self.strength.max(axis=1, initial=0.0) > 0.0, contrast, 0.0)) ** 2
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class DifferenceRegion:
     """A part of an image, and figures of what is swept there, weighted by worth.
 
     Attributes:
@@ -69,13 +71,13 @@ class Place:
     """
 
     part: Rectangle
-    worth: float
+    information: float
     across_px: float
     strength: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Places:
+class DifferenceRegions:
     """The most telling places of one pair of a window, the best first; none where no outline is in view.
 
     Attributes:
@@ -88,7 +90,7 @@ class Places:
 
     index: int
     outlines: Outlines
-    found: tuple[Place, ...]
+    regions: tuple[DifferenceRegion, ...]
     frames: int
     strength: tuple[float, float]
 
@@ -104,7 +106,7 @@ class Shift:
 def swept(outlines: Outlines, edges: NDArray[np.int8], rig: Rig, T_one: Matrix4, T_other: Matrix4) -> Swept:
     """What outlines sweep between two extrinsics (4, 4), where both put them into the image; `edges` (height, width) is
     `EdgePyramid.sharp` of the image."""
-    one, other = drawn_at(outlines, rig, T_one), drawn_at(outlines, rig, T_other)
+    one, other = project_outlines(outlines, rig, T_one), project_outlines(outlines, rig, T_other)
     in_both = (one.seen & other.seen)[outlines.pieces].all(axis=1)
     lower, upper = outlines.pieces[in_both].T
     between = 0.5 * (one.uv_px + other.uv_px)
@@ -134,7 +136,7 @@ def _under_outlines(
     return np.bincount(of_outline, length * strength, outlines) / np.maximum(total, LEAST_LENGTH_PX)
 
 
-def places(
+def difference_regions(
     window: Window,
     images: ImageReader,
     T_one: Matrix4,
@@ -143,7 +145,7 @@ def places(
     count: int,
     *,
     compensated: bool,
-) -> Places:
+) -> DifferenceRegions:
     """The pair on which two extrinsics (4, 4) differ most, and at most `count` rectangles of its image, of (width,
     height) `size_px` and without overlap, in which they do.
 
@@ -153,13 +155,13 @@ def places(
     """
     if not window.pairs:
         raise ValueError("a window without pairs has no places")
-    best_worth = -1.0
+    best_information = -1.0
     total, weight = np.zeros(2), 0.0
     rig, camera = window.rig, window.rig.camera
     lit = rig.mask if rig.mask is not None else np.ones((camera.height, camera.width), np.bool_)
     scales = EdgeScales(lit, 0, 0, upright=rig.T_camera_lidar_nominal[:2, 2])
-    looked_at = evenly(len(window.pairs), FRAMES)
-    for index in looked_at:
+    sampled = evenly(len(window.pairs), FRAMES)
+    for index in sampled:
         outlines = outlines_of(window.pairs[index], rig, compensated=compensated)
         grey = images.grey(window.pairs[index].camera)
         if grey.shape != scales.shape:
@@ -168,48 +170,50 @@ def places(
         seen = swept(outlines, scales.pyramid(grey).sharp, rig, T_one, T_other)
         total += seen.length_px @ seen.strength
         weight += float(seen.length_px.sum())
-        found = _largest(seen, (camera.width, camera.height), size_px, count)
-        worth = sum(place.worth for place in found)
-        if worth > best_worth:
-            chosen, best_worth = (index, outlines, found), worth
+        regions = _largest(seen, (camera.width, camera.height), size_px, count)
+        information = sum(place.information for place in regions)
+        if information > best_information:
+            best, best_information = (index, outlines, regions), information
     strength = total / weight if weight > 0.0 else np.full(2, np.nan)
-    return Places(*chosen, len(looked_at), (float(strength[0]), float(strength[1])))
+    return DifferenceRegions(*best, len(sampled), (float(strength[0]), float(strength[1])))
 
 
 def shift_px(window: Window, T_one: Matrix4, T_other: Matrix4, *, compensated: bool) -> Shift | None:
     """How far apart two extrinsics (4, 4) put the range edges of the middle pair; None where none is in the image at
     both."""
     outlines = outlines_of(window.pairs[len(window.pairs) // 2], window.rig, compensated=compensated)
-    one, other = (drawn_at(outlines, window.rig, T) for T in (T_one, T_other))
+    one, other = (project_outlines(outlines, window.rig, T) for T in (T_one, T_other))
     both = one.seen & other.seen
     if not both.any():
         return None
-    apart = np.linalg.norm(one.uv_px[both] - other.uv_px[both], axis=1)
-    return Shift(float(np.median(apart)), float(apart.max()))
+    distances_px = np.linalg.norm(one.uv_px[both] - other.uv_px[both], axis=1)
+    return Shift(float(np.median(distances_px)), float(distances_px.max()))
 
 
-def evenly(count: int, wanted: int) -> list[int]:
+def evenly(count: int, at_most: int) -> list[int]:
     """At most `wanted` of `count` indices, each in the middle of its share."""
-    return [int((2 * k + 1) * count / (2 * min(wanted, count))) for k in range(min(wanted, count))]
+    return [int((2 * k + 1) * count / (2 * min(at_most, count))) for k in range(min(at_most, count))]
 
 
-def _largest(seen: Swept, image_px: tuple[int, int], size_px: tuple[int, int], count: int) -> tuple[Place, ...]:
+def _largest(
+    seen: Swept, image_px: tuple[int, int], size_px: tuple[int, int], count: int
+) -> tuple[DifferenceRegion, ...]:
     width, height = (min(size, whole) for size, whole in zip(size_px, image_px, strict=True))
-    worth = seen.worth
-    found: list[Place] = []
-    while len(found) < count and worth.any():
+    information = seen.information
+    regions: list[DifferenceRegion] = []
+    while len(regions) < count and information.any():
         part = _about_its_middle(
-            _best(seen.middle_px, worth, image_px, (width, height)), seen.middle_px, worth, image_px
+            _best(seen.middle_px, information, image_px, (width, height)), seen.middle_px, information, image_px
         )
         inside = _within(seen.middle_px[:, 0], part.left, width) & _within(seen.middle_px[:, 1], part.top, height)
-        weight = worth[inside]
+        weight = information[inside]
         strength = weight @ seen.strength[inside] / weight.sum()
         across_px = _weighted_median(seen.across_px[inside], weight)
-        found.append(Place(part, float(weight.sum()), across_px, (float(strength[0]), float(strength[1]))))
+        regions.append(DifferenceRegion(part, float(weight.sum()), across_px, (float(strength[0]), float(strength[1]))))
         # A rectangle that overlaps this one would show the same again.
-        beside = np.abs(seen.middle_px - (part.left + width / 2, part.top + height / 2)) < (width, height)
-        worth[beside.all(axis=1)] = 0.0
-    return tuple(found)
+        overlapping = np.abs(seen.middle_px - (part.left + width / 2, part.top + height / 2)) < (width, height)
+        information[overlapping.all(axis=1)] = 0.0
+    return tuple(regions)
 
 
 def _best(
@@ -232,11 +236,11 @@ def _best(
 
 
 def _about_its_middle(
-    part: Rectangle, middle_px: NDArray[np.float64], worth: NDArray[np.float64], image_px: tuple[int, int]
+    part: Rectangle, middle_px: NDArray[np.float64], information: NDArray[np.float64], image_px: tuple[int, int]
 ) -> Rectangle:
     """`part`, moved so that its middle is the weighted mean of what it holds, as far as the image allows."""
     inside = _within(middle_px[:, 0], part.left, part.width) & _within(middle_px[:, 1], part.top, part.height)
-    u, v = worth[inside] @ middle_px[inside] / worth[inside].sum()
+    u, v = information[inside] @ middle_px[inside] / information[inside].sum()
     left = min(max(round(u - part.width / 2), 0), image_px[0] - part.width)
     top = min(max(round(v - part.height / 2), 0), image_px[1] - part.height)
     return Rectangle(left, top, part.width, part.height)

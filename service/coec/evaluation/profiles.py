@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.estimators import ESTIMATORS, Sight
+from coec.calibration.estimators import ESTIMATORS, WindowData
 from coec.calibration.objective.edges import EdgesAlone, build_edges
 from coec.calibration.objective.mutual_information import Objective
 from coec.calibration.types import Matrix4
@@ -22,7 +22,7 @@ CROWDING = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class ScanSpan:
     """Half-widths of a scan, radians and metres, and the number of values per axis (odd, so that the pose itself is
     among them)."""
 
@@ -31,14 +31,14 @@ class Span:
     points: int
 
 
-WIDE = Span(radians(25.0), 0.6, 121)
+WIDE = ScanSpan(radians(25.0), 0.6, 121)
 """What a search from the far end of the protocol (METHOD, section 2) has to cross."""
 
-NARROW = Span(radians(2.0), 0.1, 81)
+NARROW = ScanSpan(radians(2.0), 0.1, 81)
 """Shows the peaks: that of mutual information is degrees wide, that of the edges a fraction of a degree."""
 
 
-class Landscape(Protocol):
+class ScoreFunction(Protocol):
     """An objective that is maximised."""
 
     def score(self, T_camera_lidar: Matrix4) -> float:
@@ -80,7 +80,7 @@ class ObjectiveLandscape:
         return self.objective.evaluate(T_camera_lidar).score
 
 
-def landscapes(sight: Sight, config: CalibrationConfig) -> dict[str, Landscape]:
+def landscapes(window_data: WindowData, config: CalibrationConfig) -> dict[str, ScoreFunction]:
     """The objectives on a window, by name: the fused one, its two witnesses alone (`mi` is also the paper's objective),
     and the configured one if it is another.
 
@@ -88,14 +88,14 @@ def landscapes(sight: Sight, config: CalibrationConfig) -> dict[str, Landscape]:
         CalibrationError: the window has no edges or no depth.
     """
     kinds = dict.fromkeys(("fused", "mi", config.objective.kind))
-    found: dict[str, Landscape] = {
-        kind: ObjectiveLandscape(ESTIMATORS[kind](sight, config).objective) for kind in kinds
+    by_kind: dict[str, ScoreFunction] = {
+        kind: ObjectiveLandscape(ESTIMATORS[kind](window_data, config).objective) for kind in kinds
     }
-    edges = build_edges(sight.window.pairs, sight.points, sight.greys(), sight.window.rig)
-    return {**found, "edges": ObjectiveLandscape(EdgesAlone(edges.whole, edges.blur_rad))}
+    edges = build_edges(window_data.window.pairs, window_data.points, window_data.greys(), window_data.window.rig)
+    return {**by_kind, "edges": ObjectiveLandscape(EdgesAlone(edges.whole, edges.blur_rad))}
 
 
-def scan(landscape: Landscape, centre: Matrix4, axes: int, span: Span) -> tuple[Scan, ...]:
+def scan(landscape: ScoreFunction, centre: Matrix4, axes: int, span: ScanSpan) -> tuple[Scan, ...]:
     """One scan for each of the first `axes` axes through `centre` (4, 4)."""
     even = np.linspace(-1.0, 1.0, span.points)
     steps = np.sign(even) * np.abs(even) ** CROWDING
@@ -108,11 +108,11 @@ def scan(landscape: Landscape, centre: Matrix4, axes: int, span: Span) -> tuple[
 
 
 def views(
-    named: Mapping[str, Landscape], centre: Matrix4, axes: int, heard: Callable[[int, str], None]
+    named: Mapping[str, ScoreFunction], centre: Matrix4, axes: int, on_progress: Callable[[int, str], None]
 ) -> dict[str, Views]:
     """Wide and narrow scans of every landscape; `heard(done, name)` counts the landscapes."""
     seen = {}
     for done, (name, landscape) in enumerate(named.items(), start=1):
         seen[name] = Views(scan(landscape, centre, axes, WIDE), scan(landscape, centre, axes, NARROW))
-        heard(done, name)
+        on_progress(done, name)
     return seen

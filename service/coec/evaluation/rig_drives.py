@@ -14,9 +14,9 @@ from coec.calibration.monitor.sensors import PreparedSweep, prepare_sweep
 from coec.calibration.types import FramePair, LidarFrame
 from coec.errors import CoecError
 from coec.evaluation.check_drives import CHECK_PAIRS
-from coec.evaluation.knocked_drive import FIRST_SEED, LIDAR, KnockedDrive
+from coec.evaluation.knocked_drive import FIRST_SEED, LIDAR, DisplacedRigDrive
 from coec.evaluation.rig_drive_windows import urgent_windows
-from coec.evaluation.rig_looks import TURN_S, SeenPair, due, look_at
+from coec.evaluation.rig_looks import TURN_S, SeenPair, due, observe
 from coec.schemas.replies import Vector6
 from coec.schemas.rig import Mounts, RigDriveRow, RigLook
 from coec.simulation.journey import START_NS
@@ -26,7 +26,7 @@ Seen = Mapping[tuple[str, Mounts], SeenPair]
 """The pairs of an instant by camera, and by which of their sensors has moved."""
 
 
-def driven(drive: KnockedDrive) -> RigDriveRow:
+def driven(drive: DisplacedRigDrive) -> RigDriveRow:
     """All looks and urgent windows of a drive; an error becomes the row's `failure`.
 
     Raises:
@@ -36,15 +36,15 @@ def driven(drive: KnockedDrive) -> RigDriveRow:
     row = RigDriveRow(name=drive.name, seed=FIRST_SEED + drive.number, camera=drive.camera)
     try:
         seen = [_seen(drive, instant) for instant in stops]
-        looks = tuple(_looks(drive, seen))
+        checks = tuple(_checks(drive, seen))
         frames = {key: [of.frames for of in _of(seen, *key)] for key in _variants(drive)}
-        windows = tuple(urgent_windows(drive, frames, looks))
+        windows = tuple(urgent_windows(drive, frames, checks))
     except CoecError as error:
         return row.model_copy(update={"failure": f"{type(error).__name__}: {error}"})
-    return row.model_copy(update={"looks": looks, "windows": windows})
+    return row.model_copy(update={"looks": checks, "windows": windows})
 
 
-def _variants(drive: KnockedDrive) -> Iterator[tuple[str, Mounts]]:
+def _variants(drive: DisplacedRigDrive) -> Iterator[tuple[str, Mounts]]:
     """Each camera as built, with the LiDAR moved, and moved itself if it is one of those that may be knocked."""
     for camera in drive.right.cameras:
         yield from ((camera, mounts) for mounts in Mounts if mounts is not Mounts.CAMERA or camera in drive.cameras)
@@ -56,47 +56,47 @@ def _of(seen: Sequence[Seen], camera: str, mounts: Mounts) -> list[SeenPair]:
     return [pair for pair in pairs if pair is not None]
 
 
-def _looks(drive: KnockedDrive, seen: Sequence[Seen]) -> Iterator[RigLook]:
+def _checks(drive: DisplacedRigDrive, seen: Sequence[Seen]) -> Iterator[RigLook]:
     """In the order of their stamps."""
     for number in range(1, len(seen) + 1):
         for camera in due(number, drive.right.cameras):
-            yield from _looks_of(drive, camera, seen[max(number - CHECK_PAIRS, 0) : number])
+            yield from _checks_of(drive, camera, seen[max(number - CHECK_PAIRS, 0) : number])
 
 
-def _looks_of(drive: KnockedDrive, camera: str, latest: Sequence[Seen]) -> Iterator[RigLook]:
+def _checks_of(drive: DisplacedRigDrive, camera: str, latest: Sequence[Seen]) -> Iterator[RigLook]:
     """Looks at one pair: with all sensors as built, and with each sensor moved that has moved in its latest frames."""
     rig = drive.right.pair(camera, LIDAR).rig
     for mounts in Mounts:
         if (camera, mounts) not in latest[-1] and mounts is not Mounts.AS_BUILT:
             continue
-        told = look_at(rig, drive.served[rig.pair], _of(latest, camera, mounts))
+        observation = observe(rig, drive.served[rig.pair], _of(latest, camera, mounts))
         yield RigLook(
-            edge=rig.pair, mounts=mounts, pair_stamps_ns=told.pair_stamps_ns, offset=_six(told.offset),
-            sigma=_six(told.sigma), noise=_six(told.noise), place=_six(told.place), dispersion=told.dispersion,
-            distance2=told.distance2, flagged=told.flagged, weak=told.weak,
-            causes=tuple(cause.code for cause in told.causes),
+            edge=rig.pair, mounts=mounts, pair_stamps_ns=observation.pair_stamps_ns, offset=_six(observation.offset),
+            sigma=_six(observation.sigma), noise=_six(observation.noise), place=_six(observation.place), dispersion=observation.dispersion,
+            distance2=observation.distance2, flagged=observation.flagged, weak=observation.weak,
+            causes=tuple(cause.code for cause in observation.causes),
         )  # fmt: skip
 
 
-def _seen(drive: KnockedDrive, instant: Instant) -> dict[tuple[str, Mounts], SeenPair]:
+def _seen(drive: DisplacedRigDrive, instant: Instant) -> dict[tuple[str, Mounts], SeenPair]:
     """The pairs of an instant: one of every camera with all sensors as built, and after the knock also one for each
     knocked sensor in it."""
-    right, knocked = drive.right, drive.knocked
+    right, displaced = drive.right, drive.displaced
     motions = tuple(right.message(entry) for entry in instant.motions)
-    found: dict[tuple[str, Mounts], SeenPair] = {}
+    seen_pairs: dict[tuple[str, Mounts], SeenPair] = {}
     sweep = right.message(instant.sweep)
     assert isinstance(sweep, LidarFrame)
     of_sweep = prepare_sweep(sweep)
-    moved = knocked.message(instant.sweep) if _is_after(drive, instant.sweep.stamp_ns) else None
+    moved = displaced.message(instant.sweep) if _is_after(drive, instant.sweep.stamp_ns) else None
     of_moved = prepare_sweep(moved) if isinstance(moved, LidarFrame) else None
     for camera, entry in instant.pictures.items():
         picture = right.message(entry)
-        found |= _joined((camera, Mounts.AS_BUILT), pair_of(picture, sweep, motions), of_sweep)
+        seen_pairs |= _joined((camera, Mounts.AS_BUILT), pair_of(picture, sweep, motions), of_sweep)
         if moved is not None and of_moved is not None:
-            found |= _joined((camera, Mounts.LIDAR), pair_of(picture, moved, motions), of_moved)
+            seen_pairs |= _joined((camera, Mounts.LIDAR), pair_of(picture, moved, motions), of_moved)
         if camera in drive.cameras and _is_after(drive, entry.stamp_ns):
-            found |= _joined((camera, Mounts.CAMERA), pair_of(knocked.message(entry), sweep, motions), of_sweep)
-    return found
+            seen_pairs |= _joined((camera, Mounts.CAMERA), pair_of(displaced.message(entry), sweep, motions), of_sweep)
+    return seen_pairs
 
 
 def _joined(
@@ -105,7 +105,7 @@ def _joined(
     return {} if frames is None else {key: SeenPair(frames, sweep)}
 
 
-def _is_after(drive: KnockedDrive, stamp_ns: int) -> bool:
+def _is_after(drive: DisplacedRigDrive, stamp_ns: int) -> bool:
     return stamp_ns - START_NS >= drive.at_s * 1e9
 
 

@@ -25,9 +25,9 @@ from coec.calibration.commissioning.baseline import (
 )
 from coec.calibration.monitor.likelihood import WEAK_TIMES
 from coec.calibration.rig import lidar_looks
-from coec.calibration.rig.evidence import Look, information_of
+from coec.calibration.rig.evidence import EdgeObservation, information_of
 from coec.calibration.rig.steps import REACH
-from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
+from coec.calibration.rig.types import Edge, RigGraph, Sensor, SensorKind
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4, Uncertainty
 from coec.config import LidarEdgesConfig
@@ -86,7 +86,7 @@ do not report it."""
 CHECK_S = 4.0
 """Time from the first frame of a check to its last."""
 
-LIDAR_LOOK = np.array([*np.radians([0.037, 0.020, 0.015]), 0.0092, 0.0040, 0.0048])
+LIDAR_CHECK = np.array([*np.radians([0.037, 0.020, 0.015]), 0.0092, 0.0040, 0.0048])
 """(6,) standard deviation that a look at two LiDARs claims (rad, m): the median of 48 looks on six simulated streets
 (seeds 52000 to 52005), a roof LiDAR and one on each flank."""
 
@@ -96,7 +96,7 @@ counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DrawnRig:
+class SimulatedRig:
     """A rig as it is meant to be."""
 
     name: str
@@ -127,10 +127,10 @@ ROOF = {"roof": _lidar(0.0, 1.2, 0.0, 1.9)}
 SHORT = {"short_left": _lidar(60.0, 3.2, 0.9, 0.6), "short_right": _lidar(-60.0, 3.2, -0.9, 0.6)}
 
 
-def _rig(name: str, poses: Poses, pairs: Sequence[tuple[str, str]]) -> DrawnRig:
-    sensors = [Sensor(one, Kind.CAMERA if one in CAMERAS else Kind.LIDAR) for one in poses]
+def _rig(name: str, poses: Poses, pairs: Sequence[tuple[str, str]]) -> SimulatedRig:
+    sensors = [Sensor(one, SensorKind.CAMERA if one in CAMERAS else SensorKind.LIDAR) for one in poses]
     edges = [Edge(f"{a}-{b}", a, b, poses[a] @ se3.inverse(poses[b])) for a, b in pairs]
-    return DrawnRig(name, poses, RigGraph.of(sensors, edges))
+    return SimulatedRig(name, poses, RigGraph.of(sensors, edges))
 
 
 SINGLE = _rig("one camera, one LiDAR", {"front": CAMERAS["front"], **ROOF}, [("front", "roof")])
@@ -140,7 +140,7 @@ _OF_CAMERAS = [
     *((camera, "short_left") for camera in ("front", "left", "rear")),
     *((camera, "short_right") for camera in ("front", "right", "rear")),
 ]
-APART = _rig("four cameras, three LiDARs, none between these", {**CAMERAS, **ROOF, **SHORT}, _OF_CAMERAS)
+UNLINKED = _rig("four cameras, three LiDARs, none between these", {**CAMERAS, **ROOF, **SHORT}, _OF_CAMERAS)
 FULL = _rig(
     "four cameras, three LiDARs",
     {**CAMERAS, **ROOF, **SHORT},
@@ -195,26 +195,26 @@ class Happening:
         return still and bool(rng.random() < BLIND)
 
 
-Heard = tuple[float, Look]
+TimedEvidence = tuple[float, EdgeObservation]
 """The time at which a look becomes known, s, and the look."""
 
 
-def looks(rig: DrawnRig, drive: Happening, rng: np.random.Generator) -> list[Heard]:
+def simulate_checks(rig: SimulatedRig, drive: Happening, rng: np.random.Generator) -> list[TimedEvidence]:
     """All looks of a drive, in the order in which they become known."""
-    found: list[Heard] = []
+    evidence: list[TimedEvidence] = []
     biased = int(rng.integers(len(rig.graph.edges)))
     lidars_at_s = float(rng.uniform(0.0, LIDAR_PERIOD_S))
     for number, edge in enumerate(rig.graph.edges):
         if edge.name in rig.graph.of_lidars:
-            found += _lidar_looks(edge, drive, lidars_at_s, rng)
+            evidence += _lidar_checks(edge, drive, lidars_at_s, rng)
         else:
-            found += _checks(edge, drive, BIASED if number == biased else 1.0, rng)
-    return sorted(found, key=lambda one: (one[0], one[1].edge))
+            evidence += _checks(edge, drive, BIASED if number == biased else 1.0, rng)
+    return sorted(evidence, key=lambda one: (one[0], one[1].edge))
 
 
-def _checks(edge: Edge, drive: Happening, biased: float, rng: np.random.Generator) -> list[Heard]:
+def _checks(edge: Edge, drive: Happening, biased: float, rng: np.random.Generator) -> list[TimedEvidence]:
     """Checks of one pair of a camera and a LiDAR."""
-    found: list[Heard] = []
+    evidence: list[TimedEvidence] = []
     bias = UNCOMMISSIONED_BIAS * rng.normal(size=6) * biased
     blind = drive.is_blind(edge, rng)
     period_s = float(rng.choice(PERIODS_S))
@@ -237,31 +237,31 @@ def _checks(edge: Edge, drive: Happening, biased: float, rng: np.random.Generato
                 suspected_ns = None
             elif suspected_ns is None:
                 suspected_ns = round((at - CHECK_S) * NS_PER_S)
-            found.append((at + late_s, _look(edge, at, seen, scatter, faint, suspected_ns)))
+            evidence.append((at + late_s, _check_evidence(edge, at, seen, scatter, faint, suspected_ns)))
         if rng.random() < period_s / STREET_S:
             street, poor = STREET * rng.normal(size=6), _poor(rng)
         at += PERIODS_S[0] if flagged and not faint else period_s
-    return found
+    return evidence
 
 
-def _lidar_looks(edge: Edge, drive: Happening, at_s: float, rng: np.random.Generator) -> list[Heard]:
+def _lidar_checks(edge: Edge, drive: Happening, at_s: float, rng: np.random.Generator) -> list[TimedEvidence]:
     """Looks at two LiDARs, the first of them at `at_s`."""
-    found: list[Heard] = []
+    evidence: list[TimedEvidence] = []
     bias, street = lidar_looks.BIAS * rng.normal(size=6), lidar_looks.PLACE * rng.normal(size=6)
     blind = drive.is_blind(edge, rng)
     while at_s < drive.until_s:
-        sigma = _varied(LIDAR_LOOK, rng)
+        sigma = _varied(LIDAR_CHECK, rng)
         seen = drive.where(edge, at_s) + bias + street + _student(sigma, rng)
         if rng.random() < BAD:
             seen = REACH * rng.normal(size=6)
         if not blind and rng.random() >= MISSING:
             T_a_b = se3.perturb(edge.T_a_b, seen)
-            look = lidar_looks.look_of(edge.name, round(at_s * NS_PER_S), T_a_b, np.diag(sigma**2))
-            found.append((at_s + LIDAR_LATE_S, look))
+            check = lidar_looks.observation_of_registration(edge.name, round(at_s * NS_PER_S), T_a_b, np.diag(sigma**2))
+            evidence.append((at_s + LIDAR_LATE_S, check))
         if rng.random() < LIDAR_PERIOD_S / STREET_S:
             street = lidar_looks.PLACE * rng.normal(size=6)
         at_s += LIDAR_PERIOD_S
-    return found
+    return evidence
 
 
 def _student(sigma: Array, rng: np.random.Generator) -> Array:
@@ -279,8 +279,10 @@ def _poor(rng: np.random.Generator) -> float:
     return float(rng.uniform(1.0, POOREST)) if rng.random() < POOR else 1.0
 
 
-def _look(edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool, suspected_ns: int | None) -> Look:
-    return Look(
+def _check_evidence(
+    edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool, suspected_ns: int | None
+) -> EdgeObservation:
+    return EdgeObservation(
         edge=edge.name,
         stamp_ns=round(at_s * NS_PER_S),
         T_a_b=se3.perturb(edge.T_a_b, xi),
@@ -305,27 +307,27 @@ class Lasting:
     between: Mapping[str, Array]
 
     @classmethod
-    def of(cls, rig: DrawnRig, rng: np.random.Generator) -> Lasting:
+    def of(cls, rig: SimulatedRig, rng: np.random.Generator) -> Lasting:
         """Drawn."""
         lens = {name: rng.normal(size=2) for name in rig.poses}
         return cls(lens, {name: lidar_looks.BIAS * rng.normal(size=6) for name in sorted(rig.graph.of_lidars)})
 
 
 def windows(
-    rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator, off_by_rad: float = 0.0
+    rig: SimulatedRig, poses: Poses, lasting: Lasting, rng: np.random.Generator, off_by_rad: float = 0.0
 ) -> dict[str, Measurement]:
     """One window of each edge between a camera and a LiDAR, one look of each edge between LiDARs. The first is turned
     from its true pose by `off_by_rad`."""
-    found = {}
+    measurements = {}
     for number, edge in enumerate(rig.graph.edges):
         T_a_b = poses[edge.a] @ se3.inverse(poses[edge.b])
         if number == 0 and off_by_rad > 0.0:
             T_a_b = se3.perturb(T_a_b, np.concatenate([off_by_rad * random_direction(rng), np.zeros(3)]))
         if edge.name in rig.graph.of_lidars:
-            found[edge.name] = _look_as_window(T_a_b, lasting.between[edge.name], rng)
+            measurements[edge.name] = _lidar_check_as_window(T_a_b, lasting.between[edge.name], rng)
         else:
-            found[edge.name] = window_of(T_a_b, lasting.lens[edge.a], rng)
-    return found
+            measurements[edge.name] = window_of(T_a_b, lasting.lens[edge.a], rng)
+    return measurements
 
 
 def window_of(T_a_b: Matrix4, lens: Array, rng: np.random.Generator) -> Measurement:
@@ -341,8 +343,8 @@ def window_of(T_a_b: Matrix4, lens: Array, rng: np.random.Generator) -> Measurem
     return Measurement(se3.perturb(T_a_b, error), Uncertainty(noise, shared, float("nan")), 0)
 
 
-def _look_as_window(T_a_b: Matrix4, bias: Array, rng: np.random.Generator) -> Measurement:
+def _lidar_check_as_window(T_a_b: Matrix4, bias: Array, rng: np.random.Generator) -> Measurement:
     """A look at two LiDARs at the true pose (4, 4), in the form of a window."""
-    sigma = _varied(LIDAR_LOOK, rng)
+    sigma = _varied(LIDAR_CHECK, rng)
     error = bias + lidar_looks.PLACE * rng.normal(size=6) + _student(sigma, rng)
     return lidar_looks.window_of(0, se3.perturb(T_a_b, error), np.diag(sigma**2))

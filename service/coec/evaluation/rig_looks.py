@@ -9,14 +9,14 @@ from functools import cache
 
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.images.codec import CachedGreys, GreyImages
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import check_at, join, seen_part
 from coec.calibration.monitor.check_verdict import judge_check
 from coec.calibration.monitor.neighbourhood import REACH_RAD
 from coec.calibration.monitor.sensors import OUTLINE_RAD, PreparedSweep, prepare_images
 from coec.calibration.ports import DepthModel, Silence
-from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
+from coec.calibration.rig.types import Edge, RigGraph, Sensor, SensorKind
 from coec.calibration.types import FramePair, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig
 from coec.evaluation.check_drives import CHECK_PAIRS
@@ -55,7 +55,7 @@ class SeenPair:
     sweep: PreparedSweep
 
 
-def look_at(rig: Rig, pose: Matrix4, seen: Sequence[SeenPair]) -> Observation:
+def observe(rig: Rig, pose: Matrix4, seen: Sequence[SeenPair]) -> Observation:
     """A look at an uncommissioned pair that serves `pose` (4, 4); edges alone decide, so no depth is inferred.
 
     Raises:
@@ -64,17 +64,17 @@ def look_at(rig: Rig, pose: Matrix4, seen: Sequence[SeenPair]) -> Observation:
     pairs, sweeps = tuple(one.frames for one in seen), [one.sweep for one in seen]
     window = Window(f"{rig.pair}-{pairs[-1].stamp_ns}", rig, pose, pairs)
     images = CachedGreys(GreyImages(LimitsConfig()), len(pairs))
-    sight = sight_of(window, _no_depth(), images, CalibrationConfig(), Silence())
+    window_data = prepare_window_data(window, _no_depth(), images, CalibrationConfig(), Silence())
     part = seen_part(rig, sweeps, pose, OUTLINE_RAD)
     upright = rig.T_camera_lidar_nominal[:2, 2]
-    pictures = prepare_images(sight.greys(), len(pairs), rig.camera, rig.mask, upright, part, part)
-    evidence = join(sight, sweeps, pictures, REACH_RAD)
+    pictures = prepare_images(window_data.greys(), len(pairs), rig.camera, rig.mask, upright, part, part)
+    evidence = join(window_data, sweeps, pictures, REACH_RAD)
     return judge_check(evidence, check_at(evidence, pose), pose, None)
 
 
 def graph_of(drive: RigDrive, lidar: str) -> RigGraph:
     """All cameras of a drive with one of its LiDARs, at their nominal mounts; each edge is named after its pair."""
-    sensors = [Sensor(lidar, Kind.LIDAR), *(Sensor(camera, Kind.CAMERA) for camera in drive.cameras)]
+    sensors = [Sensor(lidar, SensorKind.LIDAR), *(Sensor(camera, SensorKind.CAMERA) for camera in drive.cameras)]
     T_ego_lidar = inverse(drive.T_sensor_ego_nominal(lidar))
     edges = [
         Edge(f"{camera}-{lidar}", camera, lidar, product(drive.T_sensor_ego_nominal(camera), T_ego_lidar))

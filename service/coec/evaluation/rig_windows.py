@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from coec.calibration.monitor.urgency import TRIES
-from coec.calibration.rig.evidence import of_window
+from coec.calibration.rig.evidence import observation_of_window
 from coec.calibration.rig.types import Edge
 from coec.config import MonitorConfig
-from coec.evaluation.rig_evidence import NS_PER_S, DrawnRig, Happening, Heard, Lasting, window_of
+from coec.evaluation.rig_evidence import NS_PER_S, Happening, Lasting, SimulatedRig, TimedEvidence, window_of
 from coec.geometry import se3
 
 SLICE_S = MonitorConfig().urgent_slice_s
@@ -30,25 +30,25 @@ ACCEPTED = 0.7
 and wrong lenses. None of them was wrong."""
 
 
-def hurried(
-    rig: DrawnRig, drive: Happening, looks: Sequence[Heard], lasting: Lasting, rng: np.random.Generator
-) -> list[Heard]:
+def urgent_evidence(
+    rig: SimulatedRig, drive: Happening, checks: Sequence[TimedEvidence], lasting: Lasting, rng: np.random.Generator
+) -> list[TimedEvidence]:
     """Results of accepted windows, in the order in which they become known; `looks` are those at all pairs."""
-    found: list[Heard] = []
+    evidence: list[TimedEvidence] = []
     for edge in rig.graph.edges:
         if edge.name not in rig.graph.of_lidars:
-            found += _of_pair(edge, drive, [one for one in looks if one[1].edge == edge.name], lasting, rng)
-    return sorted(found, key=lambda one: (one[0], one[1].edge))
+            evidence += _of_pair(edge, drive, [one for one in checks if one[1].edge == edge.name], lasting, rng)
+    return sorted(evidence, key=lambda one: (one[0], one[1].edge))
 
 
 def _of_pair(
-    edge: Edge, drive: Happening, looks: Sequence[Heard], lasting: Lasting, rng: np.random.Generator
-) -> list[Heard]:
+    edge: Edge, drive: Happening, checks: Sequence[TimedEvidence], lasting: Lasting, rng: np.random.Generator
+) -> list[TimedEvidence]:
     """Results for one pair: at most `TRIES` windows per suspicion, one after the other."""
-    found: list[Heard] = []
+    evidence: list[TimedEvidence] = []
     flagged, tries, known_s = 0, 0, -np.inf
-    for at_s, look in looks:
-        if look.stepped_ns is None:
+    for at_s, check in checks:
+        if check.stepped_ns is None:
             flagged = tries = 0
             continue
         flagged += 1
@@ -57,11 +57,11 @@ def _of_pair(
         tries += 1
         end_s = at_s + SLICE_S
         known_s = end_s + float(rng.uniform(*TAKES_S))
-        begun, ended = drive.where(edge, at_s), drive.where(edge, end_s)
+        offset_at_start, offset_at_end = drive.where(edge, at_s), drive.where(edge, end_s)
         # A window during which the mount moved is refused.
-        if rng.random() < ACCEPTED and np.array_equal(begun, ended):
-            measured = window_of(se3.perturb(edge.T_a_b, ended), lasting.lens[edge.a], rng)
-            told = of_window(edge.name, measured)
-            assert told is not None
-            found.append((known_s, replace(told, stamp_ns=round(at_s * NS_PER_S))))
-    return found
+        if rng.random() < ACCEPTED and np.array_equal(offset_at_start, offset_at_end):
+            measured = window_of(se3.perturb(edge.T_a_b, offset_at_end), lasting.lens[edge.a], rng)
+            window_evidence = observation_of_window(edge.name, measured)
+            assert window_evidence is not None
+            evidence.append((known_s, replace(window_evidence, stamp_ns=round(at_s * NS_PER_S))))
+    return evidence

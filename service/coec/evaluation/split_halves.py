@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.evaluation.statistics import Outcome
+from coec.evaluation.statistics import SolveOutcome
 from coec.geometry import se3
 
 SPLIT_SEED = 20_240_104
@@ -67,7 +67,7 @@ def split(available: int, trial: int) -> tuple[list[int], list[int]]:
     return sorted(order[:half]), sorted(order[half : 2 * half])
 
 
-def compare(outcomes: Sequence[tuple[Outcome, Outcome]], pairs: int, dof: int) -> Halves:
+def compare(outcomes: Sequence[tuple[SolveOutcome, SolveOutcome]], pairs: int, dof: int) -> Halves:
     """What the outcomes of both halves of every split say; `pairs` frames in each, `dof` axes searched."""
     estimates = [(a.trial.estimate, b.trial.estimate) for a, b in outcomes]
     both = [

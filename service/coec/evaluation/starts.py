@@ -25,7 +25,7 @@ SUBSET_SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
 
-def directions(count: int) -> NDArray[np.float64]:
+def sphere_directions(count: int) -> NDArray[np.float64]:
     """(count, 3) unit vectors, evenly spread: the Fibonacci sphere about the third axis, from +1 down to -1.
 
     Raises:
@@ -40,25 +40,25 @@ def directions(count: int) -> NDArray[np.float64]:
     return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), along])
 
 
-def partners(count: int) -> NDArray[np.int64]:
+def translation_partners(count: int) -> NDArray[np.int64]:
     """(count,) a permutation: j = (k·i + c) mod count, with c = ⌊count/2⌋ and k the number nearest to count / golden
     ratio (the smaller of two) that is coprime to count.
 
     So neighbouring rotations get translations from all over the sphere, and every direction is used once.
     """
-    wanted = count / GOLDEN_RATIO
+    ideal_step = count / GOLDEN_RATIO
     coprime = [k for k in range(1, max(count, 2)) if gcd(k, count) == 1]
-    step = min(coprime, key=lambda k: (abs(k - wanted), k))
+    step = min(coprime, key=lambda k: (abs(k - ideal_step), k))
     return (step * np.arange(count, dtype=np.int64) + count // 2) % count
 
 
 def perturbations(count: int, rotation_rad: float, translation_m: float) -> NDArray[np.float64]:
     """(count, 6) ξ: rotation vector R·d_i about the camera axes and translation T·d_j, where j is the partner of i."""
-    sphere = directions(count)
-    return np.hstack([rotation_rad * sphere, translation_m * sphere[partners(count)]])
+    sphere = sphere_directions(count)
+    return np.hstack([rotation_rad * sphere, translation_m * sphere[translation_partners(count)]])
 
 
-def starts(reference: Matrix4, count: int, rotation_rad: float, translation_m: float) -> list[Matrix4]:
+def start_poses(reference: Matrix4, count: int, rotation_rad: float, translation_m: float) -> list[Matrix4]:
     """The reference (4, 4) moved by every perturbation, on the left."""
     return [se3.perturb(reference, xi) for xi in perturbations(count, rotation_rad, translation_m)]
 
@@ -73,8 +73,8 @@ def frame_counts(available: int) -> list[int]:
     return sorted(counts)
 
 
-def subset(available: int, wanted: int, trial: int) -> list[int]:
+def frame_subset(available: int, size: int, trial: int) -> list[int]:
     """`wanted` of `available` indices, ascending, drawn without repetition. `wanted` and `trial` seed the draw, so that
     trials differ and evaluations repeat."""
-    drawn = np.random.default_rng([SUBSET_SEED, wanted, trial]).choice(available, size=wanted, replace=False)
-    return sorted(int(index) for index in drawn)
+    sampled = np.random.default_rng([SUBSET_SEED, size, trial]).choice(available, size=size, replace=False)
+    return sorted(int(index) for index in sampled)

@@ -36,7 +36,7 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SolveOutcome:
     """A trial against the reference.
 
     Attributes:
@@ -63,7 +63,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class SpreadStatistics:
     """Spread of a figure over the starts. `p95` interpolates linearly between the two nearest sorted values."""
 
     median: float
@@ -101,15 +101,15 @@ class Statistics:
 
     starts: int
     hits: int
-    rotation_rad: Spread
-    translation_m: Spread
+    rotation_rad: SpreadStatistics
+    translation_m: SpreadStatistics
     median: NDArray[np.float64]
     bias: NDArray[np.float64]
     std: NDArray[np.float64]
     rms: NDArray[np.float64]
     sigma: NDArray[np.float64]
-    solve_s: Spread
-    evaluations: Spread
+    solve_s: SpreadStatistics
+    evaluations: SpreadStatistics
     verdicts: Verdicts
     stop_reasons: dict[str, int]
 
@@ -125,7 +125,7 @@ class Statistics:
 
 
 @dataclass(frozen=True, slots=True)
-class FramesPoint:
+class FrameCountStatistics:
     """Errors over several subsets of one number of frames, hits and misses alike.
 
     `sigma_rad` is the standard deviation of the rotation that the solves claim (median; NaN where none does): the root
@@ -135,13 +135,13 @@ class FramesPoint:
     frames: int
     subsets: int
     hit_rate: float
-    rotation_rad: Spread
-    translation_m: Spread
+    rotation_rad: SpreadStatistics
+    translation_m: SpreadStatistics
     sigma_rad: float
 
 
 @dataclass(frozen=True, slots=True)
-class SlicePoint:
+class SliceStatistics:
     """Errors over several slices of one length in seconds, hits and misses alike; `frames` is the median per slice."""
 
     length_s: float
@@ -149,20 +149,20 @@ class SlicePoint:
     frames: float
     solves: int
     hit_rate: float
-    rotation_rad: Spread
-    translation_m: Spread
+    rotation_rad: SpreadStatistics
+    translation_m: SpreadStatistics
     sigma_rad: float
 
 
-def score(trial: Trial, reference: Matrix4, dof: int) -> Outcome:
+def score(trial: Trial, reference: Matrix4, dof: int) -> SolveOutcome:
     """The trial against the reference (4, 4); with 6 degrees of freedom a hit needs the translation too."""
     estimate = trial.estimate
-    ended = trial.start if estimate is None else estimate.optimum.T_camera_lidar
-    error = se3.difference(ended, reference)
+    end_pose = trial.start if estimate is None else estimate.optimum.T_camera_lidar
+    error = se3.difference(end_pose, reference)
     rotation_rad, translation_m = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
-    return Outcome(
+    return SolveOutcome(
         trial=trial,
-        T_camera_lidar=ended,
+        T_camera_lidar=end_pose,
         error=error,
         rotation_rad=rotation_rad,
         translation_m=translation_m,
@@ -171,7 +171,7 @@ def score(trial: Trial, reference: Matrix4, dof: int) -> Outcome:
     )
 
 
-def summarise(outcomes: Sequence[Outcome]) -> Statistics:
+def summarise(outcomes: Sequence[SolveOutcome]) -> Statistics:
     """The statistics of at least one outcome.
 
     Raises:
@@ -205,9 +205,9 @@ def summarise(outcomes: Sequence[Outcome]) -> Statistics:
     )
 
 
-def frames_point(frames: int, outcomes: Sequence[Outcome]) -> FramesPoint:
+def frames_point(frames: int, outcomes: Sequence[SolveOutcome]) -> FrameCountStatistics:
     """Figures of windows of `frames` frames, from at least one outcome."""
-    return FramesPoint(
+    return FrameCountStatistics(
         frames=frames,
         subsets=len(outcomes),
         hit_rate=sum(outcome.hit for outcome in outcomes) / len(outcomes),
@@ -217,10 +217,10 @@ def frames_point(frames: int, outcomes: Sequence[Outcome]) -> FramesPoint:
     )
 
 
-def slice_point(length_s: float, slices: Sequence[tuple[int, Sequence[Outcome]]]) -> SlicePoint:
+def slice_point(length_s: float, slices: Sequence[tuple[int, Sequence[SolveOutcome]]]) -> SliceStatistics:
     """Figures of slices of one length, each given as its frames and outcomes; at least one outcome in all."""
     outcomes = [outcome for _, of_slice in slices for outcome in of_slice]
-    return SlicePoint(
+    return SliceStatistics(
         length_s=length_s,
         slices=len(slices),
         frames=float(np.median([frames for frames, _ in slices])),
@@ -232,34 +232,34 @@ def slice_point(length_s: float, slices: Sequence[tuple[int, Sequence[Outcome]]]
     )
 
 
-def stop_reason(outcome: Outcome) -> str:
+def stop_reason(outcome: SolveOutcome) -> str:
     """Why the search of an outcome ended."""
     estimate = outcome.trial.estimate
     return NOT_SOLVED if estimate is None else estimate.optimum.stop_reason.value
 
 
-def spread(figures: Iterable[float]) -> Spread:
+def spread(figures: Iterable[float]) -> SpreadStatistics:
     """Median, 95th percentile and maximum; NaN of none."""
     values = np.fromiter(figures, dtype=np.float64)
     if not len(values):
-        return Spread(np.nan, np.nan, np.nan)
+        return SpreadStatistics(np.nan, np.nan, np.nan)
     median, p95, largest = np.quantile(values, [0.5, 0.95, 1.0])
-    return Spread(float(median), float(p95), float(largest))
+    return SpreadStatistics(float(median), float(p95), float(largest))
 
 
-def worst(outcomes: Sequence[Outcome]) -> int:
+def worst(outcomes: Sequence[SolveOutcome]) -> int:
     """Index of the outcome furthest from the reference, in units of the limits of a hit."""
     return max(range(len(outcomes)), key=lambda index: outcomes[index].excess)
 
 
-def _claimed(hits: Sequence[Outcome]) -> NDArray[np.float64]:
+def _claimed(hits: Sequence[SolveOutcome]) -> NDArray[np.float64]:
     """Median claim per axis, over the hits with a claim."""
     claims = np.array([hit.trial.estimate.sigma for hit in hits if hit.trial.estimate is not None]).reshape(-1, 6)
     known = [column[np.isfinite(column)] for column in claims.T]
     return np.array([np.median(column) if len(column) else np.nan for column in known])
 
 
-def _claimed_rotation_rad(outcomes: Sequence[Outcome]) -> float:
+def _claimed_rotation_rad(outcomes: Sequence[SolveOutcome]) -> float:
     """Median claimed standard deviation of the rotation, over the outcomes with a claim."""
     sigmas = [outcome.trial.estimate.sigma[:3] for outcome in outcomes if outcome.trial.estimate is not None]
     claims = [float(np.linalg.norm(sigma)) for sigma in sigmas if np.isfinite(sigma).all()]

@@ -38,7 +38,7 @@ SEED = 20_230_617
 
 
 @dataclass(frozen=True, slots=True)
-class Knock:
+class MountStep:
     """A movement of the mount within a window: a turn about a random axis (rad) and a shift in a random direction (m),
     either at once between two pairs or, if it creeps, evenly in time from the first pair to the last."""
 
@@ -53,22 +53,22 @@ class Knock:
         return self.turn_rad > 0.0 or self.shift_m > 0.0
 
 
-KNOCKS = (
-    Knock("none", 0.0),
-    Knock("0.3 deg", radians(0.3)),
-    Knock("0.5 deg", radians(0.5)),
-    Knock("1 deg", radians(1.0)),
-    Knock("2 deg", radians(2.0)),
-    Knock("3 deg", radians(3.0)),
-    Knock("6 deg", radians(6.0)),
-    Knock("5 cm", 0.0, 0.05),
-    Knock("10 cm", 0.0, 0.10),
-    Knock("1 deg, slowly", radians(1.0), creeps=True),
+MOUNT_STEPS = (
+    MountStep("none", 0.0),
+    MountStep("0.3 deg", radians(0.3)),
+    MountStep("0.5 deg", radians(0.5)),
+    MountStep("1 deg", radians(1.0)),
+    MountStep("2 deg", radians(2.0)),
+    MountStep("3 deg", radians(3.0)),
+    MountStep("6 deg", radians(6.0)),
+    MountStep("5 cm", 0.0, 0.05),
+    MountStep("10 cm", 0.0, 0.10),
+    MountStep("1 deg, slowly", radians(1.0), creeps=True),
 )
 
 
 @dataclass(frozen=True, slots=True)
-class TriedKnock:
+class MountStepTrial:
     """What the calibration said about one window.
 
     Attributes:
@@ -88,13 +88,13 @@ class TriedKnock:
     wrong: bool
     moved: bool
     off_s: float | None
-    told_s: float | None
+    interval_s: float | None
     holds: bool | None
     late: float
 
 
 @dataclass(frozen=True, slots=True)
-class KnockRow:
+class MountStepRow:
     """The windows with one knock: shares of them, and for a step the share whose time is known. Over the windows with a
     reported time: the medians of its error, s, and of the reported interval's length, s, and the share of intervals
     that hold the knock."""
@@ -110,15 +110,15 @@ class KnockRow:
     holds: float | None
 
 
-def try_knocks(
+def try_mount_steps(
     window: Window,
     depth: DepthModel,
     images: ImageReader,
     config: CalibrationConfig,
     trials: int,
-    knocks: Sequence[Knock],
-    heard: Callable[[int], None],
-) -> list[TriedKnock]:
+    knocks: Sequence[MountStep],
+    on_progress: Callable[[int], None],
+) -> list[MountStepTrial]:
     """Solves `window`, whose start must be the true pose, `trials` times with every knock (seeded) and once without
     one; `heard(done)` counts the solves.
 
@@ -131,89 +131,89 @@ def try_knocks(
     still = replace(window, pairs=pairs, between=between, start_known_to_rad=MOUNT_RAD)
     config = config.model_copy(update={"motion_compensation": False})
     # Each recording has knocks of its own, so that many recordings show many knocks.
-    drawn_for = zlib.crc32(window.pairs[0].camera.image.data)
-    tried: list[TriedKnock] = []
+    recording_hash = zlib.crc32(window.pairs[0].camera.image.data)
+    tried: list[MountStepTrial] = []
     for number, knock in enumerate(knocks):
         # Without a knock every trial is the same.
         for trial in range(trials if knock.moves else 1):
-            rng = np.random.default_rng([SEED, number, trial, drawn_for])
+            rng = np.random.default_rng([SEED, number, trial, recording_hash])
             tried.append(_try(knock, still, depth, images, config, rng))
-            heard(len(tried))
+            on_progress(len(tried))
     return tried
 
 
-def table(tried: Sequence[TriedKnock]) -> tuple[KnockRow, ...]:
+def table(tried: Sequence[MountStepTrial]) -> tuple[MountStepRow, ...]:
     """The shares by knock, in the order of their first trials."""
     rows = []
     for name in dict.fromkeys(one.name for one in tried):
         of = [one for one in tried if one.name == name]
         known = [one.off_s is not None and one.off_s <= KNOWN_TO_S for one in of]
-        has_time = not any(knock.name == name and (knock.creeps or not knock.moves) for knock in KNOCKS)
-        told = [one for one in of if one.off_s is not None]
+        has_time = not any(knock.name == name and (knock.creeps or not knock.moves) for knock in MOUNT_STEPS)
+        timed = [one for one in of if one.off_s is not None]
         rows.append(
-            KnockRow(
+            MountStepRow(
                 name,
                 len(of),
                 sum(one.accepted for one in of) / len(of),
                 sum(one.wrong for one in of) / len(of),
                 sum(one.moved for one in of) / len(of),
                 sum(known) / len(of) if has_time else None,
-                _median([one.off_s for one in told]),
-                _median([one.told_s for one in told]),
-                sum(bool(one.holds) for one in told) / len(told) if told else None,
+                _median([one.off_s for one in timed]),
+                _median([one.interval_s for one in timed]),
+                sum(bool(one.holds) for one in timed) / len(timed) if timed else None,
             )
         )
     return tuple(rows)
 
 
 def _try(
-    knock: Knock,
+    knock: MountStep,
     still: Window,
     depth: DepthModel,
     images: ImageReader,
     config: CalibrationConfig,
     rng: np.random.Generator,
-) -> TriedKnock:
+) -> MountStepTrial:
     count, start = len(still.pairs), still.T_camera_lidar_start
     first_late = int(rng.integers(1, count))
     xi = np.concatenate([knock.turn_rad * random_direction(rng), knock.shift_m * random_direction(rng)])
     at_ns = int(rng.integers(still.pairs[first_late - 1].stamp_ns, still.pairs[first_late].stamp_ns))
     begin_ns, length_ns = still.pairs[0].stamp_ns, still.stamp_ns - still.pairs[0].stamp_ns
 
-    def knocked(pairs: Sequence[FramePair]) -> tuple[FramePair, ...]:
+    def displaced(pairs: Sequence[FramePair]) -> tuple[FramePair, ...]:
         if knock.creeps:
             return tuple(_moved(pair, start, xi * ((pair.stamp_ns - begin_ns) / length_ns)) for pair in pairs)
         return tuple(_moved(pair, start, xi * (pair.stamp_ns > at_ns)) for pair in pairs)
 
-    moved = replace(still, pairs=knocked(still.pairs), between=knocked(still.between))
+    moved = replace(still, pairs=displaced(still.pairs), between=displaced(still.between))
     late = 1 - first_late / count
     try:
         estimate = calibrate(moved, depth, images, config, Silence())
     except CalibrationError:
-        return TriedKnock(
-            knock.name, accepted=False, wrong=False, moved=False, off_s=None, told_s=None, holds=None, late=late
+        return MountStepTrial(
+            knock.name, accepted=False, wrong=False, moved=False, off_s=None, interval_s=None, holds=None, late=late
         )
     accepted = estimate.verdict.decision is Decision.ACCEPTED
-    off_s = told_s = holds = None
-    if (told := estimate.moved) is not None and knock.moves and not knock.creeps:
-        off_s = abs((told.last_before_ns + told.first_after_ns) // 2 - at_ns) / NS_PER_S
-        told_s = (told.first_after_ns - told.last_before_ns) / NS_PER_S
-        holds = told.last_before_ns <= at_ns < told.first_after_ns
-    return TriedKnock(
+    off_s = interval_s = holds = None
+    if (motion := estimate.moved) is not None and knock.moves and not knock.creeps:
+        off_s = abs((motion.last_before_ns + motion.first_after_ns) // 2 - at_ns) / NS_PER_S
+        interval_s = (motion.first_after_ns - motion.last_before_ns) / NS_PER_S
+        holds = motion.last_before_ns <= at_ns < motion.first_after_ns
+    return MountStepTrial(
         knock.name,
         accepted,
         accepted and _is_wrong(estimate, se3.perturb(start, xi)),
         any(reason.code == MOVED for reason in estimate.verdict.reasons),
         off_s,
-        told_s,
+        interval_s,
         holds,
         late,
     )
 
 
-def _median(told: Sequence[float | None]) -> float | None:
+def _median(values: Sequence[float | None]) -> float | None:
     """Median of what was reported; None if nothing was."""
-    return float(np.median([one for one in told if one is not None])) if told else None
+    return float(np.median([one for one in values if one is not None])) if values else None
 
 
 def _compensated(pairs: Sequence[FramePair], window: Window, config: CalibrationConfig) -> tuple[FramePair, ...]:

@@ -9,17 +9,17 @@ from pathlib import Path
 
 from coec.fleet.engines.engine import Engine
 from coec.fleet.places import Job
-from coec.fleet.results import Results
-from coec.fleet.terms import Terms
+from coec.fleet.results import BatchFolder
+from coec.fleet.terms import ReplaySettings
 from coec.schemas.fleet import BatchReport, WindowRow
 
 
 def run(
     jobs: Sequence[Job],
-    terms: Terms,
+    settings: ReplaySettings,
     engine: Engine,
     folder: Path,
-    told: Callable[[WindowRow], object],
+    on_row: Callable[[WindowRow], object],
     *,
     resume: bool,
 ) -> BatchReport:
@@ -37,20 +37,20 @@ def run(
         UsageError, OutputError, SourceError: the folder cannot be used; see `Results`.
         FleetError: the engine failed, or windows could not be judged for a common cause. Finished rows are kept.
     """
-    results = Results(folder, terms, resume=resume)
-    known = results.urls
-    left = [job for job in jobs if job.url not in known]
+    results = BatchFolder(folder, settings, resume=resume)
+    evaluated_urls = results.urls
+    remaining = [job for job in jobs if job.url not in evaluated_urls]
     tally = _Tally()
-    began_s = time.monotonic()
+    started_s = time.monotonic()
     try:
-        for row in engine.rows(left, terms):
+        for row in engine.rows(remaining, settings):
             results.add(row)
             tally.add(row)
-            told(row)
+            on_row(row)
     finally:  # so that an interrupted batch has its tables, too
         results.finish()
-    elapsed_s = time.monotonic() - began_s
-    return tally.report(folder, len(jobs), len(jobs) - len(left), elapsed_s, engine.cores)
+    elapsed_s = time.monotonic() - started_s
+    return tally.report(folder, len(jobs), len(jobs) - len(remaining), elapsed_s, engine.cores)
 
 
 class _Tally:
@@ -74,13 +74,13 @@ class _Tally:
             self._compared += row.recorded is not None
             self._differing += row.recorded not in (None, row.decided)
 
-    def report(self, folder: Path, windows: int, kept: int, elapsed_s: float, cores: int) -> BatchReport:
+    def report(self, folder: Path, windows: int, evaluated_before: int, elapsed_s: float, cores: int) -> BatchReport:
         """The report of this run."""
-        judged = windows > kept and elapsed_s > 0.0
+        has_run = windows > evaluated_before and elapsed_s > 0.0
         return BatchReport(
             output=str(folder),
             windows=windows,
-            kept=kept,
+            kept=evaluated_before,
             accepted=self._accepted,
             refused=self._refused,
             errors=dict(sorted(self._errors.items())),
@@ -88,5 +88,5 @@ class _Tally:
             differing=self._differing,
             elapsed_s=elapsed_s,
             cpu_s=self._cpu_s,
-            share_of_ideal=self._seconds / (cores * elapsed_s) if judged else None,
+            share_of_ideal=self._seconds / (cores * elapsed_s) if has_run else None,
         )

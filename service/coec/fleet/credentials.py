@@ -114,7 +114,7 @@ class StoreCredentials:
             values.update({name: environment.get(name) or None for name in group.names})
             path = values.pop(GOOGLE, None)
             if path is not None:
-                google = _content(Path(path))
+                google = _credential_file(Path(path))
         return cls(values, google)
 
     def install(self) -> None:
@@ -131,7 +131,7 @@ class StoreCredentials:
             os.environ[GOOGLE] = f"/proc/self/fd/{descriptor}"
 
 
-def _content(path: Path) -> bytes:
+def _credential_file(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             content = file.read(MAX_FILE_BYTES + 1)

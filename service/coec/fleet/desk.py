@@ -16,9 +16,9 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import DepthModel, Silence
 from coec.config import DepthConfig, LimitsConfig
 from coec.errors import CoecError, SourceError
-from coec.fleet.places import Job, fetched, sha256_of
-from coec.fleet.terms import Terms
-from coec.fleet.trouble import begun, failed
+from coec.fleet.places import Job, fetched_window, sha256_of
+from coec.fleet.terms import ReplaySettings
+from coec.fleet.trouble import empty_row, failed_row
 from coec.reports import provenance
 from coec.schemas.base import to_json
 from coec.schemas.fleet import WindowRow
@@ -26,16 +26,16 @@ from coec.schemas.replies import CalibrationResult
 
 _log = logging.getLogger(__name__)
 
-NETWORKS_KEPT = 4
+MAX_OPEN_NETWORKS = 4
 """How many networks are open at a time. A fleet has one or two, and each takes a hundred megabytes."""
 
 
-class Desk:
+class WindowEvaluator:
     """Judges windows on the same terms. `row` may be called on several threads, so that one fetches a window while
     another's is solved."""
 
-    def __init__(self, terms: Terms) -> None:
-        self._terms = terms
+    def __init__(self, settings: ReplaySettings) -> None:
+        self._settings = settings
         self._solving = threading.Lock()
         self._limits = LimitsConfig()
         self._images = GreyImages(self._limits)
@@ -44,32 +44,32 @@ class Desk:
 
     def row(self, job: Job) -> WindowRow:
         """The row of a window. If anything is wrong with the window, the row says so."""
-        row = begun(job, self._versions)
+        row = empty_row(job, self._versions)
         try:
-            with fetched(job.url) as path:
+            with fetched_window(job.url) as path:
                 sha256 = sha256_of(path)
                 row = row.model_copy(update={"sha256": sha256, "bytes": path.stat().st_size})
                 if job.sha256 not in (None, sha256):
                     raise SourceError(f"{job.url} has the sha256 {sha256}, but {job.sha256} is stated beside it")
                 with self._solving:
-                    began_s, began_cpu_s = time.monotonic(), time.process_time()
+                    started_s, started_cpu_s = time.monotonic(), time.process_time()
                     try:
-                        update = self._judged(path)
+                        update = self._evaluate(path)
                     finally:
-                        took_s, cpu_s = time.monotonic() - began_s, time.process_time() - began_cpu_s
+                        took_s, cpu_s = time.monotonic() - started_s, time.process_time() - started_cpu_s
                         row = row.model_copy(update={"seconds": took_s, "cpu_s": cpu_s})
         except CoecError as error:
-            return failed(row, error.reply_code, str(error))
+            return failed_row(row, error.reply_code, str(error))
         except Exception as error:  # a fault of coec; the other windows are judged all the same
             _log.exception("a window could not be judged", extra={"fields": {"url": job.url}})
-            return failed(row, CoecError.reply_code, f"{type(error).__name__}: {error}")
+            return failed_row(row, CoecError.reply_code, f"{type(error).__name__}: {error}")
         return row.model_copy(update=update)
 
-    def _judged(self, path: Path) -> dict[str, object]:
+    def _evaluate(self, path: Path) -> dict[str, object]:
         recorded = read_result(path)
         vehicle = read_vehicle(path) if recorded is None else recorded.vehicle
-        window, configuration = self._terms.applied(*read_window(path))
-        network = self._network(self._terms.network(configuration.depth))
+        window, configuration = self._settings.apply(*read_window(path))
+        network = self._network(self._settings.network(configuration.depth))
         result = result_of(calibrate(window, network, self._images, configuration, Silence()), window.rig, vehicle)
         if recorded is not None:
             result = comparable(result, recorded)
@@ -84,7 +84,7 @@ class Desk:
         # The process has one core, so more threads would only wait for each other. The depth does not depend on it.
         config = config.model_copy(update={"threads": 1})
         if config not in self._networks:
-            while len(self._networks) >= NETWORKS_KEPT:
+            while len(self._networks) >= MAX_OPEN_NETWORKS:
                 self._networks.pop(next(iter(self._networks)))
             self._networks[config] = open_depth(config, self._limits)
         return self._networks[config]

@@ -8,7 +8,7 @@ from typing import Any
 from coec.errors import SourceError
 
 
-def library(name: str) -> Any:
+def optional_library(name: str) -> Any:
     """A module of the extra.
 
     Raises:

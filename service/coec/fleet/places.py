@@ -85,15 +85,15 @@ def jobs_of(patterns: Sequence[str]) -> list[Job]:
         UsageError: a pattern names no window.
         SourceError: a store cannot be asked, or the hashes beside windows cannot be read.
     """
-    found: set[str] = set()
+    matches: set[str] = set()
     for pattern in patterns:
-        spread = _DEEP.sub(r"\1**/*\2", pattern)
-        urls = _remote(spread) if _scheme(spread) else _local(spread)
+        expanded = _DEEP.sub(r"\1**/*\2", pattern)
+        urls = _matching_objects(expanded) if _scheme(expanded) else _matching_files(expanded)
         if not urls:
             raise UsageError(f"{pattern} names no window ({SUFFIX})")
-        found.update(urls)
-    urls = sorted(found)
-    sums = {folder: _sums(folder) for folder in sorted({_folder(url) for url in urls})}
+        matches.update(urls)
+    urls = sorted(matches)
+    sums = {folder: _checksums(folder) for folder in sorted({_folder(url) for url in urls})}
     return [Job(url, sums[_folder(url)].get(_name(url))) for url in urls]
 
 
@@ -108,7 +108,7 @@ def is_path(url: str) -> bool:
 
 
 @contextmanager
-def fetched(url: str) -> Iterator[Path]:
+def fetched_window(url: str) -> Iterator[Path]:
     """A window as a file on this machine, for the duration of the block.
 
     Raises:
@@ -119,9 +119,9 @@ def fetched(url: str) -> Iterator[Path]:
         return
     with TemporaryDirectory(prefix="coec-batch-") as folder:
         path = Path(folder) / _name(url)
-        with _asking(url):
-            store, place = _store(url)
-            with store.open(place, "rb") as source, path.open("wb") as target:
+        with _translated_store_errors(url):
+            store, object_path = _store(url)
+            with store.open(object_path, "rb") as source, path.open("wb") as target:
                 shutil.copyfileobj(source, target, 2**20)
         yield path
 
@@ -139,42 +139,42 @@ def sha256_of(path: Path) -> str:
         raise SourceError(f"cannot read {path}: {error.strerror}") from error
 
 
-def _local(pattern: str) -> list[str]:
+def _matching_files(pattern: str) -> list[str]:
     path = Path(pattern)
     if path.is_dir():
-        found = path.rglob(f"*{SUFFIX}")
+        matches = path.rglob(f"*{SUFFIX}")
     elif not _is_pattern(pattern):
         return [pattern]  # if the file is absent, its row gets the error, as for a store
     else:
         fixed = next(index for index, part in enumerate(path.parts) if _is_pattern(part))
-        found = Path(*path.parts[:fixed]).glob(str(Path(*path.parts[fixed:])))
-    return [str(path) for path in found if path.suffix == SUFFIX and path.is_file()]
+        matches = Path(*path.parts[:fixed]).glob(str(Path(*path.parts[fixed:])))
+    return [str(path) for path in matches if path.suffix == SUFFIX and path.is_file()]
 
 
 def _is_pattern(text: str) -> bool:
     return any(sign in text for sign in "*?[")
 
 
-def _remote(pattern: str) -> list[str]:
-    with _asking(pattern):
-        store, place = _store(pattern)
-        if not _is_pattern(place):
-            if not store.isdir(place):
+def _matching_objects(pattern: str) -> list[str]:
+    with _translated_store_errors(pattern):
+        store, object_path = _store(pattern)
+        if not _is_pattern(object_path):
+            if not store.isdir(object_path):
                 return [pattern]
-            place = f"{place.rstrip('/')}/**"
-        return [store.unstrip_protocol(path) for path in store.glob(place) if path.endswith(SUFFIX)]
+            object_path = f"{object_path.rstrip('/')}/**"
+        return [store.unstrip_protocol(path) for path in store.glob(object_path) if path.endswith(SUFFIX)]
 
 
-def _sums(folder: str) -> dict[str, str]:
+def _checksums(folder: str) -> dict[str, str]:
     """Hashes that a folder's `SHA256SUMS` states, by name; empty if there is no such file."""
     url = f"{folder}{SUMS}"
     try:
         if _scheme(url):
-            with _asking(url):
-                store, place = _store(url)
-                if not store.exists(place):
+            with _translated_store_errors(url):
+                store, object_path = _store(url)
+                if not store.exists(object_path):
                     return {}
-                text = store.cat_file(place, 0, MAX_SUMS_BYTES)
+                text = store.cat_file(object_path, 0, MAX_SUMS_BYTES)
         else:
             with Path(url).open("rb") as stream:
                 text = stream.read(MAX_SUMS_BYTES)
@@ -182,8 +182,8 @@ def _sums(folder: str) -> dict[str, str]:
         return {}
     except OSError as error:
         raise SourceError(f"cannot read {url}: {error.strerror}") from error
-    lines = (_SUM.fullmatch(line) for line in text.decode(errors="replace").splitlines())
-    return {line[2].removeprefix("./"): line[1].lower() for line in lines if line}
+    entries = (_SUM.fullmatch(line) for line in text.decode(errors="replace").splitlines())
+    return {line[2].removeprefix("./"): line[1].lower() for line in entries if line}
 
 
 def _scheme(url: str) -> str:
@@ -208,18 +208,18 @@ def _store(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise StoreError(f"{url}: URLs need the optional extra `fleet`: pip install 'coec[fleet]'") from error
     try:
-        store, place = fsspec.core.url_to_fs(url)
+        store, object_path = fsspec.core.url_to_fs(url)
     except ImportError as error:
         extra = EXTRAS.get(_scheme(url))
         hint = "" if extra is None else f": pip install 'coec[{extra}]'"
         raise StoreError(f"{url}: the package that reads {_scheme(url)}:// is not installed{hint}") from error
     except ValueError as error:
         raise UsageError(f"{url}: {error}") from error
-    return store, place
+    return store, object_path
 
 
 @contextmanager
-def _asking(url: str) -> Iterator[None]:
+def _translated_store_errors(url: str) -> Iterator[None]:
     """Turns whatever a store's library raises into a `SourceError`, because these libraries share no error class. A
     failure that concerns the whole store becomes a `StoreError`."""
     try:

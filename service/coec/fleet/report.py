@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from coec.fleet.alarms import false_alarms
-from coec.fleet.questions import WINDOWS, ask, view
+from coec.fleet.questions import WINDOWS_VIEW, connect, create_view
 from coec.fleet.tables import NAMELESS
 from coec.schemas.fleet import (
     AXES,
@@ -24,33 +24,35 @@ from coec.schemas.fleet import (
 from coec.schemas.fleet_now import FleetNow
 from coec.schemas.replies import Maybe6
 
-READ, BEFORE = "read", "before"
+REPORT_TABLE, EARLIER_VIEW = "read", "before"
 """Names of the table with the columns that a report needs, and of the view of the batch to compare with."""
 
-ENDS = 5
+WINDOWS_AT_END = 5
 """How many accepted windows at each end give, by their median, where a pair began and where it is now. A single outlier
 moves neither."""
 
 MONTH_S = 30 * 86_400.0
 
-LISTED = 50
+MAX_CHANGED_WINDOWS = 50
 """How many windows with a different decision are listed."""
 
 NS_PER_S = 1e9
 
-_TOLD = ", ".join(f"CASE WHEN observed[{index}] THEN {axis} END AS {axis}" for index, axis in enumerate(AXES, 1))
+_OBSERVED_CORRECTIONS = ", ".join(
+    f"CASE WHEN observed[{index}] THEN {axis} END AS {axis}" for index, axis in enumerate(AXES, 1)
+)
 """The corrections; null for axes that a window does not observe."""
 
-_READ = (
+_REPORT_COLUMNS = (
     "vehicle, pair, date, stamp_ns, window_id, url, sha256, accepted, observed, reason_codes, error_code, decision,"
     f" figures, {', '.join(AXES)}"
 )
 """Columns that a report needs. They are copied into a table, so that each of thousands of files is opened only once."""
 
-_ACCEPTED = f"(SELECT vehicle, pair, date, stamp_ns, {_TOLD} FROM {READ} WHERE accepted)"
+_ACCEPTED = f"(SELECT vehicle, pair, date, stamp_ns, {_OBSERVED_CORRECTIONS} FROM {REPORT_TABLE} WHERE accepted)"
 
 
-def report(folder: Path, against: Path | None, now: FleetNow | None = None) -> FleetReport:
+def report(folder: Path, against: Path | None, fleet_now: FleetNow | None = None) -> FleetReport:
     """The report from the tables in a folder. `against`: folder of an earlier batch over the same windows. `now`: the
     last words of the vehicles, for their alarms.
 
@@ -58,10 +60,10 @@ def report(folder: Path, against: Path | None, now: FleetNow | None = None) -> F
         UsageError: there are no tables.
         SourceError: the optional extra is not installed.
     """
-    connection = ask(folder)
-    connection.execute(f"CREATE TEMP TABLE {READ} AS SELECT {_READ} FROM {WINDOWS}")
+    connection = connect(folder)
+    connection.execute(f"CREATE TEMP TABLE {REPORT_TABLE} AS SELECT {_REPORT_COLUMNS} FROM {WINDOWS_VIEW}")
     windows, accepted, first_ns, last_ns = connection.execute(
-        f"SELECT count(*), count(*) FILTER (accepted), min(stamp_ns), max(stamp_ns) FROM {READ}"
+        f"SELECT count(*), count(*) FILTER (accepted), min(stamp_ns), max(stamp_ns) FROM {REPORT_TABLE}"
     ).fetchone()
     pairs = _pairs(connection)
     return FleetReport(
@@ -69,13 +71,13 @@ def report(folder: Path, against: Path | None, now: FleetNow | None = None) -> F
         pairs=pairs,
         windows=windows,
         accepted=accepted,
-        refusals=_counts(connection, f"SELECT unnest(reason_codes) AS code FROM {READ} WHERE NOT accepted"),
-        errors=_counts(connection, f"SELECT error_code AS code FROM {READ} WHERE error_code IS NOT NULL"),
+        refusals=_counts(connection, f"SELECT unnest(reason_codes) AS code FROM {REPORT_TABLE} WHERE NOT accepted"),
+        errors=_counts(connection, f"SELECT error_code AS code FROM {REPORT_TABLE} WHERE error_code IS NOT NULL"),
         first_ns=first_ns,
         last_ns=last_ns,
         figures=_figures(connection),
         changes=None if against is None else _changes(connection, against),
-        false_alarms=None if now is None else false_alarms(pair.word for pair in now.pairs),
+        false_alarms=None if fleet_now is None else false_alarms(pair.word for pair in fleet_now.pairs),
     )
 
 
@@ -88,7 +90,7 @@ def _pairs(connection: Any) -> tuple[PairOfFleet, ...]:
     ends = _ends(connection)
     counted = connection.execute(
         f"SELECT vehicle, pair, count(*), count(*) FILTER (accepted), count(*) FILTER (error_code IS NOT NULL),"
-        f" max(stamp_ns) FROM {READ} GROUP BY ALL"
+        f" max(stamp_ns) FROM {REPORT_TABLE} GROUP BY ALL"
     ).fetchall()
     made = []
     for vehicle, pair, windows, accepted, errors, last_ns in counted:
@@ -125,7 +127,7 @@ def _six(values: Sequence[float | None]) -> Maybe6:
 def _ends(connection: Any) -> dict[tuple[str, str], tuple[Maybe6, Maybe6, Maybe6]]:
     """By vehicle and pair: medians of the first and of the last accepted windows, and the slope over all, per month."""
     medians = ", ".join(
-        f"median({axis}) FILTER (up <= {ENDS}), median({axis}) FILTER (down <= {ENDS}),"
+        f"median({axis}) FILTER (up <= {WINDOWS_AT_END}), median({axis}) FILTER (down <= {WINDOWS_AT_END}),"
         f" regr_slope({axis}, stamp_ns / {NS_PER_S}) * {MONTH_S}"
         for axis in AXES
     )
@@ -163,7 +165,7 @@ def _days(connection: Any) -> dict[tuple[str, str], list[DayOfPair]]:
 def _figures(connection: Any) -> tuple[FigureOfFleet, ...]:
     rows = connection.execute(
         "SELECT figure.key, pair, count(DISTINCT vehicle), count(*), quantile_cont(figure.value, [0.005, 0.5, 0.995])"
-        f" FROM (SELECT vehicle, pair, unnest(map_entries(figures)) AS figure FROM {READ} WHERE accepted)"
+        f" FROM (SELECT vehicle, pair, unnest(map_entries(figures)) AS figure FROM {REPORT_TABLE} WHERE accepted)"
         " WHERE figure.value IS NOT NULL GROUP BY ALL ORDER BY ALL"
     ).fetchall()
     return tuple(
@@ -174,13 +176,13 @@ def _figures(connection: Any) -> tuple[FigureOfFleet, ...]:
     )
 
 
-def _once(name: str) -> str:
+def _unique_windows(name: str) -> str:
     """The windows of a view; of several copies only the one with the first URL."""
     return f"(SELECT * FROM {name} QUALIFY row_number() OVER (PARTITION BY sha256 ORDER BY url) = 1)"
 
 
 def _changes(connection: Any, against: Path) -> FleetChanges:
-    view(connection, BEFORE, against)
+    create_view(connection, EARLIER_VIEW, against)
     rotation = "greatest(" + ", ".join(f"abs(now.{axis} - was.{axis})" for axis in AXES[:3]) + ")"
     translation = "greatest(" + ", ".join(f"abs(now.{axis} - was.{axis})" for axis in AXES[3:]) + ")"
     connection.execute(
@@ -191,7 +193,7 @@ def _changes(connection: Any, against: Path) -> FleetChanges:
         " coalesce(was.error_code, array_to_string(was.reason_codes, ', ')) AS was_why,"
         " coalesce(now.error_code, array_to_string(now.reason_codes, ', ')) AS now_why,"
         f" {rotation} AS rotation, {translation} AS translation"
-        f" FROM {_once(READ)} AS now JOIN {_once(BEFORE)} AS was USING (sha256)"
+        f" FROM {_unique_windows(REPORT_TABLE)} AS now JOIN {_unique_windows(EARLIER_VIEW)} AS was USING (sha256)"
     )
     both, identical, gained, lost, failing, rotation_deg, translation_m = connection.execute(
         "SELECT count(*), count(*) FILTER (same), count(*) FILTER (now_accepted AND NOT was_accepted),"
@@ -202,7 +204,7 @@ def _changes(connection: Any, against: Path) -> FleetChanges:
     rows = connection.execute(
         "SELECT vehicle, window_id, was_accepted, was_why, now_accepted, now_why, rotation, translation FROM changed"
         " WHERE was_accepted <> now_accepted OR failing"
-        f" ORDER BY rotation DESC NULLS LAST, vehicle, window_id LIMIT {LISTED}"
+        f" ORDER BY rotation DESC NULLS LAST, vehicle, window_id LIMIT {MAX_CHANGED_WINDOWS}"
     ).fetchall()
     return FleetChanges(
         both=both,

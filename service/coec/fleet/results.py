@@ -15,21 +15,21 @@ from pathlib import Path
 from coec.adapters.files import durable, output
 from coec.errors import DecodeError, OutputError, UsageError
 from coec.fleet import tables
-from coec.fleet.extra import library
-from coec.fleet.terms import Terms
+from coec.fleet.extra import optional_library
+from coec.fleet.terms import ReplaySettings
 from coec.schemas.base import from_json, to_json
 from coec.schemas.fleet import WindowRow
 
-TERMS, JOURNAL = "terms.json", "journal.jsonl"
+SETTINGS_FILE, JOURNAL_FILE = "terms.json", "journal.jsonl"
 
 ROWS_A_FILE = 512
 """Rows in one file of a table: files then have some megabytes, and at most so many rows are read again at a start."""
 
 
-class Results:
+class BatchFolder:
     """The results of one batch. Call `finish` at its end, however it ends."""
 
-    def __init__(self, folder: Path, terms: Terms, *, resume: bool) -> None:
+    def __init__(self, folder: Path, settings: ReplaySettings, *, resume: bool) -> None:
         """Begins a folder, or continues one. A batch without a row, which failed before its first window, counts as
         none.
 
@@ -39,20 +39,20 @@ class Results:
             SourceError: a table in it is damaged, or the libraries for tables are not installed.
         """
         self._folder = folder
-        library("pyarrow.parquet")  # before anything is written
-        self._claim(terms, resume=resume)
-        self._made = tables.urls(folder)
+        optional_library("pyarrow.parquet")  # before anything is written
+        self._open(settings, resume=resume)
+        self._written = tables.tabulated_urls(folder)
         self._rows: list[WindowRow] = []
-        self._journal = durable.Log(folder / JOURNAL, 2 * ROWS_A_FILE, self._lines)
-        with self._writing(folder / JOURNAL):
+        self._journal = durable.LineLog(folder / JOURNAL_FILE, 2 * ROWS_A_FILE, self._lines)
+        with self._writing(folder / JOURNAL_FILE):
             rows = [_row(line) for line in self._journal.load()]
         # A run that ended just after it wrote tables may have left their rows in the journal.
-        self._rows = [row for row in rows if row is not None and row.url not in self._made]
+        self._rows = [row for row in rows if row is not None and row.url not in self._written]
 
     @property
     def urls(self) -> frozenset[str]:
         """URLs of the windows that have a row."""
-        return frozenset(self._made | {row.url for row in self._rows})
+        return frozenset(self._written | {row.url for row in self._rows})
 
     def add(self, row: WindowRow) -> None:
         """Adds the row of a finished window; it is on the disk when this returns.
@@ -61,7 +61,7 @@ class Results:
             OutputError: it cannot be written.
         """
         self._rows.append(row)
-        with self._writing(self._folder / JOURNAL):
+        with self._writing(self._folder / JOURNAL_FILE):
             self._journal.add(to_json(row))
             self._journal.flush()
         if len(self._rows) >= ROWS_A_FILE:
@@ -78,30 +78,30 @@ class Results:
         # The name depends on the rows in the file, so that no file replaces one with other rows.
         urls = [row.url for row in self._rows]
         name = hashlib.sha256("\n".join(sorted(urls)).encode()).hexdigest()[:16]
-        tables.write(self._folder, self._rows, f"part-{name}")
-        self._made.update(urls)
+        tables.write_tables(self._folder, self._rows, f"part-{name}")
+        self._written.update(urls)
         self._rows = []
-        with self._writing(self._folder / JOURNAL):
+        with self._writing(self._folder / JOURNAL_FILE):
             self._journal.renew()
             self._journal.flush()
 
     def _lines(self) -> Iterator[bytes]:
         return (to_json(row) for row in self._rows)
 
-    def _claim(self, terms: Terms, *, resume: bool) -> None:
-        path = self._folder / TERMS
+    def _open(self, settings: ReplaySettings, *, resume: bool) -> None:
+        path = self._folder / SETTINGS_FILE
         try:
-            there = json.loads(path.read_bytes())["fingerprint"]
+            stored = json.loads(path.read_bytes())["fingerprint"]
         except (FileNotFoundError, NotADirectoryError):  # if the folder cannot be made, `output.replace` raises
-            there = None
+            stored = None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UsageError(f"{path} cannot be read ({error}): choose another folder") from error
-        if there is None or not self._has_rows():
-            document = {"fingerprint": terms.fingerprint, "terms": terms.model_dump(mode="json")}
-            output.replace(path, json.dumps(document, sort_keys=True, indent=1).encode())
+        if stored is None or not self._has_rows():
+            document = {"fingerprint": settings.fingerprint, "terms": settings.model_dump(mode="json")}
+            output.replace_output(path, json.dumps(document, sort_keys=True, indent=1).encode())
         elif not resume:
             raise UsageError(f"{self._folder} holds a batch: --resume goes on with it, another folder begins anew")
-        elif there != terms.fingerprint:
+        elif stored != settings.fingerprint:
             raise UsageError(
                 f"{self._folder} holds a batch of another configuration, rig, network or version of coec: its rows "
                 "cannot be compared with new ones; choose another folder"
@@ -110,7 +110,7 @@ class Results:
     def _has_rows(self) -> bool:
         """Whether a window of the batch in the folder has a row, readable or not."""
         with suppress(OSError):
-            if (self._folder / JOURNAL).stat().st_size > 0:
+            if (self._folder / JOURNAL_FILE).stat().st_size > 0:
                 return True
         return next(self._folder.glob("date=*/vehicle=*/*.parquet"), None) is not None
 

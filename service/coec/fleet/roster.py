@@ -14,8 +14,8 @@ from typing import Final, get_args
 
 from coec.errors import DecodeError
 from coec.schemas.fleet import SEEN
-from coec.schemas.fleet_now import FleetNow, PairNow, Standing
-from coec.schemas.last_word import LastWord, read
+from coec.schemas.fleet_now import Connectivity, FleetNow, PairNow
+from coec.schemas.last_word import LastWord, decode_heartbeat
 from coec.schemas.replies import HealthState
 
 AXES: Final = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -33,20 +33,20 @@ OVERDUE_PERIODS: Final = 2.5
 RANKS: Final = ("miscalibrated", "suspect", "degraded", "silent", "stale", "unknown", "healthy", "parked")
 """States, the most urgent first. A pair that knows that it is wrong comes before one that says nothing."""
 
-Name = tuple[str, str]
+PairName = tuple[str, str]
 """Vehicle and pair."""
 
-_Place = tuple[int, float, float, Name]
+_SortKey = tuple[int, float, float, PairName]
 """Sort key of a pair in the order of urgency."""
 
 
 @dataclass(slots=True)
-class _Heard:
+class _FleetEntry:
     """A word; when it was said, by the watcher's steady clock; which axis drifted furthest and how far, in multiples of
     the drift that a monitor has to detect; its size as it came, bytes; and whether its vehicle has gone since."""
 
-    word: LastWord
-    said_s: float
+    heartbeat: LastWord
+    published_s: float
     axis: int | None
     urgency: float
     size: int
@@ -54,150 +54,152 @@ class _Heard:
 
 
 @dataclass(frozen=True, slots=True)
-class Filter:
+class FleetFilter:
     """Which pairs are shown: those in one of the states (or `parked`, `silent`; empty: all states) whose name contains
     the text. The name is that of the vehicle and the pair."""
 
     states: frozenset[str] = frozenset()
     text: str = ""
 
-    def passes(self, name: Name, told: str) -> bool:
+    def passes(self, name: PairName, state: str) -> bool:
         """Whether a pair that is shown in state `told` passes."""
-        return (not self.states or told in self.states) and (not self.text or self.text in f"{name[0]}/{name[1]}")
+        return (not self.states or state in self.states) and (not self.text or self.text in f"{name[0]}/{name[1]}")
 
 
-EVERYTHING: Final = Filter()
+NO_FILTER: Final = FleetFilter()
 
 
-class Roster:
+class FleetState:
     """The last words of one fleet. Owned by one thread."""
 
     def __init__(self, most: int = MAX_PAIRS) -> None:
         self._most = most
         self._bytes = 0
-        self._heard: dict[Name, _Heard] = {}
+        self._entries: dict[PairName, _FleetEntry] = {}
         self._refused: Counter[str] = Counter()
 
-    def hear(self, key: str, payload: bytes, now_s: float) -> None:
+    def on_heartbeat(self, key: str, payload: bytes, now_s: float) -> None:
         """Takes in a word as it is said, at `now_s` by the steady clock. Invalid words are counted."""
-        word = self._read(key, payload)
-        if word is not None:
-            self._take(word, len(payload), now_s)
+        heartbeat = self._read(key, payload)
+        if heartbeat is not None:
+            self._store(heartbeat, len(payload), now_s)
 
-    def recall(self, key: str, payload: bytes, now_s: float, wall_ns: int) -> None:
+    def restore(self, key: str, payload: bytes, now_s: float, wall_ns: int) -> None:
         """Takes in a word that was kept or asked for, unless a later one is known."""
-        word = self._read(key, payload)
-        if word is None:
+        heartbeat = self._read(key, payload)
+        if heartbeat is None:
             return
-        known = self._heard.get((word.vehicle, word.pair))
-        if known is None or word.said_ns > known.word.said_ns:
-            self._take(word, len(payload), now_s - max((wall_ns - word.said_ns) * 1e-9, 0.0))
+        known = self._entries.get((heartbeat.vehicle, heartbeat.pair))
+        if known is None or heartbeat.said_ns > known.heartbeat.said_ns:
+            self._store(heartbeat, len(payload), now_s - max((wall_ns - heartbeat.said_ns) * 1e-9, 0.0))
 
-    def present(self, vehicle: str, pair: str, *, is_there: bool) -> None:
+    def on_liveliness(self, vehicle: str, pair: str, *, is_there: bool) -> None:
         """The liveliness token of a pair came or went. A token that came does not say what the pair's state is."""
-        known = self._heard.get((vehicle, pair))
+        known = self._entries.get((vehicle, pair))
         if known is not None and not is_there:
             known.gone = True
 
-    def refuse(self, cause: str, count: int = 1) -> None:
+    def count_refused(self, cause: str, count: int = 1) -> None:
         """Counts something that was no word."""
         self._refused[cause] += count
 
-    def overdue(self, now_s: float, most: int) -> list[Name]:
+    def overdue(self, now_s: float, most: int) -> list[PairName]:
         """Pairs that are silent although their token has not gone, the longest silent first. Their word may have been
         lost, so they can be asked."""
-        found = [
-            (heard.said_s, name)
-            for name, heard in self._heard.items()
-            if not heard.gone and _standing(heard, now_s) == "silent"
+        silent = [
+            (entry.published_s, name)
+            for name, entry in self._entries.items()
+            if not entry.gone and _connectivity(entry, now_s) == "silent"
         ]
-        return [name for _, name in sorted(found)[:most]]
+        return [name for _, name in sorted(silent)[:most]]
 
-    def now(self, now_s: float, chosen: Filter = EVERYTHING, most: int = MAX_PAIRS) -> FleetNow:
+    def now(self, now_s: float, selection: FleetFilter = NO_FILTER, most: int = MAX_PAIRS) -> FleetNow:
         """The fleet as it is now, with at most `most` of the chosen pairs."""
         states: Counter[str] = Counter()
-        order: list[tuple[_Place, Standing, _Heard]] = []
-        for name, heard in self._heard.items():
-            standing = _standing(heard, now_s)
-            told = heard.word.state if standing == "live" else standing
-            states[told] += 1
-            if chosen.passes(name, told):
-                place = (_rank(heard.word, standing), -heard.urgency, heard.said_s, name)
-                order.append((place, standing, heard))
+        order: list[tuple[_SortKey, Connectivity, _FleetEntry]] = []
+        for name, entry in self._entries.items():
+            connectivity = _connectivity(entry, now_s)
+            state = entry.heartbeat.state if connectivity == "live" else connectivity
+            states[state] += 1
+            if selection.passes(name, state):
+                sort_key = (_rank(entry.heartbeat, connectivity), -entry.urgency, entry.published_s, name)
+                order.append((sort_key, connectivity, entry))
         order.sort(key=lambda item: item[0])
         return FleetNow(
-            vehicles=len({vehicle for vehicle, _ in self._heard}),
-            known=len(self._heard),
+            vehicles=len({vehicle for vehicle, _ in self._entries}),
+            known=len(self._entries),
             states=dict(sorted(states.items(), key=lambda item: RANKS.index(item[0]))),
             matching=len(order),
-            pairs=tuple(_pair(heard, standing, now_s) for _, standing, heard in order[:most]),
+            pairs=tuple(_pair_now(entry, connectivity, now_s) for _, connectivity, entry in order[:most]),
             refused=dict(self._refused),
         )
 
     def _read(self, key: str, payload: bytes) -> LastWord | None:
         try:
-            return read(key, payload)
+            return decode_heartbeat(key, payload)
         except DecodeError as error:
             self._refused[error.reason] += 1
             return None
 
-    def _take(self, word: LastWord, size: int, said_s: float) -> None:
-        name = (word.vehicle, word.pair)
-        before = self._heard.get(name)
-        total = self._bytes + size - (0 if before is None else before.size)
-        if before is None and (len(self._heard) >= self._most or total > MAX_WORD_BYTES):
+    def _store(self, heartbeat: LastWord, size: int, published_s: float) -> None:
+        name = (heartbeat.vehicle, heartbeat.pair)
+        known = self._entries.get(name)
+        total = self._bytes + size - (0 if known is None else known.size)
+        if known is None and (len(self._entries) >= self._most or total > MAX_WORD_BYTES):
             self._refused["too_many_pairs"] += 1
             return
         if total > max(MAX_WORD_BYTES, self._bytes):
             self._refused["word_too_large"] += 1
             return
         self._bytes = total
-        self._heard[name] = _Heard(word, said_s, *_drift(word), size)
+        self._entries[name] = _FleetEntry(heartbeat, published_s, *_drift(heartbeat), size)
 
 
-def of_states(names: Iterable[str], refuse: Callable[[str], Exception]) -> frozenset[str]:
+def parse_states(names: Iterable[str], refuse: Callable[[str], Exception]) -> frozenset[str]:
     """The names of a filter as a set of states.
 
     Raises:
         Exception: what `refuse(text)` returns, if a name is no state.
     """
-    chosen = frozenset(names)
+    selected = frozenset(names)
     known = (*get_args(HealthState), "parked", "silent")
-    for name in sorted(chosen - set(known)):
+    for name in sorted(selected - set(known)):
         raise refuse(f"{name!a} is no state; there are: {', '.join(known)}")
-    return chosen
+    return selected
 
 
-def _standing(heard: _Heard, now_s: float) -> Standing:
-    if heard.word.service == "stopping":
+def _connectivity(entry: _FleetEntry, now_s: float) -> Connectivity:
+    if entry.heartbeat.service == "stopping":
         return "parked"
-    if heard.gone or now_s - heard.said_s > OVERDUE_PERIODS * heard.word.period_s:
+    if entry.gone or now_s - entry.published_s > OVERDUE_PERIODS * entry.heartbeat.period_s:
         return "silent"
     return "live"
 
 
-def _rank(word: LastWord, standing: Standing) -> int:
+def _rank(heartbeat: LastWord, connectivity: Connectivity) -> int:
     """Rank of a pair. One that was last known to be wrong stays in front, even if it is silent or parked now."""
-    by_state = RANKS.index(word.state)
-    if standing == "live" or word.state == "miscalibrated":
+    by_state = RANKS.index(heartbeat.state)
+    if connectivity == "live" or heartbeat.state == "miscalibrated":
         return by_state
-    return min(by_state, RANKS.index("silent")) if standing == "silent" else RANKS.index("parked")
+    return min(by_state, RANKS.index("silent")) if connectivity == "silent" else RANKS.index("parked")
 
 
-def _drift(word: LastWord) -> tuple[int | None, float]:
+def _drift(heartbeat: LastWord) -> tuple[int | None, float]:
     """The axis that drifted furthest, and how far, in multiples of the drift that a monitor has to detect."""
-    shares = [0.0 if moved is None else abs(moved) / seen for moved, seen in zip(word.drift or (), SEEN, strict=False)]
+    shares = [
+        0.0 if moved is None else abs(moved) / seen for moved, seen in zip(heartbeat.drift or (), SEEN, strict=False)
+    ]
     furthest = max(shares, default=0.0)
     return (shares.index(furthest) if furthest > 0.0 else None), furthest
 
 
-def _pair(heard: _Heard, standing: Standing, now_s: float) -> PairNow:
-    said_s = max(now_s - heard.said_s, 0.0)
+def _pair_now(entry: _FleetEntry, connectivity: Connectivity, now_s: float) -> PairNow:
+    age_s = max(now_s - entry.published_s, 0.0)
     return PairNow(
-        word=heard.word,
-        standing=standing,
-        said_s=said_s,
-        looked_s=None if heard.word.age_s is None else heard.word.age_s + said_s,
-        worst=None if heard.axis is None else AXES[heard.axis],
-        urgency=heard.urgency,
+        word=entry.heartbeat,
+        standing=connectivity,
+        said_s=age_s,
+        looked_s=None if entry.heartbeat.age_s is None else entry.heartbeat.age_s + age_s,
+        worst=None if entry.axis is None else AXES[entry.axis],
+        urgency=entry.urgency,
     )

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from coec.adapters.files import output
 from coec.errors import SourceError
-from coec.fleet.extra import library
+from coec.fleet.extra import optional_library
 from coec.schemas.base import to_json
 from coec.schemas.fleet import AXES, WindowRow
 from coec.schemas.replies import Maybe6, Maybe6x6
@@ -24,9 +24,9 @@ UNDATED, NAMELESS = "unknown", "unknown"
 still hold their own data."""
 
 
-def schema() -> Any:
+def table_schema() -> Any:
     """Columns of the table (a `pyarrow.Schema`); `date` and `vehicle` are the folders."""
-    pa = library("pyarrow")
+    pa = optional_library("pyarrow")
     text, number, whole = pa.string(), pa.float64(), pa.int64()
     six = pa.list_(number, 6)
     return pa.schema(
@@ -75,7 +75,7 @@ def schema() -> Any:
     )
 
 
-def write(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
+def write_tables(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
     """Writes a file of this name for each date and vehicle, each completely or not at all.
 
     Raises:
@@ -83,29 +83,29 @@ def write(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
     """
     groups: dict[str, list[WindowRow]] = defaultdict(list)
     for row in rows:
-        groups[_place(row)].append(row)
-    for place, group in sorted(groups.items()):
-        output.replace(folder / place / f"{name}.parquet", _parquet(group))
+        groups[_partition(row)].append(row)
+    for partition, group in sorted(groups.items()):
+        output.replace_output(folder / partition / f"{name}.parquet", _parquet(group))
 
 
-def urls(folder: Path) -> set[str]:
+def tabulated_urls(folder: Path) -> set[str]:
     """URLs of all windows that have a row in a folder.
 
     Raises:
         SourceError: a file is damaged.
     """
-    parquet = library("pyarrow.parquet")
+    parquet = optional_library("pyarrow.parquet")
 
-    found: set[str] = set()
+    known: set[str] = set()
     for path in sorted(folder.glob("date=*/vehicle=*/*.parquet")):
         try:
-            found.update(parquet.ParquetFile(path).read(["url"])["url"].to_pylist())
+            known.update(parquet.ParquetFile(path).read(["url"])["url"].to_pylist())
         except (OSError, ValueError, KeyError) as error:
             raise SourceError(f"{path} is damaged ({error}): remove it, and its windows are judged again") from error
-    return found
+    return known
 
 
-def _place(row: WindowRow) -> str:
+def _partition(row: WindowRow) -> str:
     date = UNDATED if row.result is None else f"{_time(row.result.data_stamp_ns):%Y-%m-%d}"
     return f"date={date}/vehicle={quote(row.vehicle, safe='') or NAMELESS}"
 
@@ -115,18 +115,18 @@ def _time(stamp_ns: int) -> datetime:
 
 
 def _parquet(rows: Sequence[WindowRow]) -> bytes:
-    pa, parquet = library("pyarrow"), library("pyarrow.parquet")
+    pa, parquet = optional_library("pyarrow"), optional_library("pyarrow.parquet")
 
-    table = pa.Table.from_pylist([_values(row) for row in sorted(rows, key=lambda row: row.url)], schema())
+    table = pa.Table.from_pylist([_row_values(row) for row in sorted(rows, key=lambda row: row.url)], table_schema())
     stream = io.BytesIO()
     parquet.write_table(table, stream, compression="zstd")
     return stream.getvalue()
 
 
-def _values(row: WindowRow) -> dict[str, Any]:
+def _row_values(row: WindowRow) -> dict[str, Any]:
     """The values of a row. Maps are in the order of their names, so that equal rows give equal bytes, also in a resumed
     batch."""
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "url": row.url,
         "sha256": row.sha256,
         "bytes": row.bytes,
@@ -140,10 +140,10 @@ def _values(row: WindowRow) -> dict[str, Any]:
     }
     result = row.result
     if result is None:
-        return told
+        return fields
     seen = zip(result.solved, result.unobservable, strict=True)
     return {
-        **told,
+        **fields,
         "window_id": result.window_id,
         "pair": result.pair,
         "camera_frame": result.camera_frame,

@@ -21,7 +21,7 @@ MAX_RIG_BYTES = 2**20
 """Largest file that describes a rig, bytes: a thousand times what intrinsics and a pose take."""
 
 
-class Terms(BaseModel):
+class ReplaySettings(BaseModel):
     """The settings by which windows are judged. They are sent to the processes that judge.
 
     Attributes:
@@ -42,16 +42,16 @@ class Terms(BaseModel):
     @property
     def fingerprint(self) -> str:
         """Hash of the terms and of coec's version: equal fingerprints give equal decisions."""
-        told = json.dumps([__version__, self.model_dump(mode="json")], sort_keys=True)
-        return hashlib.sha256(told.encode()).hexdigest()
+        document = json.dumps([__version__, self.model_dump(mode="json")], sort_keys=True)
+        return hashlib.sha256(document.encode()).hexdigest()
 
-    def applied(self, window: Window, carried: CalibrationConfig) -> tuple[Window, CalibrationConfig]:
+    def apply(self, window: Window, recorded: CalibrationConfig) -> tuple[Window, CalibrationConfig]:
         """A window and its own configuration, replaced by what these terms say.
 
         Raises:
             ConfigError: the configuration does not name the pair of the window.
         """
-        calibration = self._calibration(window.rig.pair, carried)
+        calibration = self._calibration(window.rig.pair, recorded)
         if self.rig is None or (rig := rig_from_json(self.rig, None)).pair != window.rig.pair:
             return window, calibration
         old, new = window.rig.camera, rig.camera
@@ -62,9 +62,9 @@ class Terms(BaseModel):
         """The network by which a window is judged, given the one that is configured for it."""
         return configured if self.depth is None else configured.model_copy(update={"model": self.depth})
 
-    def _calibration(self, pair: str, carried: CalibrationConfig) -> CalibrationConfig:
+    def _calibration(self, pair: str, recorded: CalibrationConfig) -> CalibrationConfig:
         if not self.calibrations:
-            return carried
+            return recorded
         calibration = self.calibrations.get(pair, self.any_pair)
         if calibration is None:
             known = ", ".join(sorted(self.calibrations))
@@ -72,7 +72,7 @@ class Terms(BaseModel):
         return calibration
 
 
-def terms_of(config: Path | None, rig: Path | None, depth: str | None) -> Terms:
+def load_settings(config: Path | None, rig: Path | None, depth: str | None) -> ReplaySettings:
     """The terms from what a user gives. Each argument may be None: the windows' own is used.
 
     Args:
@@ -90,7 +90,9 @@ def terms_of(config: Path | None, rig: Path | None, depth: str | None) -> Terms:
         calibrations = {pair.name: pair.calibration for pair in pairs}
         # If there is only one pair, its settings are for all windows, whatever the vehicles call their pairs.
         any_pair = pairs[0].calibration if len(pairs) == 1 else None
-    return Terms(calibrations=calibrations, any_pair=any_pair, rig=None if rig is None else _rig(rig), depth=depth)
+    return ReplaySettings(
+        calibrations=calibrations, any_pair=any_pair, rig=None if rig is None else _rig(rig), depth=depth
+    )
 
 
 def _rig(path: Path) -> dict[str, Any]:

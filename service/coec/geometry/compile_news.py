@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-Hearer = Callable[[str], None]
+Listener = Callable[[str], None]
 """Called with the name of a kernel, on the compiling thread."""
 
-_hearers: list[Hearer] = []
-_on_end: list[Hearer] = []
+_listeners: list[Listener] = []
+_on_end: list[Listener] = []
 
 
 def _nothing(_: str) -> None:
@@ -18,22 +18,22 @@ def _nothing(_: str) -> None:
 
 
 @contextmanager
-def heard_by(hearer: Hearer, on_end: Hearer = _nothing) -> Iterator[None]:
+def listening(listener: Listener, on_end: Listener = _nothing) -> Iterator[None]:
     """Inside the context, `hearer` is called repeatedly while a kernel and those inside it are compiled, and `on_end`
     when all of them are, or when that failed. Kernels read from the cache cause no calls."""
-    _hearers.append(hearer)
+    _listeners.append(listener)
     _on_end.append(on_end)
     try:
         yield
     finally:
-        _hearers.remove(hearer)
+        _listeners.remove(listener)
         _on_end.remove(on_end)
 
 
-def tell(kernel: str) -> None:
+def notify(kernel: str) -> None:
     """Tell all hearers that a step of the compilation of this kernel begins."""
-    for hearer in tuple(_hearers):
-        hearer(kernel)
+    for listener in tuple(_listeners):
+        listener(kernel)
 
 
 def end(kernel: str) -> None:

@@ -170,7 +170,7 @@ class _Passes(event.Listener):
     """Reports each compiler pass. A kernel from the cache goes through none."""
 
     def on_start(self, event: Any) -> None:
-        compile_news.tell(event.data["qualname"])
+        compile_news.notify(event.data["qualname"])
 
     def on_end(self, event: Any) -> None:
         pass

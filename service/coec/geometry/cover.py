@@ -20,14 +20,14 @@ _STEPS = ((1.0 / _RATIO) ** 1, (1.0 / _RATIO) ** 2, (1.0 / _RATIO) ** 3)
 def unit_ball(count: int) -> NDArray[np.float64]:
     """(count, 3) points of the unit ball: the R₃ sequence (Roberts 2018, "The unreasonable effectiveness of quasirandom
     sequences") in the cube around it, without the points outside of the ball."""
-    ball, found, number = np.empty((count, 3)), 0, 0
-    while found < count:
+    ball, accepted, number = np.empty((count, 3)), 0, 0
+    while accepted < count:
         number += 1
         x, y, z = number * _STEPS[0] + 0.5, number * _STEPS[1] + 0.5, number * _STEPS[2] + 0.5
         x, y, z = 2.0 * (x - np.floor(x)) - 1.0, 2.0 * (y - np.floor(y)) - 1.0, 2.0 * (z - np.floor(z)) - 1.0
         if x * x + y * y + z * z <= 1.0:
-            ball[found, 0], ball[found, 1], ball[found, 2] = x, y, z
-            found += 1
+            ball[accepted, 0], ball[accepted, 1], ball[accepted, 2] = x, y, z
+            accepted += 1
     return ball
 
 

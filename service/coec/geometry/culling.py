@@ -63,8 +63,8 @@ def within_cone(
     c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
     distance_m = np.maximum(np.sqrt(a * a + b * b + c * c), np.float32(1e-6))
     parallax_rad = np.arcsin(np.minimum(np.float32(shift_m) / distance_m, np.float32(1.0)))
-    outside: NDArray[np.bool_] = np.arccos(np.clip(c / distance_m, -1.0, 1.0)) > angle_rad + parallax_rad
-    return ~outside
+    beyond: NDArray[np.bool_] = np.arccos(np.clip(c / distance_m, -1.0, 1.0)) > angle_rad + parallax_rad
+    return ~beyond
 
 
 @dataclass(frozen=True, slots=True, eq=False)

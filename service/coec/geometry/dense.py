@@ -61,7 +61,7 @@ def log_determinant(factor: Array) -> Array:
     return 2.0 * total
 
 
-def solved(factor: Array, right: Array) -> Array:
+def cholesky_solve(factor: Array, right: Array) -> Array:
     """The solution X (..., n, p) of L·Lᵀ·X = B (..., n, p)."""
     n = factor.shape[-1]
     shape = np.broadcast_shapes(factor.shape[:-2], right.shape[:-2])
@@ -81,5 +81,5 @@ def inverse(a: Array) -> Array:
     Raises:
         ValueError: one of them is not positive definite.
     """
-    x = solved(cholesky(a), np.broadcast_to(np.eye(a.shape[-1]), a.shape))
+    x = cholesky_solve(cholesky(a), np.broadcast_to(np.eye(a.shape[-1]), a.shape))
     return np.asarray(0.5 * (x + np.swapaxes(x, -1, -2)))

@@ -48,8 +48,8 @@ def eigen(matrix: Rows) -> list[tuple[float, list[float]]]:
     a = [[float(value) for value in row] for row in matrix]
     vectors = [[float(i == j) for j in range(n)] for i in range(n)]
     for _ in range(MAX_SWEEPS):
-        beside = fsum(abs(a[i][j]) for i in range(n) for j in range(i))
-        if beside <= 1e-15 * fsum(abs(a[i][i]) for i in range(n)):
+        off_diagonal = fsum(abs(a[i][j]) for i in range(n) for j in range(i))
+        if off_diagonal <= 1e-15 * fsum(abs(a[i][i]) for i in range(n)):
             break
         for p in range(n):
             for q in range(p + 1, n):

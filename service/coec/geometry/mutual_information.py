@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from coec.geometry.cameras import Camera
 from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.culling import BUNDLE, NEVER_OUT, Bundles
-from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Certainty, certain_pixels, exact_pixel, filter_of
+from coec.geometry.pixel_lookup import NOT_IN_IMAGE, UNSURE, Certainty, certain_pixels, exact_pixel, filter_of
 from coec.geometry.prefetch import prefetch
 
 TASK = 32 * BUNDLE
@@ -91,11 +91,11 @@ def information_of_each(frames: BinnedFrames, poses: NDArray[np.float64]) -> lis
         counts, first_task = _histograms_of_tasks(frames, poses)
         return [FrameInformation(*_information(counts[0], first_task))]
     tasks = max(len(_tasks(frames.first_point)[1]), 1)
-    found, at_once = [], max(1, MOST_COUNTS // (tasks * (frames.depth_bins + 1) * frames.range_bins))
+    results, at_once = [], max(1, MOST_COUNTS // (tasks * (frames.depth_bins + 1) * frames.range_bins))
     for begin in range(0, len(poses), at_once):
         mi, points = _informations(*_histograms_of_tasks(frames, poses[begin : begin + at_once]))
-        found += [FrameInformation(*of_pose) for of_pose in zip(mi, points, strict=True)]
-    return found
+        results += [FrameInformation(*of_pose) for of_pose in zip(mi, points, strict=True)]
+    return results
 
 
 def joint_histograms(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -200,7 +200,7 @@ def _count_points(
         end = min(begin + BUNDLE, x.shape[0])
         xs, ys, zs, bins, pixels = x[begin:end], y[begin:end], z[begin:end], range_bin[begin:end], pixel[: end - begin]
         # Pass 1, in vector registers: project.
-        if certain_pixels(single, limits, T_single, xs, ys, zs, pixels) == OUTSIDE:
+        if certain_pixels(single, limits, T_single, xs, ys, zs, pixels) == NOT_IN_IMAGE:
             continue
         # In between, prefetch: a map is read at scattered places, and the maps of fifty frames have left the caches
         # since the last pose. Cache lines requested together arrive together (200 frames: 62, not 78 µs each).

@@ -40,11 +40,11 @@ def neighbour_differences(grey: NDArray[np.uint8], block_rows: int, block_column
         for y in range(block * rows, (block + 1) * rows, 2):
             here = grey[y]
             for x in range(width - 1):
-                of_column[x] += _apart(here[x + 1], here[x])
+                of_column[x] += _absolute_difference(here[x + 1], here[x])
             if y + 1 < height:
                 below = grey[y + 1]
                 for x in range(width):
-                    of_column[x] += _apart(below[x], here[x])
+                    of_column[x] += _absolute_difference(below[x], here[x])
         for column in range(block_columns):
             total = np.int64(0)
             for x in range(column * columns, (column + 1) * columns):
@@ -65,7 +65,7 @@ def level_counts(grey: NDArray[np.uint8], step: int) -> NDArray[np.int64]:
 
 
 @njit(cache=True, inline="always")
-def _apart(a: np.uint8, b: np.uint8) -> np.int32:
+def _absolute_difference(a: np.uint8, b: np.uint8) -> np.int32:
     """Absolute difference in eight bits. By default differences are taken in 64 bits, and a vector register holds many
     more values of eight."""
     return np.int32(np.uint8(a - b) if a > b else np.uint8(b - a))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from coec.geometry.cameras import Camera, domain_angle_rad, image_point, in_single_precision, project_point
 from coec.geometry.compiler import njit
 
-OUTSIDE, UNSURE = -2, -1
+NOT_IN_IMAGE, UNSURE = -2, -1
 """Codes in place of a pixel: there is none, or single precision cannot decide. UNSURE is the larger, so that the
 largest entry of a block tells whether there is anything to do for the block."""
 
@@ -160,9 +160,9 @@ def certain_pixels(
     """
     reach, edge_cosine, near_m = limits.reach_px, limits.edge_cosine, limits.near_m
     width, height = np.float32(camera.width), np.float32(camera.height)
-    zero, outside, unsure, far_m = np.float32(0.0), np.float32(OUTSIDE), np.float32(UNSURE), np.float32(FAR_M)
+    zero, not_in_image, unsure, far_m = np.float32(0.0), np.float32(NOT_IN_IMAGE), np.float32(UNSURE), np.float32(FAR_M)
     band = np.float32(EDGE_BAND)
-    largest = np.int32(OUTSIDE)
+    largest = np.int32(NOT_IN_IMAGE)
     # No branch, and nothing wider than 32 bits: with one 64-bit number or one count of truth values in this loop the
     # compiler uses registers of half the width (1.05 instead of 0.55 ns per point).
     for i in range(pixel.shape[0]):
@@ -181,8 +181,8 @@ def certain_pixels(
             & (d > near_m)
             & (d < far_m)
         )
-        found = row * width + column if seen else outside
-        pixel[i] = np.int32(found if certain else unsure)
+        index = row * width + column if seen else not_in_image
+        pixel[i] = np.int32(index if certain else unsure)
         largest = max(largest, pixel[i])
     return largest
 
@@ -193,7 +193,7 @@ def exact_pixel(camera: Camera, T: NDArray[np.float64], x_m: float, y_m: float, 
     x, y, z = moved(T, x_m, y_m, z_m)
     u, v, valid = project_point(camera, x, y, z)
     if not (valid and u >= -0.5 and v >= -0.5 and u < camera.width - 0.5 and v < camera.height - 0.5):
-        return OUTSIDE
+        return NOT_IN_IMAGE
     return int(v + 0.5) * camera.width + int(u + 0.5)
 
 

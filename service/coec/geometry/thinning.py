@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 SEED = 16_384
 """An arbitrary number. The choice depends on the two counts alone, so that a replay chooses the same."""
 
-KEPT_CHOICES = 16
+CACHED_SUBSETS = 16
 """Choices kept in memory, of up to a hundred thousand numbers each (13 MB in all). They recur, because the images of a
 window have one size, and so have the sweeps of many sensors."""
 
 
-@lru_cache(maxsize=KEPT_CHOICES)
+@lru_cache(maxsize=CACHED_SUBSETS)
 def thinned(count: int, at_most: int) -> NDArray[np.int64]:
     """Indices (n,), ascending, of `at_most` of `count` things, each chosen with the same probability; of all things if
     there are not more. The array is read-only because every caller with these counts gets the same one.
@@ -32,8 +32,8 @@ def thinned(count: int, at_most: int) -> NDArray[np.int64]:
     if count < 0 or at_most < 0:
         raise ValueError(f"counts must not be negative: {at_most} of {count}")
     if at_most >= count:
-        chosen = np.arange(count)
+        indices = np.arange(count)
     else:
-        chosen = np.sort(np.random.default_rng([SEED, count, at_most]).choice(count, at_most, False, shuffle=False))
-    chosen.flags.writeable = False
-    return chosen
+        indices = np.sort(np.random.default_rng([SEED, count, at_most]).choice(count, at_most, False, shuffle=False))
+    indices.flags.writeable = False
+    return indices

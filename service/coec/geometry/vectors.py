@@ -27,5 +27,5 @@ def lengths(vectors: NDArray[Precision]) -> NDArray[Precision]:
 
 def random_direction(rng: np.random.Generator) -> NDArray[np.float64]:
     """A unit vector (3,), uniform over all directions, from three normal numbers."""
-    drawn = rng.normal(size=3)
-    return np.asarray(drawn / np.sqrt((drawn**2).sum()))
+    normal = rng.normal(size=3)
+    return np.asarray(normal / np.sqrt((normal**2).sum()))

@@ -22,7 +22,7 @@ from coec.evaluation.detection import require_enough
 from coec.evaluation.experiments import Bench, Stages
 from coec.evaluation.normalised_errors import NormalisedErrors
 from coec.evaluation.split_halves import Halves
-from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
+from coec.evaluation.statistics import FrameCountStatistics, SliceStatistics, SolveOutcome
 from coec.geometry.cameras import name_of
 from coec.recording import CallbackProgress, Recording, fit_camera
 from coec.recording import Window as PublicWindow
@@ -41,8 +41,8 @@ from coec.reports.evaluation_documents import (
 from coec.schemas.evaluation import DetectionReport, EvaluationReport, StepRow
 from coec.schemas.replies import Vector6
 from coec.sources import open_source, windows
-from coec.sources.between import with_between
-from coec.sources.recording import KnowsTruth
+from coec.sources.between import with_thinned_pairs
+from coec.sources.recording import HasGroundTruth
 
 MARGIN_DEG, MARGIN_M = 5.0, 0.2
 REACH_MARGIN_DEG, REACH_MARGIN_M = 3.0, 0.15
@@ -98,10 +98,10 @@ class Subject:
 class Experiments:
     """Outcomes of the experiments that were asked for. `interrupted`: some are missing."""
 
-    from_reference: Outcome
-    outcomes: list[Outcome] = field(default_factory=list)
-    frames: tuple[FramesPoint, ...] = ()
-    slices: tuple[SlicePoint, ...] = ()
+    from_reference: SolveOutcome
+    outcomes: list[SolveOutcome] = field(default_factory=list)
+    frames: tuple[FrameCountStatistics, ...] = ()
+    slices: tuple[SliceStatistics, ...] = ()
     halves: Halves | None = None
     normalised: dict[str, NormalisedErrors] = field(default_factory=dict)
     detection: DetectionReport | None = None
@@ -137,7 +137,7 @@ def configuration_of(plan: Plan, options: SolverOptions, recorded: CalibrationCo
 def subject_of(
     source: str,
     frames: int | None,
-    loaded: windows.Loaded,
+    loaded: windows.LoadedWindow,
     plan: Plan,
     options: SolverOptions,
     camera_model: str | None,
@@ -155,7 +155,7 @@ def subject_of(
     if camera_model is not None:
         window, _ = fit_camera(window, camera_model)
     if plan.steps and loaded.configuration is None:  # a recorded window brings the pairs between its own
-        window = with_between(window, open_source(source), WindowConfig())
+        window = with_thinned_pairs(window, open_source(source), WindowConfig())
     model = open_depth(configuration_of(plan, options, loaded.configuration).depth, LimitsConfig())
     depth = experiments.inferred(window, model, stages.begin("depth", len(window.pairs)))
     return Subject(source, frames, window, model, depth, loaded.configuration, loaded.vehicle)
@@ -197,7 +197,7 @@ def _try_further(
 ) -> None:
     def cut(begin_s: float, end_s: float) -> Window:
         between_s = (begin_s, end_s)
-        loaded = windows.load(subject.source, subject.frames, WindowConfig().pairs, lambda *_: None, between_s)
+        loaded = windows.load_window(subject.source, subject.frames, WindowConfig().pairs, lambda *_: None, between_s)
         # The rig of the whole window stays, because its camera model may have been replaced.
         return replace(loaded.window, rig=subject.window.rig)
 
@@ -223,14 +223,14 @@ def _try_further(
         seen = experiments.detected(bench, plan.detection, experiments.CHECKS, stages)
         done.detection = detection_of(seen, plan.detection, len(bench.window.pairs))
     if plan.steps:
-        done.steps = steps_of(experiments.knocked(bench, plan.steps, stages))
+        done.steps = steps_of(experiments.mount_step_trials(bench, plan.steps, stages))
 
 
 def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
     """The reference for the errors of windows, as a name and a pose by stamp: the truth where the source knows it, else
     its own calibration."""
     recording = open_source(source)
-    if isinstance(recording, KnowsTruth):
+    if isinstance(recording, HasGroundTruth):
         return SIMULATED_TRUTH, recording.truth
     return OWN_CALIBRATION, lambda _: bench.reference
 

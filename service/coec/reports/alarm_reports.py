@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coec.evaluation.alarms import Alarms
+from coec.evaluation.alarms import AlarmExperiments
 from coec.reports import console
 from coec.reports.evaluation_documents import number
 from coec.schemas import evaluation as wire
 
 
-def document_of(alarms: Alarms) -> wire.AlarmsReport:
+def document_of(alarms: AlarmExperiments) -> wire.AlarmsReport:
     """What `coec alarms --json` prints."""
     config = alarms.config
     return wire.AlarmsReport(
@@ -37,9 +37,9 @@ def document_of(alarms: Alarms) -> wire.AlarmsReport:
         from_start=tuple(
             wire.FromStartRow(
                 off_deg=row.off_deg,
-                rigs=len(row.wanted_s),
-                wanted=float(np.mean(np.isfinite(row.wanted_s))),
-                wanted_s=_spread(row.wanted_s),
+                rigs=len(row.requested_s),
+                wanted=float(np.mean(np.isfinite(row.requested_s))),
+                wanted_s=_spread(row.requested_s),
             )
             for row in alarms.from_start
         ),

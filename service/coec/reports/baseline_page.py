@@ -10,17 +10,17 @@ from coec.calibration.commissioning.baseline import Baseline
 from coec.calibration.figures import FIGURES
 from coec.config import VerdictConfig
 from coec.reports.evaluation_documents import in_degrees
-from coec.reports.page import Block, Cell, Facts, Page, Section, Table, Text, Verdict
+from coec.reports.page import Block, Cell, Facts, Page, Section, Table, Text, VerdictBanner
 from coec.reports.page.words import count, number, percent, significant
 from coec.reports.page_parts import axes_table
-from coec.reports.provenance import Made
+from coec.reports.provenance import Provenance
 
 CHECK_PAIRS = 6
 """Number of pairs in the check whose spread is shown."""
 
 
 def baselines_page(
-    baselines: Mapping[str, Baseline], learned: str, sources: Sequence[str], name: str, made: Made
+    baselines: Mapping[str, Baseline], learned: str, sources: Sequence[str], name: str, made: Provenance
 ) -> Page:
     """The page of every pair in a file of baselines.
 
@@ -42,7 +42,7 @@ def baselines_page(
     others = [pair for pair in baselines if pair != learned]
     sections = [section for pair in (learned, *others) for section in _pair(baselines[pair])]
     origin = made.section(tuple(("Source", source) for source in sources))
-    verdict = Verdict("good", "Commissioned.", sentence, todo)
+    verdict = VerdictBanner("good", "Commissioned.", sentence, todo)
     return Page("coec commission", f"Baselines in {name}", (verdict,), (*sections, origin))
 
 
@@ -113,4 +113,4 @@ def _limits(baseline: Baseline) -> list[Block]:
 
 def _limit(name: str, sign: str, limit: float) -> tuple[str, ...]:
     figure = FIGURES[name]
-    return figure.title, f"{sign} {significant(limit)}", figure.unit, figure.tells
+    return figure.title, f"{sign} {significant(limit)}", figure.unit, figure.measures

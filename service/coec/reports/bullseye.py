@@ -8,7 +8,7 @@ from math import degrees
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.evaluation.statistics import HIT_RAD, Outcome
+from coec.evaluation.statistics import HIT_RAD, SolveOutcome
 from coec.reports.page import Disc, Discs, Dot, DotKind, Ring
 from coec.reports.page.words import number
 
@@ -51,7 +51,7 @@ def latitude_radius(from_z_deg: float) -> float:
     return float(np.sin(np.radians(from_z_deg) / 2.0))
 
 
-def end_places(outcomes: Sequence[Outcome], rim_deg: float) -> Places:
+def end_places(outcomes: Sequence[SolveOutcome], rim_deg: float) -> Places:
     """Places of ends on the target, degrees from the reference: yaw to the right and pitch upwards, as the picture
     moves; ends beyond the rim lie on it."""
     errors = np.degrees(np.array([outcome.error[:3] for outcome in outcomes]))
@@ -59,13 +59,13 @@ def end_places(outcomes: Sequence[Outcome], rim_deg: float) -> Places:
     return np.column_stack([np.arctan2(errors[:, 0], errors[:, 1]), np.minimum(angle_deg, rim_deg)])
 
 
-def rim_of(outcomes: Sequence[Outcome]) -> float:
+def rim_of(outcomes: Sequence[SolveOutcome]) -> float:
     """The radius of the target, degrees, see `RIMS_DEG`."""
     p95_deg = np.quantile(np.degrees([outcome.rotation_rad for outcome in outcomes]), 0.95)
     return next(rim for rim in RIMS_DEG if p95_deg <= rim)
 
 
-def bullseye(methods: Mapping[str, Sequence[Outcome]], directions: Mapping[str, NDArray[np.float64]]) -> Discs:
+def bullseye(methods: Mapping[str, Sequence[SolveOutcome]], directions: Mapping[str, NDArray[np.float64]]) -> Discs:
     """For each method, a disc of its starts by each of `directions` (title, (n, 3) unit vectors in camera axes), and a
     target of its ends. All targets have the radius of the worst method. A single method may have an empty name."""
     rim_deg = max(rim_of(outcomes) for outcomes in methods.values())
@@ -79,25 +79,31 @@ def bullseye(methods: Mapping[str, Sequence[Outcome]], directions: Mapping[str, 
     return Discs(tuple(discs), tuple((kind, f"{kind.name}: {count}") for kind, count in counts.items()))
 
 
-def _starts(title: str, unit: NDArray[np.float64], outcomes: Sequence[Outcome]) -> Disc:
+def _starts(title: str, unit: NDArray[np.float64], outcomes: Sequence[SolveOutcome]) -> Disc:
     rings = tuple(Ring(latitude_radius(from_z_deg), f"{from_z_deg:g}°") for from_z_deg in LATITUDES_DEG)
     missed = sum(not outcome.hit for outcome in outcomes)
-    told = f"{len(outcomes)} directions, of which {missed} led to a miss; the centre looks along +z, the rim along −z"
-    return Disc(title, told, ("+x", "+y", "−x", "−y"), rings, _dots(start_places(unit), outcomes))
+    description = (
+        f"{len(outcomes)} directions, of which {missed} led to a miss; the centre looks along +z, the rim along −z"
+    )
+    return Disc(title, description, ("+x", "+y", "−x", "−y"), rings, _dots(start_places(unit), outcomes))
 
 
-def _target(title: str, outcomes: Sequence[Outcome], rim_deg: float) -> Disc:
+def _target(title: str, outcomes: Sequence[SolveOutcome], rim_deg: float) -> Disc:
     goal = HIT_DEG / rim_deg
     others = (Ring(share, f"{share * rim_deg:g}°") for share in QUARTERS if abs(share - goal) >= CLEAR)
     rings = (*others, Ring(goal, f"a hit: {HIT_DEG:g}°", goal=True))
     places = end_places(outcomes, rim_deg)
     places[:, 1] /= rim_deg
     hits = sum(outcome.hit for outcome in outcomes)
-    told = f"{hits} of {len(outcomes)} lie within {HIT_DEG:g}° of the reference; the rim is {rim_deg:g}° and more"
-    return Disc(f"{title} (rim: {rim_deg:g}° and more)", told, ("yaw", "pitch", "", ""), rings, _dots(places, outcomes))
+    description = (
+        f"{hits} of {len(outcomes)} lie within {HIT_DEG:g}° of the reference; the rim is {rim_deg:g}° and more"
+    )
+    return Disc(
+        f"{title} (rim: {rim_deg:g}° and more)", description, ("yaw", "pitch", "", ""), rings, _dots(places, outcomes)
+    )
 
 
-def _dots(places: Places, outcomes: Sequence[Outcome]) -> tuple[Dot, ...]:
+def _dots(places: Places, outcomes: Sequence[SolveOutcome]) -> tuple[Dot, ...]:
     order = list(KINDS)
     dots = [
         (

@@ -12,7 +12,7 @@ from coec.adapters.depth.maps import STEREO
 from coec.calibration.types import Compensation, Window
 from coec.config import CalibrationConfig
 from coec.geometry import se3
-from coec.geometry.edges.scan_lines import telling
+from coec.geometry.edges.scan_lines import distinct_rings
 from coec.reports import console
 from coec.reports.page.words import count
 from coec.schemas.replies import CalibrationResult, Transform, Vector6
@@ -56,12 +56,12 @@ def show(
     show_pose(result.camera_from_lidar, result.lidar_frame, result.camera_frame)
     console.show(settings_text(configuration, result.depth_identity))
     console.show(compensation_text(result.compensation))
-    if any(pair.lidar.ring is not None and telling(pair.lidar.ring) is None for pair in window.pairs):
+    if any(pair.lidar.ring is not None and distinct_rings(pair.lidar.ring) is None for pair in window.pairs):
         console.show(
             "the field `ring` holds one number and was ignored: beams were told apart by their elevation", "yellow"
         )
-    for remark in remarks(camera_fit, time_offset):
-        console.show(remark)
+    for note in remarks(camera_fit, time_offset):
+        console.show(note)
     if result.independent_looks is not None:
         console.show(
             f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent looks{_together(result)}"
@@ -72,15 +72,15 @@ def show(
 
 def remarks(camera_fit: Mapping[str, Any] | None, time_offset: Mapping[str, Any] | None) -> list[str]:
     """What else was found out, one sentence each; both arguments as `--json` has them, None: not asked for."""
-    said = []
+    sentences = []
     if camera_fit is not None:
-        said.append(
+        sentences.append(
             f"{camera_fit['model']} fitted to {camera_fit['of']}: {camera_fit['residual_rms_px']:.4f} px rms, "
             f"{camera_fit['residual_max_px']:.4f} px at most"
         )
     if time_offset is not None:
-        said.append(f"camera after its stamp: {_offset_text(time_offset)}")
-    return said
+        sentences.append(f"camera after its stamp: {_offset_text(time_offset)}")
+    return sentences
 
 
 def start_of(window: Window) -> Vector6:
@@ -136,9 +136,9 @@ def _show_axes(window: Window, result: CalibrationResult) -> None:
     axes = console.table("axis", "start", "correction", "± σ", "unit", right=(1, 2, 3))
     for axis, name in enumerate(console.AXIS_NAMES):
         unsolved = "not observable" if result.unobservable[axis] else "not searched"
-        found = console.figure(result.correction[axis], sign=True) if result.solved[axis] else unsolved
+        correction = console.figure(result.correction[axis], sign=True) if result.solved[axis] else unsolved
         spread = console.figure(result.sigma[axis]) if result.solved[axis] else ""
-        axes.add_row(name, console.figure(start[axis], sign=True), found, spread, console.UNITS[axis])
+        axes.add_row(name, console.figure(start[axis], sign=True), correction, spread, console.UNITS[axis])
     console.out.print(axes)
 
 
@@ -149,8 +149,8 @@ def _numbers(values: Sequence[float]) -> str:
 def _together(result: CalibrationResult) -> str:
     """How the errors of turns and shifts correlate, where both were solved."""
     pairs = {"pitch and height": result.correlation_pitch_height, "yaw and side": result.correlation_yaw_side}
-    told = ", ".join(f"{names} {value:+.2f}" for names, value in pairs.items() if value is not None)
-    return f"; correlation of errors: {told}" if told else ""
+    correlations = ", ".join(f"{names} {value:+.2f}" for names, value in pairs.items() if value is not None)
+    return f"; correlation of errors: {correlations}" if correlations else ""
 
 
 def _offset_text(offset: Mapping[str, Any]) -> str:

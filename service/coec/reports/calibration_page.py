@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from coec.calibration.types import Window
 from coec.reports.instants import second
-from coec.reports.page import AxesTable, Block, Facts, Page, Section, Text, Verdict
+from coec.reports.page import AxesTable, Block, Facts, Page, Section, Text, VerdictBanner
 from coec.reports.page.words import count, number, percent, significant, size
 from coec.reports.page_parts import (
     advice_of,
@@ -16,7 +16,7 @@ from coec.reports.page_parts import (
     figures_block,
     turn_and_shift,
 )
-from coec.reports.provenance import Made, content_hash, depth_items
+from coec.reports.provenance import Provenance, content_hash, depth_items
 from coec.schemas.replies import CalibrationReport, CalibrationResult, Vector6
 
 USE = (
@@ -32,7 +32,7 @@ def calibration_page(
     start: Vector6,
     pictures: Sequence[Block],
     remarks: Sequence[str],
-    made: Made,
+    made: Provenance,
 ) -> Page:
     """The page of a result.
 
@@ -65,14 +65,14 @@ def _accepted(result: CalibrationResult) -> bool:
     return result.verdict.decision == "accepted"
 
 
-def _verdict(report: CalibrationReport) -> Verdict:
+def _verdict(report: CalibrationReport) -> VerdictBanner:
     if not _accepted(report):
         first = report.verdict.reasons[0].text if report.verdict.reasons else "no reason was given"
         more = len(report.verdict.reasons) - 1
         rest = f" (and {count(more, 'reason')} more, below)" if more > 0 else ""
         advice = advice_of(report.verdict.reasons) or ("Take another window.",)
-        return Verdict("bad", "Refused:", f"{first}{rest}. Do not use this result.", advice)
-    return Verdict("good", "Accepted.", f"The camera is {turn_and_shift(_solved(report))} from the recording’s own "
+        return VerdictBanner("bad", "Refused:", f"{first}{rest}. Do not use this result.", advice)
+    return VerdictBanner("good", "Accepted.", f"The camera is {turn_and_shift(_solved(report))} from the recording’s own "
                    f"calibration{_known_to(report)}.", USE)  # fmt: skip
 
 
@@ -90,7 +90,7 @@ def _known_to(report: CalibrationResult) -> str:
 
 
 def _axes(report: CalibrationReport, start: Vector6) -> AxesTable:
-    words = {
+    unsolved_labels = {
         axis: "not observable" if report.unobservable[axis] else "not searched"
         for axis, solved in enumerate(report.solved)
         if not solved
@@ -101,7 +101,7 @@ def _axes(report: CalibrationReport, start: Vector6) -> AxesTable:
         "Correction",
         report.correction,
         report.sigma,
-        words,
+        unsolved_labels,
         {"Search began at": [axis_value(value, axis) for axis, value in enumerate(start)]},
     )
 

@@ -11,14 +11,14 @@ from coec.adapters.files.conversions import metric_of
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.types import Reason as Found
 from coec.calibration.types import Window
-from coec.reports.diagnosis import Measured
+from coec.reports.diagnosis import SolvedOffset
 from coec.reports.evaluation_documents import in_degrees
 from coec.reports.evaluation_page import detection_table
 from coec.reports.instants import second
-from coec.reports.page import Page, Pictures, Section, Text, Verdict
+from coec.reports.page import Page, Pictures, Section, Text, VerdictBanner
 from coec.reports.page.words import NONE, count, number
 from coec.reports.page_parts import advice_of, axes_table, axis_value, figures_block, file_picture, turn_and_shift
-from coec.reports.provenance import Made, content_hash, depth_items
+from coec.reports.provenance import Provenance, content_hash, depth_items
 from coec.schemas.evaluation import DetectionReport
 from coec.schemas.replies import Reason
 
@@ -28,12 +28,12 @@ OF_PAPER = frozenset({"mi", "f1", "f2"})
 
 def check_page(
     seen: Observation,
-    measured: Measured | None,
+    measured: SolvedOffset | None,
     window: Window,
     depth_identity: str,
     config_hash: str,
     pictures: Sequence[Path],
-    made: Made,
+    made: Provenance,
 ) -> Page:
     """The page of one check.
 
@@ -86,7 +86,7 @@ def check_page(
     return Page("coec diagnose", f"Check of {window.rig.pair}", (_verdict(seen, measured),), sections)
 
 
-def detection_page(detection: DetectionReport, source: str, made: Made) -> Page:
+def detection_page(detection: DetectionReport, source: str, made: Provenance) -> Page:
     """How well wrong extrinsics are detected on a recording."""
     checks = sum(row.checks for row in detection.moves)
     sentence = f"{count(checks, 'check')} at the right extrinsic and at moved ones; see which of them are flagged."
@@ -94,36 +94,38 @@ def detection_page(detection: DetectionReport, source: str, made: Made) -> Page:
         Section("Checks by move", (detection_table(detection),)),
         made.section((("Source", source),)),
     )
-    return Page("coec diagnose", "How well a wrong extrinsic is seen", (Verdict("none", "Tried.", sentence),), sections)
+    return Page(
+        "coec diagnose", "How well a wrong extrinsic is seen", (VerdictBanner("none", "Tried.", sentence),), sections
+    )
 
 
-def _by_axis(measured: Measured) -> list[str]:
+def _by_axis(measured: SolvedOffset) -> list[str]:
     return [
         NONE if sigma is None else f"{axis_value(value, axis)} ± {axis_value(sigma, axis, sign=False)}"
         for axis, (value, sigma) in enumerate(zip(measured.offset, measured.sigma, strict=True))
     ]
 
 
-def _verdict(seen: Observation, measured: Measured | None) -> Verdict:
+def _verdict(seen: Observation, measured: SolvedOffset | None) -> VerdictBanner:
     if seen.causes:
         reasons = [_reason(cause.as_reason()) for cause in seen.causes]
         sentence = " ".join(cause.text for cause in seen.causes) + " Such a check says nothing of the extrinsic."
-        return Verdict("poor", "Cannot tell:", sentence, advice_of(reasons))
+        return VerdictBanner("poor", "Cannot tell:", sentence, advice_of(reasons))
     if seen.flagged:
         todo = (
             "See that the mount is tight.",
             "Calibrate: `coec calibrate` on a window of this mount tells where the camera is.",
         )
-        return Verdict(
+        return VerdictBanner(
             "bad", "Wrong:", f"the camera is not where this extrinsic has it. {_where(seen, measured)}", todo
         )
     if seen.undecided:
         again = ("Take another window, in motion, past objects at different distances.",)
-        return Verdict("unsure", "Undecided:", "this window neither accuses the extrinsic nor acquits it.", again)
-    return Verdict("good", "Right.", "The edges fit this extrinsic as well as a right one.")
+        return VerdictBanner("unsure", "Undecided:", "this window neither accuses the extrinsic nor acquits it.", again)
+    return VerdictBanner("good", "Right.", "The edges fit this extrinsic as well as a right one.")
 
 
-def _where(seen: Observation, measured: Measured | None) -> str:
+def _where(seen: Observation, measured: SolvedOffset | None) -> str:
     """How far the extrinsic is off, by the solve if it can tell, else by the check."""
     near = f"The nearest place at which the edges fit is {turn_and_shift(in_degrees(np.nan_to_num(seen.offset)))}"
     if measured is None:
@@ -134,5 +136,5 @@ def _where(seen: Observation, measured: Measured | None) -> str:
     return f"A solve of all {measured.pairs} pairs puts it {turn_and_shift(solved)} from there."
 
 
-def _reason(found: Found) -> Reason:
-    return Reason(code=found.code, text=found.text)
+def _reason(reason: Found) -> Reason:
+    return Reason(code=reason.code, text=reason.text)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from coec.adapters.images.codec import GreyImages, decode_bgr
 from coec.calibration.types import Matrix4, Rig, Window
 from coec.config import LimitsConfig
-from coec.evaluation.outlines import Outlines, drawn_at
-from coec.evaluation.places import Place, Places, Shift, places, shift_px
+from coec.evaluation.outlines import Outlines, project_outlines
+from coec.evaluation.places import DifferenceRegion, DifferenceRegions, Shift, difference_regions, shift_px
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import Rectangle
 from coec.reports.canvas import DPI, bgr_of, box, folded, scale_bar
@@ -110,21 +110,21 @@ def close_ups(
     size = (max(8, round(PANEL_PX[0] / enlarged)), max(8, round(PANEL_PX[1] / enlarged)))
     bounds = LimitsConfig() if limits is None else limits
     images = GreyImages(bounds)
-    telling = places(window, images, T_before, T_after, size, PLACES, compensated=compensated)
+    telling = difference_regions(window, images, T_before, T_after, size, PLACES, compensated=compensated)
     pair = window.pairs[telling.index]
     image = decode_bgr(pair.camera.image, bounds)
     width = 2 * (AXIS_PX + PANEL_PX[0]) + 3 * GAP_PX
     lines = folded(sentences(window, telling, shift, T_before, T_after, caption), width - 2 * GAP_PX)
     overview = _fitted(camera.width, camera.height, (width - 2 * GAP_PX, OVERVIEW_PX))
     row_px = TITLE_PX + PANEL_PX[1] + AXIS_PX
-    height = GAP_PX + LINE_PX * len(lines) + GAP_PX + overview[1] + GAP_PX + row_px * len(telling.found)
+    height = GAP_PX + LINE_PX * len(lines) + GAP_PX + overview[1] + GAP_PX + row_px * len(telling.regions)
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     for index, line in enumerate(lines):
         weight = "bold" if index == 0 else "normal"
         figure.text(GAP_PX / width, 1 - (GAP_PX + LINE_PX * index) / height, line, va="top", weight=weight, size=10)
     top = GAP_PX + LINE_PX * len(lines) + GAP_PX
-    _overview(box(figure, (width - overview[0]) // 2, top, *overview), image, telling.found)
-    for row, place in enumerate(telling.found):
+    _overview(box(figure, (width - overview[0]) // 2, top, *overview), image, telling.regions)
+    for row, place in enumerate(telling.regions):
         below = top + overview[1] + GAP_PX + row_px * row + TITLE_PX
         for column, (T, name) in enumerate(((T_before, caption.before), (T_after, caption.after))):
             left = GAP_PX + AXIS_PX + column * (PANEL_PX[0] + GAP_PX + AXIS_PX)
@@ -143,7 +143,12 @@ def difference_text(T_before: Matrix4, T_after: Matrix4) -> str:
 
 
 def sentences(
-    window: Window, telling: Places, shift: Shift | None, T_before: Matrix4, T_after: Matrix4, caption: Caption
+    window: Window,
+    telling: DifferenceRegions,
+    shift: Shift | None,
+    T_before: Matrix4,
+    T_after: Matrix4,
+    caption: Caption,
 ) -> list[str]:
     """The lines above the picture."""
     where = f"{window.rig.pair}, {instant(window.pairs[telling.index].stamp_ns)}"
@@ -158,7 +163,7 @@ def sentences(
         )
     if caption.network:
         lines.append(f"depth network: {caption.network}")
-    if telling.found:
+    if telling.regions:
         lines.append(
             "Lines: outlines of near things that the LiDAR saw; dots: its other range edges. They belong on edges of "
             "the image."
@@ -174,16 +179,16 @@ def sentences(
     return lines
 
 
-def _axes_text(apart: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> str:
+def _axes_text(difference: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> str:
     """The shift by axis, with its standard deviation where that is known; translations only where there are any."""
     spread = np.full(6, np.nan) if sigma is None else sigma
-    told = []
+    parts = []
     for axis, name in enumerate(("pitch", "yaw", "roll", "right", "down", "forward")):
         factor, unit, digits = (degrees(1.0), "°", 2) if axis < 3 else (100.0, " cm", 1)
-        if axis < 3 or np.isfinite(spread[axis]) or np.abs(apart[3:]).max() * factor >= 0.05:
+        if axis < 3 or np.isfinite(spread[axis]) or np.abs(difference[3:]).max() * factor >= 0.05:
             known = f" ± {factor * spread[axis]:.{digits}f}" if np.isfinite(spread[axis]) else ""
-            told.append(f"{name} {number(factor * apart[axis], digits, sign=True)}{known}{unit}")
-    return ", ".join(told)
+            parts.append(f"{name} {number(factor * difference[axis], digits, sign=True)}{known}{unit}")
+    return ", ".join(parts)
 
 
 def _fitted(width: int, height: int, within: tuple[int, int]) -> tuple[int, int]:
@@ -192,11 +197,11 @@ def _fitted(width: int, height: int, within: tuple[int, int]) -> tuple[int, int]
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def _overview(axes: Axes, image_bgr: NDArray[np.uint8], found: Sequence[Place]) -> None:
+def _overview(axes: Axes, image_bgr: NDArray[np.uint8], regions: Sequence[DifferenceRegion]) -> None:
     height, width = image_bgr.shape[:2]
     axes.imshow(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2RGB), extent=(-0.5, width - 0.5, height - 0.5, -0.5))
     axes.set_axis_off()
-    for name, place in zip(NAMES, found, strict=False):
+    for name, place in zip(NAMES, regions, strict=False):
         part = place.part
         for colour, line_width in (("black", 3.5), ("white", 1.5)):
             corner = (part.left - 0.5, part.top - 0.5)
@@ -225,7 +230,7 @@ def _panel(
         grey, cmap="gray", vmin=darkest - margin, vmax=brightest + margin, extent=(left, right, bottom, top),
         interpolation="bicubic",
     )  # fmt: skip
-    at = drawn_at(outlines, rig, T_camera_lidar)
+    at = project_outlines(outlines, rig, T_camera_lidar)
     pieces = at.uv_px[outlines.pieces[at.seen[outlines.pieces].all(axis=1)]]
     for colour_of_line, line_width in (("black", 4.5), (colour, 2.5)):
         axes.add_collection(

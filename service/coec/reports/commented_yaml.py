@@ -55,7 +55,7 @@ def short_yaml(model: BaseModel, always: Collection[str], comments: Mapping[str,
 def _differing(model: BaseModel, place: str, always: Collection[str]) -> dict[str, Any]:
     """Fields with a value that is not their default, and those of `always`; a list of models as a list of such
     mappings."""
-    found: dict[str, Any] = {}
+    differing: dict[str, Any] = {}
     for name, field in type(model).model_fields.items():
         value, here = getattr(model, name), f"{place}{name}"
         if value is None:
@@ -63,12 +63,12 @@ def _differing(model: BaseModel, place: str, always: Collection[str]) -> dict[st
         if isinstance(value, BaseModel):
             block = _differing(value, f"{here}.", always)
             if block or field.is_required():
-                found[name] = block
+                differing[name] = block
         elif here in always or field.is_required() or value != field.get_default(call_default_factory=True):
             if _holds_models(value):
                 value = [_differing(item, f"{here}.", always) for item in value]
-            found[name] = value
-    return found
+            differing[name] = value
+    return differing
 
 
 def _short_lines(name: str, value: Any, place: str, comments: Mapping[str, str]) -> Iterator[str]:

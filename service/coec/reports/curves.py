@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from coec.evaluation.profiles import Scan, Views
-from coec.evaluation.statistics import HIT_M, FramesPoint, SlicePoint, Spread
+from coec.evaluation.statistics import HIT_M, FrameCountStatistics, SliceStatistics, SpreadStatistics
 from coec.reports.bullseye import HIT_DEG
 from coec.reports.plots import TICKS, png
 
@@ -34,8 +34,8 @@ def landscape(curves: Mapping[str, Views], title: str) -> bytes:
             every = np.concatenate([views.wide[axis].scores for axis in group])
             lowest, height = float(every.min()), float(np.ptp(every)) or 1.0
             for column, axis in enumerate(group):
-                _draw_scan(panels[2 * row, column], name, views.wide[axis], lowest, height)
-                _draw_scan(panels[2 * row + 1, column], name, views.narrow[axis], lowest, height)
+                _plot_scan(panels[2 * row, column], name, views.wide[axis], lowest, height)
+                _plot_scan(panels[2 * row + 1, column], name, views.narrow[axis], lowest, height)
         panels[2 * row, 0].set_ylabel("score, lowest 0 to highest 1")
         panels[2 * row + 1, 0].set_ylabel("same scale, near the reference")
     for axes in panels.flat:
@@ -45,7 +45,7 @@ def landscape(curves: Mapping[str, Views], title: str) -> bytes:
     return png(figure)
 
 
-def error_against_frames(points: Sequence[FramesPoint], with_translation: bool, title: str) -> bytes:
+def error_against_frames(points: Sequence[FrameCountStatistics], with_translation: bool, title: str) -> bytes:
     """Median and 95th percentile of the error over subsets, and the σ that the solves claim, by the number of frames;
     below, the share of hits."""
     frames = [float(point.frames) for point in points]
@@ -54,14 +54,14 @@ def error_against_frames(points: Sequence[FramesPoint], with_translation: bool, 
     )
 
 
-def error_against_slice(points: Sequence[SlicePoint], with_translation: bool, title: str) -> bytes:
+def error_against_slice(points: Sequence[SliceStatistics], with_translation: bool, title: str) -> bytes:
     """Like `error_against_frames`, by the length of the slice, with the number of frames in it."""
     lengths_s = [point.length_s for point in points]
     labels = [f"{point.length_s:.3g} s\n{point.frames:g} fr." for point in points]
     return _errors(points, lengths_s, labels, "length of the slice and frames in it (median)", with_translation, title)
 
 
-def _draw_scan(axes: Axes, name: str, scan: Scan, lowest: float, height: float) -> None:
+def _plot_scan(axes: Axes, name: str, scan: Scan, lowest: float, height: float) -> None:
     scale, unit = (degrees(1.0), "deg") if scan.axis < 3 else (1.0, "m")
     scores = (scan.scores - lowest) / height
     best = scan.best_offset * scale
@@ -71,7 +71,7 @@ def _draw_scan(axes: Axes, name: str, scan: Scan, lowest: float, height: float) 
 
 
 def _errors(
-    points: Sequence[FramesPoint] | Sequence[SlicePoint],
+    points: Sequence[FrameCountStatistics] | Sequence[SliceStatistics],
     at: Sequence[float],
     labels: Sequence[str],
     what: str,
@@ -82,13 +82,13 @@ def _errors(
     figure = Figure(figsize=(8.0 * columns, 6.5), layout="constrained")
     figure.suptitle(title)
     panels = figure.subplots(2, columns, sharex=True, squeeze=False, height_ratios=(3, 1))
-    _draw_errors(
+    _plot_errors(
         panels[0, 0], at, [_in_degrees(point.rotation_rad) for point in points], "rotation error, deg", HIT_DEG
     )
     claimed = [degrees(point.sigma_rad) for point in points]
     panels[0, 0].plot(at, claimed, "^:", color="tab:purple", label="σ claimed (root of the three variances), median")
     if with_translation:
-        _draw_errors(panels[0, 1], at, [point.translation_m for point in points], "translation error, m", HIT_M)
+        _plot_errors(panels[0, 1], at, [point.translation_m for point in points], "translation error, m", HIT_M)
     for upper, lower in zip(panels[0], panels[1], strict=True):
         _tick(upper)
         upper.legend()
@@ -104,7 +104,7 @@ def _errors(
     return png(figure)
 
 
-def _draw_errors(axes: Axes, at: Sequence[float], errors: Sequence[Spread], label: str, limit: float) -> None:
+def _plot_errors(axes: Axes, at: Sequence[float], errors: Sequence[SpreadStatistics], label: str, limit: float) -> None:
     axes.plot(at, [error.p95 for error in errors], "s--", label="95th percentile")
     axes.plot(at, [error.median for error in errors], "o-", label="median")
     axes.axhline(limit, color="grey", linewidth=0.8, linestyle=":", label=f"limit of a hit, {limit:g}")
@@ -120,5 +120,5 @@ def _tick(axes: Axes) -> None:
     axes.minorticks_off()
 
 
-def _in_degrees(errors: Spread) -> Spread:
-    return Spread(degrees(errors.median), degrees(errors.p95), degrees(errors.max))
+def _in_degrees(errors: SpreadStatistics) -> SpreadStatistics:
+    return SpreadStatistics(degrees(errors.median), degrees(errors.p95), degrees(errors.max))

@@ -22,7 +22,7 @@ NAMES = ("pitch", "yaw", "roll", "right", "down", "forward")
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class SolvedOffset:
     """The result of a solve of all pairs, relative to the pose that was asked about.
 
     Attributes:
@@ -40,7 +40,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ExtrinsicFinding:
     """`state`: right, moved, unclear, or bad_data. `sentence` says what was found; `remarks` say what it rests on, what
     it leaves open, and what to do."""
 
@@ -53,8 +53,8 @@ STYLES = {"right": "bold green", "moved": "bold red", "unclear": "bold yellow", 
 
 
 def finding_of(
-    seen: Observation, offset: Sequence[float], sigma: Sequence[float], measured: Measured | None = None
-) -> Finding:
+    seen: Observation, offset: Sequence[float], sigma: Sequence[float], measured: SolvedOffset | None = None
+) -> ExtrinsicFinding:
     """The finding of one check. `offset` (6,) leads from the pose that was asked about to where the edges fit; `sigma`
     are its standard deviations, degrees and metres. A check knows how far a pose is off only if that is little, so for
     a flagged pose the result that a solve has `measured` comes first."""
@@ -62,12 +62,12 @@ def finding_of(
         texts = tuple(f"{cause.code}: {cause.text}" for cause in seen.causes)
         advice = tuple(dict.fromkeys(cause.advice for cause in seen.causes))
         then = "Then ask again: with such data no check tells whether the mount has moved."
-        return Finding("bad_data", "the data is wrong, not necessarily the mount", (*texts, *advice, then))
+        return ExtrinsicFinding("bad_data", "the data is wrong, not necessarily the mount", (*texts, *advice, then))
     least = max(SEEN * value for value in sigma[:3])
     faint = ("The edges are faint: in the service this check would count for little.",) if seen.weak else ()
     if seen.flagged:
         sentence, how = _how_far(offset, sigma, measured)
-        return Finding(
+        return ExtrinsicFinding(
             "moved",
             sentence,
             (
@@ -78,12 +78,12 @@ def finding_of(
             ),
         )
     if seen.undecided:
-        return Finding(
+        return ExtrinsicFinding(
             "unclear",
             f"cannot tell: the edges fit best at {moved_text(offset, sigma)}, but hardly worse where they are",
             (*faint, "Take a longer recording, in motion, with poles and corners in view, or run `coec calibrate`."),
         )
-    return Finding(
+    return ExtrinsicFinding(
         "right",
         "the extrinsic is right, as far as one check tells",
         (*faint, f"A mount that moved by less than {least:.2f}° about any axis would not be seen in it."),
@@ -93,16 +93,18 @@ def finding_of(
 def moved_text(offset: Sequence[float], sigma: Sequence[float], *, with_sigma: bool = True) -> str:
     """The axes that are off by more than chance, farthest first; if none is, the farthest alone. Axes without a σ are
     left out."""
-    told = [
+    ratios = [
         (abs(value) / spread, axis)
         for axis, (value, spread) in enumerate(zip(offset, sigma, strict=True))
         if spread > 0.0
     ]
-    far = sorted((distance, axis) for distance, axis in told if distance >= TELLING) or [max(told)]
+    far = sorted((distance, axis) for distance, axis in ratios if distance >= TELLING) or [max(ratios)]
     return ", ".join(_axis_text(axis, offset[axis], sigma[axis], with_sigma) for _, axis in reversed(far))
 
 
-def _how_far(offset: Sequence[float], sigma: Sequence[float], measured: Measured | None) -> tuple[str, tuple[str, ...]]:
+def _how_far(
+    offset: Sequence[float], sigma: Sequence[float], measured: SolvedOffset | None
+) -> tuple[str, tuple[str, ...]]:
     """For a mount that moved: the sentence, and what its figures rest on."""
     if measured is None:
         return f"mount moved: {moved_text(offset, sigma)}", (NEAREST,)
@@ -132,17 +134,17 @@ NEAREST = (
 )
 
 
-def show(finding: Finding) -> None:
+def show(finding: ExtrinsicFinding) -> None:
     """Prints the sentence in the colour of its state, with the remarks below."""
     console.show(finding.sentence, STYLES[finding.state])
-    for remark in finding.remarks:
-        console.show(f"  {remark}")
+    for note in finding.remarks:
+        console.show(f"  {note}")
 
 
 def _axis_text(axis: int, value: float, spread: float, with_sigma: bool) -> str:
     digits, unit = (1 if spread >= EXACT_DEG else 2, "°") if axis < 3 else (2, " m")
-    told = f"{NAMES[axis]} {_signed(value, digits)}{unit}"
-    return f"{told} ± {spread:.2f}{unit}" if with_sigma else told
+    text = f"{NAMES[axis]} {_signed(value, digits)}{unit}"
+    return f"{text} ± {spread:.2f}{unit}" if with_sigma else text
 
 
 def _signed(value: float, digits: int) -> str:

@@ -35,10 +35,10 @@ def _of_group(seen: Mapping[str, Views], group: range) -> Iterator[Chart]:
     for name, views in seen.items():
         every = np.concatenate([views.wide[axis].scores for axis in group])
         scales[name] = float(every.min()), float(np.ptp(every)) or 1.0
-    for told, attribute in (("from afar", "wide"), ("from near", "narrow")):
+    for distance, attribute in (("from afar", "wide"), ("from near", "narrow")):
         for axis in group:
             scans: dict[str, Scan] = {name: getattr(views, attribute)[axis] for name, views in seen.items()}
-            yield _scans(f"{AXIS_NAMES[axis]}, {told}", scans, scales)
+            yield _scans(f"{AXIS_NAMES[axis]}, {distance}", scans, scales)
 
 
 def _scans(title: str, scans: Mapping[str, Scan], scales: Mapping[str, tuple[float, float]]) -> Chart:
@@ -48,8 +48,8 @@ def _scans(title: str, scans: Mapping[str, Scan], scales: Mapping[str, tuple[flo
         scores = ((scan.scores - lowest) / height).tolist()
         series.append(Series(name, list(zip((factor * scan.offsets).tolist(), scores, strict=True))))
         best.append(f"{name} at {number(factor * scan.best_offset, digits, sign=True)} {unit}")
-    told = f"the highest place is that of {', '.join(best)}"
-    return Chart(title, f"from the reference, {unit}", "", tuple(series), told, marks=(Mark(0.0, ""),))
+    description = f"the highest place is that of {', '.join(best)}"
+    return Chart(title, f"from the reference, {unit}", "", tuple(series), description, marks=(Mark(0.0, ""),))
 
 
 def _unit(axis: int) -> tuple[float, str, int]:
@@ -57,49 +57,53 @@ def _unit(axis: int) -> tuple[float, str, int]:
     return (degrees(1.0), "°", 2) if axis < 3 else (100.0, "cm", 1)
 
 
-def normalised(found: NormalisedErrorsReport) -> Charts:
+def normalised(report: NormalisedErrorsReport) -> Charts:
     """A histogram of errors over claimed standard deviations beside the normal distribution that they should follow,
     and the share of errors in intervals against the share that should lie there; rotations and translations apart."""
-    told = {name: [axis for axis in group if sum(found.histogram[axis])] for name, group in AXES_OF.items()}
+    axes_by_group = {name: [axis for axis in group if sum(report.histogram[axis])] for name, group in AXES_OF.items()}
     return Charts(
         tuple(
             chart
-            for name, axes in told.items()
+            for name, axes in axes_by_group.items()
             if axes
-            for chart in (_histogram(found, name, axes), _held(found, name, axes))
+            for chart in (_histogram(report, name, axes), _held(report, name, axes))
         ),
         small=True,
     )
 
 
-def _histogram(found: NormalisedErrorsReport, name: str, axes: list[int]) -> Chart:
-    edges, normal = found.bin_edges, NormalDist()
+def _histogram(report: NormalisedErrorsReport, name: str, axes: list[int]) -> Chart:
+    edges, normal = report.bin_edges, NormalDist()
     beyond = [0.0, *(normal.cdf(edge) for edge in edges[1:-1]), 1.0]
     expected = _steps(edges, [high - low for low, high in pairwise(beyond)])
     counted = []
     for axis in axes:
-        counts = found.histogram[axis]
+        counts = report.histogram[axis]
         counted.append(Series(AXIS_NAMES[axis], _steps(edges, [count / sum(counts) for count in counts]), "steps"))
-    told = f"{found.judged} accepted results, errors against {found.against}; the outermost steps hold what lies beyond"
+    description = (
+        f"{report.judged} accepted results, errors against {report.against}; the outermost steps hold what lies beyond"
+    )
     series = (Series(AS_IT_SHOULD_BE, expected, "dotted"), *counted)
-    return Chart(f"Share of results by error / σ, {name}", "error / claimed σ", "", series, told, from_zero=True)
+    return Chart(f"Share of results by error / σ, {name}", "error / claimed σ", "", series, description, from_zero=True)
 
 
-def _held(found: NormalisedErrorsReport, name: str, axes: list[int]) -> Chart:
+def _held(report: NormalisedErrorsReport, name: str, axes: list[int]) -> Chart:
     shares = [
         Series(
             AXIS_NAMES[axis],
             [
                 (at, held)
-                for at, held in zip(found.confidences, found.reliability[axis], strict=True)
+                for at, held in zip(report.confidences, report.reliability[axis], strict=True)
                 if held is not None
             ],
         )
         for axis in axes
     ]
-    told = "above the diagonal claims are wider than errors, below it they are too narrow"
+    description = "above the diagonal claims are wider than errors, below it they are too narrow"
     series = (Series(AS_IT_SHOULD_BE, [(0.0, 0.0), (1.0, 1.0)], "dotted"), *shares)
-    return Chart(f"Share within their intervals, {name}", "share that should be", "", series, told, from_zero=True)
+    return Chart(
+        f"Share within their intervals, {name}", "share that should be", "", series, description, from_zero=True
+    )
 
 
 def _steps(edges: tuple[float, ...], values: list[float]) -> list[tuple[float, float]]:

@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 
 from coec.evaluation import statistics, steps
 from coec.evaluation.closure import Closure
-from coec.evaluation.detection import Tried, table
+from coec.evaluation.detection import TriedCheck, table
 from coec.evaluation.normalised_errors import BIN_EDGES, CONFIDENCES, NormalisedErrors
 from coec.evaluation.split_halves import Halves
-from coec.evaluation.steps import TriedKnock
+from coec.evaluation.steps import MountStepTrial
 from coec.schemas import evaluation as wire
 from coec.schemas.replies import Maybe6
 
 
-def spread_of(spread: statistics.Spread, scale: float = 1.0) -> wire.Spread:
+def spread_of(spread: statistics.SpreadStatistics, scale: float = 1.0) -> wire.Spread:
     """The spread of a figure, times `scale`."""
     return wire.Spread(
         median=number(scale * spread.median), p95=number(scale * spread.p95), max=number(scale * spread.max)
     )
 
 
-def angle_spread_of(spread_rad: statistics.Spread) -> wire.Spread:
+def angle_spread_of(spread_rad: statistics.SpreadStatistics) -> wire.Spread:
     """The spread of an angle, radians, in degrees."""
     return spread_of(spread_rad, degrees(1.0))
 
@@ -38,7 +38,7 @@ def verdicts_of(verdicts: statistics.Verdicts) -> wire.VerdictCounts:
     return wire.VerdictCounts(**asdict(verdicts))
 
 
-def frames_point_of(point: statistics.FramesPoint) -> wire.FramesPoint:
+def frames_point_of(point: statistics.FrameCountStatistics) -> wire.FramesPoint:
     """Errors of windows of one number of frames."""
     return wire.FramesPoint(
         frames=point.frames,
@@ -50,7 +50,7 @@ def frames_point_of(point: statistics.FramesPoint) -> wire.FramesPoint:
     )
 
 
-def slice_point_of(point: statistics.SlicePoint) -> wire.SlicePoint:
+def slice_point_of(point: statistics.SliceStatistics) -> wire.SlicePoint:
     """Errors of windows from slices of one length."""
     return wire.SlicePoint(
         length_s=point.length_s,
@@ -80,38 +80,38 @@ def halves_of(halves: Halves) -> wire.HalvesReport:
     )
 
 
-def detection_of(tried: Sequence[Tried], splits: int, pairs: int) -> wire.DetectionReport:
+def detection_of(tried: Sequence[TriedCheck], splits: int, pairs: int) -> wire.DetectionReport:
     """The checks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
     moves = tuple(wire.DetectionRow(**asdict(row)) for row in table(tried))
     return wire.DetectionReport(splits=splits, pairs=pairs, moves=moves)
 
 
-def steps_of(tried: Sequence[TriedKnock]) -> tuple[wire.StepRow, ...]:
+def steps_of(tried: Sequence[MountStepTrial]) -> tuple[wire.StepRow, ...]:
     """The windows of `try_knocks`, counted by knock."""
     return tuple(wire.StepRow(**asdict(row)) for row in steps.table(tried))
 
 
-def normalised_of(against: str, found: NormalisedErrors) -> wire.NormalisedErrorsReport:
+def normalised_of(against: str, errors: NormalisedErrors) -> wire.NormalisedErrorsReport:
     """Normalised errors, relative to what `against` names."""
-    within = [cast("Maybe6", tuple(_numbers(row))) for row in found.coverage]
-    low, high = found.nees_bounds
+    within = [cast("Maybe6", tuple(_numbers(row))) for row in errors.coverage]
+    low, high = errors.nees_bounds
     return wire.NormalisedErrorsReport(
         against=against,
-        judged=found.judged,
-        refused=found.refused,
-        independent=found.independent,
-        rms=in_degrees(found.rms),
-        largest=in_degrees(found.largest),
-        sigma=in_degrees(found.sigma),
-        sigma_over_rms=cast("Maybe6", tuple(_numbers(found.sigma_over_rms))),
+        judged=errors.judged,
+        refused=errors.refused,
+        independent=errors.independent,
+        rms=in_degrees(errors.rms),
+        largest=in_degrees(errors.largest),
+        sigma=in_degrees(errors.sigma),
+        sigma_over_rms=cast("Maybe6", tuple(_numbers(errors.sigma_over_rms))),
         within_1_sigma=within[0],
         within_2_sigma=within[1],
         within_3_sigma=within[2],
         bin_edges=BIN_EDGES,
-        histogram=tuple(tuple(int(count) for count in row) for row in found.histogram),
+        histogram=tuple(tuple(int(count) for count in row) for row in errors.histogram),
         confidences=CONFIDENCES,
-        reliability=tuple(tuple(_numbers(column)) for column in found.reliability.T),
-        nees=number(found.nees),
+        reliability=tuple(tuple(_numbers(column)) for column in errors.reliability.T),
+        nees=number(errors.nees),
         nees_low=number(low),
         nees_high=number(high),
     )

@@ -21,11 +21,11 @@ from coec.reports.page import (
     Table,
     Text,
     Tone,
-    Verdict,
+    VerdictBanner,
 )
 from coec.reports.page.words import count, number, percent
 from coec.reports.page_parts import DIGITS, SHOWN_UNITS
-from coec.reports.provenance import Made, depth_items
+from coec.reports.provenance import Provenance, depth_items
 from coec.schemas.evaluation import (
     ComparisonReport,
     DetectionReport,
@@ -44,7 +44,7 @@ ERROR_MEANING = (
 )
 
 
-def evaluation_page(report: EvaluationReport, ends: Sequence[Block], worst: Sequence[Block], made: Made) -> Page:
+def evaluation_page(report: EvaluationReport, ends: Sequence[Block], worst: Sequence[Block], made: Provenance) -> Page:
     """The page of one method.
 
     Args:
@@ -64,7 +64,7 @@ def evaluation_page(report: EvaluationReport, ends: Sequence[Block], worst: Sequ
     return Page("coec evaluate", title, (_verdict(report),), tuple(sections))
 
 
-def comparison_page(report: ComparisonReport, ends: Sequence[Block], made: Made) -> Page:
+def comparison_page(report: ComparisonReport, ends: Sequence[Block], made: Provenance) -> Page:
     """The page of several methods side by side, with pictures of where their searches ended. Each method also has a
     page of its own in the folder of its name."""
     rows: list[Sequence[str | Cell]] = [
@@ -96,7 +96,7 @@ def comparison_page(report: ComparisonReport, ends: Sequence[Block], made: Made)
         *((Section("Not evaluated", (not_allowed,)),) if missing else ()),
         made.section((("Source", report.source),)),
     )  # fmt: skip
-    opening = (Verdict("none", "Compared.", f"{sentence}."),)
+    opening = (VerdictBanner("none", "Compared.", f"{sentence}."),)
     return Page("coec evaluate", f"Methods side by side on {best.vehicle} / {best.pair}", opening, sections)
 
 
@@ -122,7 +122,7 @@ def detection_table(detection: DetectionReport) -> Table:
     return Table(caption, heads, rows, frozenset(range(1, 6)))
 
 
-def _verdict(report: EvaluationReport) -> Verdict:
+def _verdict(report: EvaluationReport) -> VerdictBanner:
     misses = report.verdicts.accepted_misses
     limits = f"{report.hit_rotation_deg:g}°"
     if report.hit_translation_m is not None:
@@ -134,15 +134,15 @@ def _verdict(report: EvaluationReport) -> Verdict:
     )
     if misses:
         served = count(misses, "miss", "misses")
-        told = f"{served} would have been served: look at the worst start below, and at its figures."
+        consequence = f"{served} would have been served: look at the worst start below, and at its figures."
         doubt = reference_doubt(report)
         if doubt is not None:
-            return Verdict("unsure", "Beside the reference, and accepted.", sentence, (doubt, told))
-        return Verdict("bad", "Wrong and accepted.", sentence, (told,))
+            return VerdictBanner("unsure", "Beside the reference, and accepted.", sentence, (doubt, consequence))
+        return VerdictBanner("bad", "Wrong and accepted.", sentence, (consequence,))
     refused = report.verdicts.failed_hits
     tone: Tone = "good" if report.hits == report.starts and not refused else "unsure"
     lost = f" {count(refused, 'right result was', 'right results were')} refused." if refused else ""
-    return Verdict(tone, "No miss was accepted.", f"{sentence}{lost}")
+    return VerdictBanner(tone, "No miss was accepted.", f"{sentence}{lost}")
 
 
 def _spreads(report: EvaluationReport) -> Table:
@@ -171,10 +171,10 @@ def _axes(report: EvaluationReport) -> Table:
 
 
 def _verdicts(report: EvaluationReport) -> Table:
-    told = report.verdicts
+    counts = report.verdicts
     rows = (
-        (Cell("accepted", tone="good"), str(told.accepted_hits), str(told.accepted_misses)),
-        (Cell("refused", tone="bad"), str(told.failed_hits), str(told.failed_misses)),
+        (Cell("accepted", tone="good"), str(counts.accepted_hits), str(counts.accepted_misses)),
+        (Cell("refused", tone="bad"), str(counts.failed_hits), str(counts.failed_misses)),
     )
     return Table("Starts by verdict and by truth", ("Verdict", "Hits", "Misses"), rows, frozenset({1, 2}))
 
@@ -207,8 +207,8 @@ def _errors_chart(
     title: str, x_label: str, at: Sequence[float], points: Sequence[FramesPoint | SlicePoint], hit_deg: float
 ) -> Chart:
     def series(name: str, values: Sequence[float | None], shape: str = "line") -> Series:
-        told = [(x, value) for x, value in zip(at, values, strict=True) if value is not None]
-        return Series(name, told, "dotted" if shape == "dotted" else "line")
+        known = [(x, value) for x, value in zip(at, values, strict=True) if value is not None]
+        return Series(name, known, "dotted" if shape == "dotted" else "line")
 
     medians = [point.rotation_deg.median for point in points]
     return Chart(
@@ -220,7 +220,7 @@ def _errors_chart(
             series("95th percentile", [point.rotation_deg.p95 for point in points]),
             series("σ claimed", [point.sigma_deg for point in points], "dotted"),
         ),
-        told=f"the median error goes from {number(medians[0])}° to {number(medians[-1])}°",
+        description=f"the median error goes from {number(medians[0])}° to {number(medians[-1])}°",
         limits=(Limit(hit_deg, f"a hit: {hit_deg:g}°"),),
         log_y=True,
         log_x=len(at) > 1 and min(at) > 0,
@@ -264,28 +264,28 @@ def _halves(halves: HalvesReport, dof: int) -> Table:
     return Table(caption, heads, rows, frozenset(range(1, 5)))
 
 
-def _normalised(found: NormalisedErrorsReport) -> tuple[Block, ...]:
+def _normalised(report: NormalisedErrorsReport) -> tuple[Block, ...]:
     rows = [
         (
             name,
-            *(number(of[axis], 4) for of in (found.rms, found.largest, found.sigma)),
-            number(found.sigma_over_rms[axis], 2),
-            *(percent(of[axis]) for of in (found.within_1_sigma, found.within_2_sigma, found.within_3_sigma)),
+            *(number(of[axis], 4) for of in (report.rms, report.largest, report.sigma)),
+            number(report.sigma_over_rms[axis], 2),
+            *(percent(of[axis]) for of in (report.within_1_sigma, report.within_2_sigma, report.within_3_sigma)),
             SHOWN_UNITS[UNITS[axis]],
         )
         for axis, name in enumerate(AXIS_NAMES)
-        if found.sigma[axis] is not None
+        if report.sigma[axis] is not None
     ]
     heads = ("Error", "Rms", "Largest", "σ claimed", "σ / rms", "Within 1 σ", "2 σ", "3 σ", "Unit")
-    caption = f"{found.judged} accepted, {found.refused} refused. True claims hold 68.3, 95.4 and 99.7 %."
+    caption = f"{report.judged} accepted, {report.refused} refused. True claims hold 68.3, 95.4 and 99.7 %."
     table = Table(caption, heads, rows, frozenset(range(1, 8)))
-    if found.nees is None:
-        return (table, evaluation_charts.normalised(found))
-    told = (
-        f"NEES per axis {number(found.nees, 2)}; of true claims {number(found.nees_low, 2)} to "
-        f"{number(found.nees_high, 2)} in 95 % of evaluations with {found.independent} results that share no frame."
+    if report.nees is None:
+        return (table, evaluation_charts.normalised(report))
+    nees_text = (
+        f"NEES per axis {number(report.nees, 2)}; of true claims {number(report.nees_low, 2)} to "
+        f"{number(report.nees_high, 2)} in 95 % of evaluations with {report.independent} results that share no frame."
     )
-    return table, Text((told,), quiet=True), evaluation_charts.normalised(found)
+    return table, Text((nees_text,), quiet=True), evaluation_charts.normalised(report)
 
 
 def _steps(steps: Sequence[StepRow]) -> Table:
@@ -308,7 +308,7 @@ def _setting(report: EvaluationReport) -> Facts:
     box = f"±{report.search_rotation_deg:g}°"
     if report.search_translation_m > 0:
         box += f", ±{report.search_translation_m:g} m"
-    ended = ", ".join(f"{reason.replace('_', ' ')} {starts}" for reason, starts in report.stop_reasons.items())
+    stop_reasons = ", ".join(f"{reason.replace('_', ' ')} {starts}" for reason, starts in report.stop_reasons.items())
     return Facts(
         (
             ("Objective", report.objective),
@@ -317,7 +317,7 @@ def _setting(report: EvaluationReport) -> Facts:
             ("Pairs of image and sweep", str(report.pairs)),
             ("Starts", f"{report.starts}, {setting(report.start_rotation_deg, report.start_translation_m)}"),
             ("Search box", box),
-            ("Searches ended as", ended),
+            ("Searches ended as", stop_reasons),
             *((f"Time, {stage}", f"{number(seconds, 1)} s") for stage, seconds in report.elapsed_s.items()),
         )
     )

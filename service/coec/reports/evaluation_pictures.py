@@ -8,12 +8,12 @@ from math import degrees
 from pathlib import Path
 
 from coec.adapters.files import output
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.ports import Silence
 from coec.evaluation import profiles, starts, statistics
 from coec.evaluation.experiments import SUBSETS, Bench
 from coec.evaluation.normalised_errors import NormalisedErrors
-from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
+from coec.evaluation.statistics import FrameCountStatistics, SliceStatistics, SolveOutcome
 from coec.reports import curves, evaluation_charts, normalised_plots, pictures, plots
 from coec.reports.bullseye import bullseye
 from coec.reports.close_ups import Caption
@@ -40,7 +40,7 @@ class Starts:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class EvaluationBlocks:
     """Blocks of an evaluation's page: where searches ended, and the start that ended farthest from the reference."""
 
     ends: tuple[Block, ...]
@@ -51,11 +51,11 @@ def write(
     folder: Path,
     bench: Bench,
     of_starts: Starts,
-    outcomes: Sequence[Outcome],
-    frames: Sequence[FramesPoint],
-    slices: Sequence[SlicePoint],
-    heard: Callable[[int, str], None],
-) -> Drawn:
+    outcomes: Sequence[SolveOutcome],
+    frames: Sequence[FrameCountStatistics],
+    slices: Sequence[SliceStatistics],
+    on_progress: Callable[[int, str], None],
+) -> EvaluationBlocks:
     """Writes the bullseye, landscapes, errors against the amount of data where they were asked for, and the worst start
     beside where it ended.
 
@@ -68,25 +68,25 @@ def write(
         f"{len(bench.window.pairs)} frames"
     )
     hits = sum(outcome.hit for outcome in outcomes)
-    unit = starts.directions(of_starts.directions)
+    unit = starts.sphere_directions(of_starts.directions)
     spheres = {"Rotation vectors of the starts": unit}
     if of_starts.translation_m > 0:
-        spheres["Translations of the starts"] = unit[starts.partners(of_starts.directions)]
+        spheres["Translations of the starts"] = unit[starts.translation_partners(of_starts.directions)]
     rate = f"{hits} of {len(outcomes)} starts hit, from {of_starts}"
-    output.write(folder / "bullseye.png", plots.bullseye(outcomes, spheres, f"{title}\n{rate}"))
+    output.write_output(folder / "bullseye.png", plots.bullseye(outcomes, spheres, f"{title}\n{rate}"))
     if frames:
         about = f"{title} and fewer\n{SUBSETS} subsets of each size, from {of_starts}"
-        output.write(folder / "frames.png", curves.error_against_frames(frames, dof == 6, about))
+        output.write_output(folder / "frames.png", curves.error_against_frames(frames, dof == 6, about))
     if slices:
         about = f"{title} in all\n{SUBSETS} solves of each length, from {of_starts}"
-        output.write(folder / "slices.png", curves.error_against_slice(slices, dof == 6, about))
-    seen = write_landscape(folder, bench, title, heard)
+        output.write_output(folder / "slices.png", curves.error_against_slice(slices, dof == 6, about))
+    seen = write_landscape(folder, bench, title, on_progress)
     ends = (bullseye({"": outcomes}, spheres), Text((LANDSCAPE,), quiet=True), evaluation_charts.landscape(seen))
-    return Drawn(ends, _write_worst(folder, bench, outcomes))
+    return EvaluationBlocks(ends, _write_worst(folder, bench, outcomes))
 
 
 def write_comparison(
-    folder: Path, window_id: str, of_starts: Starts, outcomes: Mapping[str, Sequence[Outcome]]
+    folder: Path, window_id: str, of_starts: Starts, outcomes: Mapping[str, Sequence[SolveOutcome]]
 ) -> tuple[Block, ...]:
     """Writes the bullseyes of all methods side by side.
 
@@ -94,33 +94,33 @@ def write_comparison(
         OutputError: the folder or the file cannot be written.
     """
     title = f"{window_id}: {of_starts.directions} starts, {of_starts}"
-    unit = starts.directions(of_starts.directions)
-    output.write(folder / "bullseye.png", plots.compared(outcomes, unit, title))
+    unit = starts.sphere_directions(of_starts.directions)
+    output.write_output(folder / "bullseye.png", plots.compared(outcomes, unit, title))
     return (bullseye(outcomes, {"starts": unit}),)
 
 
-def write_normalised(folder: Path, name: str, found: Mapping[str, NormalisedErrors]) -> None:
+def write_normalised(folder: Path, name: str, errors: Mapping[str, NormalisedErrors]) -> None:
     """Writes normalised.png: errors over what was claimed for them, by what they are measured against.
 
     Raises:
         OutputError: the folder or the file cannot be written.
     """
-    output.write(folder / "normalised.png", normalised_plots.normalised(found, name))
+    output.write_output(folder / "normalised.png", normalised_plots.normalised(errors, name))
 
 
 def write_landscape(
-    folder: Path, bench: Bench, title: str, heard: Callable[[int, str], None]
+    folder: Path, bench: Bench, title: str, on_progress: Callable[[int, str], None]
 ) -> Mapping[str, profiles.Views]:
     """Writes profiles.png, the fused objective and its witnesses about the reference, and returns what it shows."""
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
-    sight = sight_of(window, bench.depth, bench.images, bench.configuration, Silence())
-    named = profiles.landscapes(sight, bench.configuration)
-    seen = profiles.views(named, bench.reference, bench.configuration.search.dof, heard)
-    output.write(folder / "profiles.png", curves.landscape(seen, f"{title}\nabout the source's calibration"))
+    window_data = prepare_window_data(window, bench.depth, bench.images, bench.configuration, Silence())
+    named = profiles.landscapes(window_data, bench.configuration)
+    seen = profiles.views(named, bench.reference, bench.configuration.search.dof, on_progress)
+    output.write_output(folder / "profiles.png", curves.landscape(seen, f"{title}\nabout the source's calibration"))
     return seen
 
 
-def _write_worst(folder: Path, bench: Bench, outcomes: Sequence[Outcome]) -> tuple[Block, ...]:
+def _write_worst(folder: Path, bench: Bench, outcomes: Sequence[SolveOutcome]) -> tuple[Block, ...]:
     index = statistics.worst(outcomes)
     outcome = outcomes[index]
     start_deg = windows.rotation_error_deg(outcome.trial.start, bench.reference)
@@ -131,13 +131,13 @@ def _write_worst(folder: Path, bench: Bench, outcomes: Sequence[Outcome]) -> tup
         network=pictures.network_text(bench.configuration.depth.model, bench.depth.identity),
     )
     estimate = outcome.trial.estimate
-    drawn = pictures.write_comparison(
+    comparison = pictures.write_comparison(
         folder,
         bench.window,
         outcome.trial.start,
         outcome.T_camera_lidar,
         caption,
         bench.configuration.motion_compensation,
-        None if estimate is None else estimate.uncertainty.looks,
+        None if estimate is None else estimate.uncertainty.independent_samples,
     )
-    return drawn.blocks
+    return comparison.blocks

@@ -11,7 +11,7 @@ from typing import Any
 from coec.calibration.types import Matrix4
 from coec.evaluation import statistics
 from coec.evaluation.detection import RIGHT
-from coec.evaluation.statistics import Outcome
+from coec.evaluation.statistics import SolveOutcome
 from coec.geometry import se3
 from coec.reports import console
 from coec.reports.evaluation_documents import in_degrees
@@ -44,8 +44,8 @@ def setting(rotation_deg: float, translation_m: float) -> str:
 def reference_doubt(report: EvaluationReport) -> str | None:
     """Where searches from all around meet beside the source's calibration, and one that began at it ends there, too: a
     sentence that says so, as the misses may be the reference's. None where they do not."""
-    apart = [middle - end for middle, end in zip(report.median, report.from_reference, strict=True)]
-    if not _is_hit(report, apart) or _is_hit(report, report.from_reference):
+    difference = [middle - end for middle, end in zip(report.median, report.from_reference, strict=True)]
+    if not _is_hit(report, difference) or _is_hit(report, report.from_reference):
         return None
     where = f"{hypot(*report.from_reference[:3]):.2f}°"
     if report.hit_translation_m is not None:
@@ -62,12 +62,12 @@ def _is_hit(report: EvaluationReport, error: Sequence[float]) -> bool:
     return hypot(*error[:3]) < report.hit_rotation_deg and hypot(*error[3:]) < limit_m
 
 
-def verdict(outcome: Outcome) -> str:
+def verdict(outcome: SolveOutcome) -> str:
     """The decision in one word."""
     return "accepted" if outcome.accepted else "failed"
 
 
-def csv_of(reference: Matrix4, outcomes: Sequence[Outcome]) -> str:
+def csv_of(reference: Matrix4, outcomes: Sequence[SolveOutcome]) -> str:
     """A line per start: its begin and its end relative to the reference (4, 4), degrees and metres, camera axes."""
     axes = [f"{axis}_{unit}" for axis, unit in zip(console.AXES, console.UNITS, strict=True)]
     text = io.StringIO()
@@ -76,11 +76,11 @@ def csv_of(reference: Matrix4, outcomes: Sequence[Outcome]) -> str:
     for index, outcome in enumerate(outcomes):
         start = in_degrees(se3.difference(outcome.trial.start, reference))
         estimate = outcome.trial.estimate
-        found: list[object] = [""] * 5
+        figures: list[object] = [""] * 5
         reasons = statistics.NOT_SOLVED
         if estimate is not None:
             optimum = estimate.optimum
-            found = [optimum.score_at_start, optimum.score, optimum.mi, optimum.overlap, optimum.evaluations]
+            figures = [optimum.score_at_start, optimum.score, optimum.mi, optimum.overlap, optimum.evaluations]
             reasons = " ".join(reason.code for reason in estimate.verdict.reasons)
         judged = [
             degrees(outcome.rotation_rad),
@@ -90,7 +90,7 @@ def csv_of(reference: Matrix4, outcomes: Sequence[Outcome]) -> str:
             reasons,
             statistics.stop_reason(outcome),
         ]
-        table.writerow([index, *start, *in_degrees(outcome.error), *judged, outcome.trial.solve_s, *found])
+        table.writerow([index, *start, *in_degrees(outcome.error), *judged, outcome.trial.solve_s, *figures])
     return text.getvalue()
 
 
@@ -147,8 +147,8 @@ def show(report: EvaluationReport) -> None:
     verdicts.add_row(console.styled("accepted"), str(counts.accepted_hits), str(counts.accepted_misses))
     verdicts.add_row(console.styled("failed"), str(counts.failed_hits), str(counts.failed_misses))
     console.out.print(verdicts)
-    ended = ", ".join(f"{starts} {reason}" for reason, starts in report.stop_reasons.items())
-    console.show(f"classified correctly: {100 * report.classified_correctly:.1f} %; searches ended: {ended}")
+    stop_reasons = ", ".join(f"{starts} {reason}" for reason, starts in report.stop_reasons.items())
+    console.show(f"classified correctly: {100 * report.classified_correctly:.1f} %; searches ended: {stop_reasons}")
     _show_experiments(report)
     console.show(_seconds(report.elapsed_s))
 
@@ -225,8 +225,8 @@ def show_closure(report: ClosureReport) -> None:
     known = ", ".join(
         f"{console.figure(value)} {unit}" for value, unit in zip(report.known, console.UNITS, strict=True)
     )
-    told = "as the recordings tell" if report.from_recordings else "as given"
-    console.show(f"{report.relation}; A in the frame of B, {told}: {known}")
+    origin = "as the recordings tell" if report.from_recordings else "as given"
+    console.show(f"{report.relation}; A in the frame of B, {origin}: {known}")
     console.show(
         f"{report.trials} starts {setting(report.start_rotation_deg, report.start_translation_m)}, objective "
         f"{report.objective}, {report.dof} degrees of freedom"
@@ -243,29 +243,29 @@ def show_closure(report: ClosureReport) -> None:
     console.show(_seconds(report.elapsed_s))
 
 
-def _show_normalised(found: NormalisedErrorsReport) -> None:
+def _show_normalised(errors: NormalisedErrorsReport) -> None:
     """Prints errors beside what was claimed for them."""
-    console.show(f"errors against {found.against}: {found.judged} accepted, {found.refused} refused")
+    console.show(f"errors against {errors.against}: {errors.judged} accepted, {errors.refused} refused")
     columns = ("error", "rms", "largest", "σ claimed", "σ / rms", "within 1 σ", "2 σ", "3 σ")
     table = console.table(*columns, "unit", right=range(1, len(columns)))
     for axis, name in enumerate(console.AXIS_NAMES):
-        if found.sigma[axis] is None:
+        if errors.sigma[axis] is None:
             continue
-        coverage = [row[axis] for row in (found.within_1_sigma, found.within_2_sigma, found.within_3_sigma)]
+        coverage = [row[axis] for row in (errors.within_1_sigma, errors.within_2_sigma, errors.within_3_sigma)]
         table.add_row(
             name,
-            console.figure(found.rms[axis], 4),
-            console.figure(found.largest[axis], 4),
-            console.figure(found.sigma[axis], 4),
-            console.figure(found.sigma_over_rms[axis], 2),
+            console.figure(errors.rms[axis], 4),
+            console.figure(errors.largest[axis], 4),
+            console.figure(errors.sigma[axis], 4),
+            console.figure(errors.sigma_over_rms[axis], 2),
             *("-" if share is None else f"{100 * share:.1f} %" for share in coverage),
             console.UNITS[axis],
         )
     console.out.print(table)
-    if found.nees is not None:
-        limits = f"{console.figure(found.nees_low, 2)} to {console.figure(found.nees_high, 2)}"
+    if errors.nees is not None:
+        limits = f"{console.figure(errors.nees_low, 2)} to {console.figure(errors.nees_high, 2)}"
         console.show(
-            f"NEES per axis {found.nees:.2f}; of true claims {limits} in 95 % of evaluations with {found.independent} "
+            f"NEES per axis {errors.nees:.2f}; of true claims {limits} in 95 % of evaluations with {errors.independent} "
             "results that share no frame"
         )
 
@@ -299,8 +299,8 @@ def _show_steps(steps: Sequence[StepRow]) -> None:
             "-" if share is None else f"{100 * share:.0f} %"
             for share in (row.moved, row.accepted, row.wrong, row.time_known, row.holds)
         )
-        off, told = ("-" if seconds is None else f"{seconds:.1f} s" for seconds in (row.off_s, row.told_s))
-        table.add_row(row.name, str(row.windows), moved, accepted, wrong, known, off, told, holds)
+        off, interval = ("-" if seconds is None else f"{seconds:.1f} s" for seconds in (row.off_s, row.told_s))
+        table.add_row(row.name, str(row.windows), moved, accepted, wrong, known, off, interval, holds)
     console.out.print(table)
 
 

@@ -16,14 +16,14 @@ KEYS = "↑↓ choose   r reasons   h history   o overlay   f filter   q quit"
 """The keys that can be pressed."""
 
 
-def board(fleet: FleetNow, chosen: int, first: int, rows: int, filtered: str) -> RenderableType:
+def board(fleet: FleetNow, selected: int, first: int, rows: int, filtered: str) -> RenderableType:
     """The head, and `rows` of the pairs from `first` on; the one at `chosen` is marked (-1: none)."""
     shown = fleet.pairs[first : first + rows]
     table = console.table(
         "", "vehicle", "pair", "state", "said", "looked", "drift", "± σ", "why", "event", right=(4, 5, 6, 7)
     )
     for index, pair in enumerate(shown, first):
-        table.add_row(*_row(pair, marked=index == chosen), style="reverse" if index == chosen else "")
+        table.add_row(*_row(pair, marked=index == selected), style="reverse" if index == selected else "")
     below = fleet.matching - first - len(shown)
     foot = [Text(f"… and {below} more", "dim")] if below > 0 else []
     return Group(head(fleet, filtered), table, *foot)
@@ -38,7 +38,7 @@ def head(fleet: FleetNow, filtered: str) -> Text:
     if filtered:
         line.append(f"   showing {fleet.matching}: {filtered}", "cyan")
     if fleet.refused:
-        refused = ", ".join(f"{words} {cause}" for cause, words in sorted(fleet.refused.items()))
+        refused = ", ".join(f"{heartbeats} {cause}" for cause, heartbeats in sorted(fleet.refused.items()))
         line.append(f"   not taken: {refused}", "yellow")
     return line
 
@@ -49,7 +49,7 @@ def detail(pair: PairNow) -> RenderableType:
     lines: list[RenderableType] = [
         Text.assemble(
             f"{word.vehicle}/{word.pair}  ",
-            told(pair),
+            state_text(pair),
             f" since {duration(max(word.said_ns - word.since_ns, 0) * 1e-9 + pair.said_s)}",
             f", said {duration(pair.said_s)} ago, by coec {console.plain(word.version)}, "
             f"configuration {console.plain(word.config_hash)}, {count(word.windows, 'window')}",
@@ -81,7 +81,7 @@ def detail(pair: PairNow) -> RenderableType:
     return Group(*lines, Text(served + event), figures)
 
 
-def told(pair: PairNow) -> Text:
+def state_text(pair: PairNow) -> Text:
     """The state of a pair; for one that is silent now, its last state in brackets."""
     if pair.standing == "live":
         return console.styled(pair.word.state)
@@ -110,7 +110,7 @@ def _row(pair: PairNow, *, marked: bool) -> tuple[RenderableType, ...]:
         Text("▶" if marked else " "),
         Text(word.vehicle),
         Text(word.pair),
-        told(pair),
+        state_text(pair),
         Text(duration(pair.said_s)),
         Text("never" if pair.looked_s is None else duration(pair.looked_s)),
         Text(drift, "bold red" if pair.urgency >= 1.0 else ""),

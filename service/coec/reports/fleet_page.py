@@ -8,9 +8,9 @@ from math import inf
 
 from coec.reports.console import figure
 from coec.reports.instants import day
-from coec.reports.page import Block, Cell, Page, Section, Table, Text, Trend, Verdict
+from coec.reports.page import Block, Cell, Page, Section, Table, Text, Trend, VerdictBanner
 from coec.reports.page.words import NONE, count, percent
-from coec.reports.provenance import Made
+from coec.reports.provenance import Provenance
 from coec.schemas.fleet import AXES, FalseAlarms, FleetChanges, FleetReport, PairOfFleet
 
 NAMES = dict(zip(AXES, ("pitch", "yaw", "roll", "right", "down", "forward"), strict=True))
@@ -27,7 +27,7 @@ DRIFTED = 1.0
 COMPARED = 2
 """Accepted windows that a drift takes: an earlier and a later one."""
 
-DRAWN, LISTED = 100, 1000
+PLOTTED, LISTED = 100, 1000
 """Pairs with a plot, and pairs after them with a row, so that the page stays below 3 MB whatever the fleet. All others
 are summarised."""
 
@@ -41,7 +41,7 @@ BANDS = (1.0, 0.5, 0.25, 0.1, 0.0)
 """Lower ends of the bands of urgency in which pairs that are not listed are counted."""
 
 
-def page(report: FleetReport, title: str, made: Made) -> Page:
+def page(report: FleetReport, title: str, made: Provenance) -> Page:
     """The page; names of vehicles are text in it, never markup."""
     sections = []
     if report.changes is not None:
@@ -53,24 +53,24 @@ def page(report: FleetReport, title: str, made: Made) -> Page:
         counts = [*report.refusals.items(), *((f"{code} (no result)", n) for code, n in report.errors.items())]
         counts.sort(key=lambda item: (-item[1], item[0]))
         rows = [(Cell(code, code=True), str(n)) for code, n in counts[:ROWS]]
-        told = f"Windows by code of a reason; one window may have several.{_left_out(len(counts))}"
-        table = Table(told, ("Code", "Windows"), rows, frozenset({1}))
+        caption = f"Windows by code of a reason; one window may have several.{_left_out(len(counts))}"
+        table = Table(caption, ("Code", "Windows"), rows, frozenset({1}))
         sections.append(Section("Why windows were refused, or have no result", (table,)))
     if report.figures:
         sections.append(Section("Figures of accepted windows over the fleet", _figures(report)))
     return Page("coec fleet report", title, (_verdict(report),), (*sections, made.section()))
 
 
-def _verdict(report: FleetReport) -> Verdict:
+def _verdict(report: FleetReport) -> VerdictBanner:
     urgent = [pair for pair in report.pairs if pair.urgency >= DRIFTED]
     if not urgent:
         if all(pair.accepted < COMPARED for pair in report.pairs):
             todo = "Judge windows of other days, too: a drift is what lies between earlier windows and later ones."
-            return Verdict("none", "Drift not known.", sentence(report), (todo,))
-        return Verdict("good", "No drift.", sentence(report))
+            return VerdictBanner("none", "Drift not known.", sentence(report), (todo,))
+        return VerdictBanner("good", "No drift.", sentence(report))
     first = f"{urgent[0].vehicle}/{urgent[0].pair}"
     todo = f"Look at {first} first: see that its mount is tight, and commission it again where the camera was moved."
-    return Verdict("unsure", "Drift.", sentence(report), (todo,))
+    return VerdictBanner("unsure", "Drift.", sentence(report), (todo,))
 
 
 def sentence(report: FleetReport) -> str:
@@ -101,17 +101,17 @@ def sentence_of_alarms(alarms: FalseAlarms) -> str:
 
 
 def _alarms(alarms: FalseAlarms) -> tuple[Block, ...]:
-    told = Text((sentence_of_alarms(alarms),))
+    summary = Text((sentence_of_alarms(alarms),))
     accused = sorted(alarms.by_pair.items(), key=lambda item: (-item[1], item[0]))
     if not accused:
-        return (told,)
+        return (summary,)
     rows = [(name, str(number)) for name, number in accused[:ROWS]]
     caption = f"Pairs that were accused without cause.{_left_out(len(accused))}"
-    return told, Table(caption, ("Vehicle/pair", "False alarms"), rows, frozenset({1}))
+    return summary, Table(caption, ("Vehicle/pair", "False alarms"), rows, frozenset({1}))
 
 
 def _changes(changes: FleetChanges) -> tuple[Block, ...]:
-    told = Text(
+    summary = Text(
         (
             f"{count(changes.both, 'window is', 'windows are')} in both; {changes.identical} are decided the same "
             f"to the byte, {changes.newly_accepted} are newly accepted, {changes.newly_refused} newly refused,"
@@ -120,28 +120,28 @@ def _changes(changes: FleetChanges) -> tuple[Block, ...]:
         )
     )
     if not changes.windows:
-        return (told,)
+        return (summary,)
     rows = [
         (each.vehicle, each.window_id, each.before, each.now, figure(each.rotation_deg), figure(each.translation_m))
         for each in changes.windows
     ]
     heads = ("Vehicle", "Window", "Before", "Now", "deg", "m")
-    return told, Table("Decided otherwise, those furthest apart first", heads, rows, frozenset({4, 5}))
+    return summary, Table("Decided otherwise, those furthest apart first", heads, rows, frozenset({4, 5}))
 
 
 def _vehicles(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
     """The most urgent pairs with a plot, the next ones without, and all others summarised."""
     drift, counted = ("Urgency", "Worst axis", "Drift", "Per 30 days"), ("Windows", "Accepted", "Last window")
-    drawn, listed, others = pairs[:DRAWN], pairs[DRAWN : DRAWN + LISTED], pairs[DRAWN + LISTED :]
-    told = (
+    plotted, listed, others = pairs[:PLOTTED], pairs[PLOTTED : PLOTTED + LISTED], pairs[PLOTTED + LISTED :]
+    explanation = (
         "Drift: where the last accepted windows are from where the first were. The plot shows that axis, day by day:"
         " median, and the band that holds two thirds of the windows. Urgency 1 is a step that a monitor has to see,"
         " 0.5° or 10 cm."
     )
-    rows = [(*_drift(pair), _plot(pair), *_counts(pair)) for pair in drawn]
-    of_all = count(len(pairs), "pair") if not listed else f"The first {DRAWN} of {len(pairs)} pairs"
+    rows = [(*_drift(pair), _plot(pair), *_counts(pair)) for pair in plotted]
+    of_all = count(len(pairs), "pair") if not listed else f"The first {PLOTTED} of {len(pairs)} pairs"
     heads = ("Vehicle", "Pair", *drift, "Day by day", *counted)
-    blocks: list[Block] = [Text((told,), quiet=True), Table(of_all, heads, rows, frozenset({2, 4, 5, 7, 8}))]
+    blocks: list[Block] = [Text((explanation,), quiet=True), Table(of_all, heads, rows, frozenset({2, 4, 5, 7, 8}))]
     if listed:
         rows = [(*_drift(pair), *_counts(pair)) for pair in listed]
         caption = f"The next {len(listed)}, without plots"
@@ -153,7 +153,7 @@ def _vehicles(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
 
 def _together(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
     """Pairs that are not listed one by one, by how urgent they are."""
-    told = (
+    explanation = (
         f"{len(pairs)} pairs more are not listed one by one, as none of them is more urgent than those above. "
         f"{WHERE_ALL_IS}"
     )
@@ -165,7 +165,7 @@ def _together(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
             name = f"{low:g} and more" if high == inf else f"{low:g} to {high:g}"
             rows.append((name, str(len(of_band)), str(windows), percent(accepted / max(windows, 1))))
     heads = ("Urgency", "Pairs", "Windows", "Accepted")
-    return Text((told,)), Table("All other pairs, by urgency", heads, rows, frozenset({1, 2, 3}))
+    return Text((explanation,)), Table("All other pairs, by urgency", heads, rows, frozenset({1, 2, 3}))
 
 
 def _left_out(total: int) -> str:
@@ -200,7 +200,7 @@ def _plot(pair: PairOfFleet) -> str | Cell:
     axis, unit = AXES.index(pair.worst), pair.worst.rpartition("_")[2]
     step = -(-len(pair.days) // PLOTTED_DAYS) or 1
     days = pair.days[::-1][::step][::-1]
-    told = tuple(
+    points = tuple(
         (datetime.fromisoformat(of_day.date).timestamp(), low, middle, high)
         for of_day in days
         if (low := of_day.low[axis]) is not None
@@ -208,7 +208,7 @@ def _plot(pair: PairOfFleet) -> str | Cell:
         and (high := of_day.high[axis]) is not None
     )
     title = f"{pair.vehicle} {pair.pair}, {NAMES[pair.worst]} day by day"
-    return Cell("", trend=Trend(title, told, told[0][2], LEAST[unit])) if told else NONE
+    return Cell("", trend=Trend(title, points, points[0][2], LEAST[unit])) if points else NONE
 
 
 def _figures(report: FleetReport) -> tuple[Block, ...]:
@@ -223,9 +223,9 @@ def _figures(report: FleetReport) -> tuple[Block, ...]:
         for each in report.figures[:ROWS]
     ]
     heads = ("Figure", "Pair", "Vehicles", "Windows", "0.5 %", "Median", "99.5 %")
-    told = (
+    explanation = (
         "99 of 100 windows lie between the outer two. A vehicle without a baseline of its own can be held against them."
     )
-    return Text((told,), quiet=True), Table(
+    return Text((explanation,), quiet=True), Table(
         f"Figures by pair.{_left_out(len(report.figures))}", heads, rows, frozenset({2, 3, 4, 5, 6})
     )

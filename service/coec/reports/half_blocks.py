@@ -12,7 +12,7 @@ LIMITS = LimitsConfig(max_message_bytes=16 * 2**20, max_image_pixels=33_000_000)
 """Limits of a picture that came over a network."""
 
 
-def drawn(jpeg: bytes, columns: int, rows: int) -> Text:
+def half_block_text(jpeg: bytes, columns: int, rows: int) -> Text:
     """The picture in at most so many characters, with its proportions kept.
 
     Raises:

@@ -24,11 +24,11 @@ from coec.reports.page import (
     Table,
     Text,
     Tone,
-    Verdict,
+    VerdictBanner,
 )
 from coec.reports.page.words import count
 from coec.reports.page_parts import TONES, advice_of, axis_value, title_of
-from coec.reports.provenance import Made
+from coec.reports.provenance import Provenance
 from coec.reports.replies import entry_text
 from coec.schemas.incident import Absent, FetchedWindow, IncidentReport
 from coec.schemas.replies import (
@@ -62,7 +62,7 @@ PICTURED = {
 
 
 @dataclass(frozen=True, slots=True)
-class Story:
+class FetchedIncident:
     """What was fetched; None for what could not be."""
 
     event: EvidenceEvent
@@ -79,44 +79,48 @@ class Story:
 SAW = "What the camera saw: at the calibration that was served, and at the true one since"
 
 
-def page(story: Story, pictures: Mapping[str, bytes], made: Made) -> Page:
+def page(incident: FetchedIncident, pictures: Mapping[str, bytes], made: Provenance) -> Page:
     """The page; `pictures` are the files beside it, by name."""
-    event = story.event
+    event = incident.event
     codes = ", ".join(reason.code for reason in event.reasons) or "red event"
-    results = () if story.history is None else story.history.results
-    entries = () if story.history is None else story.history.entries
+    results = () if incident.history is None else incident.history.results
+    entries = () if incident.history is None else incident.history.entries
     sections = [
         *((Section(SAW, _pictures(pictures)),) if pictures else ()),
         Section("Figures around the event", tuple(_timeline(event))),
         *((Section("What was decided, and why", (_results(results, event), *_refusals(results))),) if results else ()),
-        *((Section("What happened, in the vehicle’s history", (_chain(story), _entries(entries))),) if entries else ()),
-        Section("Recordings", (*_windows(story.windows), *_snippets(story.snippets))),
+        *(
+            (Section("What happened, in the vehicle’s history", (_chain(incident), _entries(entries))),)
+            if entries
+            else ()
+        ),
+        Section("Recordings", (*_windows(incident.windows), *_snippets(incident.snippets))),
     ]
-    if story.health is not None:
-        sections.append(Section("Since then", (_now(story, story.health),)))
-    if story.absent:
-        rows = [(absent.what, absent.why) for absent in story.absent]
+    if incident.health is not None:
+        sections.append(Section("Since then", (_now(incident, incident.health),)))
+    if incident.absent:
+        rows = [(absent.what, absent.why) for absent in incident.absent]
         sections.append(
             Section("What is not here", (Table("Asked for, and not had", ("What", "Why"), rows, prose=frozenset({1})),))
         )
     sections.append(made.section((("Event", event.event_id),)))
-    told = list(sentences(story))
-    opening = (_verdict(story), Text(tuple(told[1:])))
+    lines = list(sentences(incident))
+    opening = (_verdict(incident), Text(tuple(lines[1:])))
     return Page("coec fetch", f"{event.vehicle}/{event.pair}: {codes}", opening, tuple(sections))
 
 
-def sentences(story: Story) -> Iterable[str]:
+def sentences(incident: FetchedIncident) -> Iterable[str]:
     """The story in a few sentences, each backed by a document in the folder."""
-    event = story.event
+    event = incident.event
     began = f"At {second(event.stamp_ns)} of sensor time the pair {event.pair} of {event.vehicle} turned red"
-    yield f"{began} (by the vehicle's clock {second(event.wall_ns)}). {_said(event.reasons)}"
-    decided = {result.window_id: result for result in (story.history.results if story.history else ())}
+    yield f"{began} (by the vehicle's clock {second(event.wall_ns)}). {_reasons_text(event.reasons)}"
+    decided = {result.window_id: result for result in (incident.history.results if incident.history else ())}
     for window_id, when in ((event.window_before, "before"), (event.window_after, "after")):
         if window_id is None:
             yield f"There is no window {when} it."
         elif window_id in decided:
             result = decided[window_id]
-            why = f": {_said(result.verdict.reasons)}" if result.verdict.reasons else "."
+            why = f": {_reasons_text(result.verdict.reasons)}" if result.verdict.reasons else "."
             verdict = f"{result.verdict.decision}{why}"
             yield f"The window {when} it, {window_id}, holds {count(result.pairs, 'pair')} and was {verdict}"
         else:
@@ -138,14 +142,16 @@ def sentence(report: IncidentReport) -> str:
     )
 
 
-def _verdict(story: Story) -> Verdict:
+def _verdict(incident: FetchedIncident) -> VerdictBanner:
     """What happened, by the first of `sentences`, and what to do; the tone depends on whether the event has ended."""
-    ended = story.event.resolution is not None
-    tone: Tone = "unsure" if ended else "bad"
-    return Verdict(tone, "Over." if ended else "Red.", next(iter(sentences(story))), advice_of(story.event.reasons))
+    resolved = incident.event.resolution is not None
+    tone: Tone = "unsure" if resolved else "bad"
+    return VerdictBanner(
+        tone, "Over." if resolved else "Red.", next(iter(sentences(incident))), advice_of(incident.event.reasons)
+    )
 
 
-def _said(reasons: Sequence[Reason]) -> str:
+def _reasons_text(reasons: Sequence[Reason]) -> str:
     return " ".join(f"{reason.text} ({reason.code})" for reason in reasons) or "No reason was given."
 
 
@@ -176,13 +182,13 @@ def _timeline(event: EvidenceEvent) -> Iterable[Block]:
     names = sorted({name for point in points for name in point.metrics})
     grounds = tuple(_grounds(points, event))
     charts = [_chart(name, points, event, grounds) for name in names[:MAX_PLOTS]]
-    drawn = tuple(chart for chart in charts if chart is not None)
+    plotted = tuple(chart for chart in charts if chart is not None)
     meaning = (
-        "The dashed line is the event, the ground the state of health." if drawn else "They hold no figures to draw."
+        "The dashed line is the event, the ground the state of health." if plotted else "They hold no figures to draw."
     )
     checks = f"{count(len(points), 'check')}, {second(first)} to {second(last)}"
     yield Text((f"{checks}; states: {states}. {meaning}",), quiet=True)
-    yield Charts(drawn, small=True)
+    yield Charts(plotted, small=True)
     if len(names) > MAX_PLOTS:
         yield Text((f"{len(names) - MAX_PLOTS} figures more are in event.json.",), quiet=True)
 
@@ -202,18 +208,18 @@ def _grounds(points: Sequence[MetricsPoint], event: EvidenceEvent) -> Iterable[G
 def _chart(
     name: str, points: Sequence[MetricsPoint], event: EvidenceEvent, grounds: tuple[Ground, ...]
 ) -> Chart | None:
-    told = [
+    samples = [
         (_seconds(point.stamp_ns, event), value) for point in points if (value := point.metrics.get(name)) is not None
     ]
-    if not told:
+    if not samples:
         return None
-    values = [value for _, value in told]
+    values = [value for _, value in samples]
     return Chart(
         title=title_of(name),
         x_label="s from the event",
         y_label="",
-        series=(Series(name, told),),
-        told=f"{figure(min(values))} to {figure(max(values))}",
+        series=(Series(name, samples),),
+        description=f"{figure(min(values))} to {figure(max(values))}",
         grounds=grounds,
         marks=(Mark(0.0, ""),),
     )
@@ -252,16 +258,16 @@ def _refusals(results: Sequence[CalibrationResult]) -> Iterable[Text]:
             if metric.limit is not None and not metric.passed
         ]
         because = f" Beyond their limits: {', '.join(failed)}." if failed else ""
-        why = _said(result.verdict.reasons).removesuffix(".")
+        why = _reasons_text(result.verdict.reasons).removesuffix(".")
         yield Text((f"{result.window_id} was refused: {why}.{because}",))
 
 
-def _chain(story: Story) -> Block:
-    if story.chain_holds is None:
+def _chain(incident: FetchedIncident) -> Block:
+    if incident.chain_holds is None:
         return Text(("The hashes of these entries could not be checked here.",), quiet=True)
-    if story.chain_holds:
+    if incident.chain_holds:
         return Text(("Each entry is what its hash says, and holds the hash of the one before it.",), quiet=True)
-    return Verdict(
+    return VerdictBanner(
         "bad", "Forged.", "The hashes of these entries do not fit: something was changed, taken out or put in."
     )
 
@@ -288,7 +294,7 @@ def _windows(windows: Sequence[FetchedWindow]) -> Iterable[Block]:
     if not windows:
         yield Text(("None was fetched.",))
         return
-    told: dict[bool | None, str | Cell] = {
+    match_labels: dict[bool | None, str | Cell] = {
         True: "the one in the history",
         False: Cell("not the one in the history", tone="bad"),
         None: "–",
@@ -299,7 +305,7 @@ def _windows(windows: Sequence[FetchedWindow]) -> Iterable[Block]:
             "–" if window.pairs is None else str(window.pairs),
             f"{window.size_bytes / 1e6:.1f}",
             window.decision or "not evaluated",
-            told[window.in_history],
+            match_labels[window.in_history],
             Cell(f"verified, {window.sha256[:16]}…", code=True),
         )
         for window in windows
@@ -319,9 +325,9 @@ def _snippets(snippets: Sequence[str]) -> Iterable[Block]:
         yield Table("Every frame of the seconds about the event", ("Recording",), rows)
 
 
-def _now(story: Story, health: HealthReply) -> Text:
-    served = "" if story.extrinsic is None else f" Served: {story.extrinsic.provenance}."
-    why = f" {_said(health.reasons)}" if health.reasons else ""
-    version = "" if story.status is None else f" The service is coec {story.status.version}."
+def _now(incident: FetchedIncident, health: HealthReply) -> Text:
+    served = "" if incident.extrinsic is None else f" Served: {incident.extrinsic.provenance}."
+    why = f" {_reasons_text(health.reasons)}" if health.reasons else ""
+    version = "" if incident.status is None else f" The service is coec {incident.status.version}."
     text = f"When this was fetched the pair was {health.state}, since {second(health.since_ns)}.{why}{served}{version}"
     return Text((text,))

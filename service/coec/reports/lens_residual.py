@@ -47,8 +47,8 @@ def lens_residual(camera: Camera, fitted: Camera) -> NDArray[np.uint8]:
     u = np.linspace(0.0, camera.width - 1.0, columns)
     v = np.linspace(0.0, camera.height - 1.0, rows)
     grid = np.stack(np.meshgrid(u, v), axis=-1)
-    apart = residuals_px(camera, fitted, grid.reshape(-1, 2)).reshape(rows, columns, 2)
-    size = np.hypot(apart[..., 0], apart[..., 1])
+    residuals = residuals_px(camera, fitted, grid.reshape(-1, 2)).reshape(rows, columns, 2)
+    size = np.hypot(residuals[..., 0], residuals[..., 1])
     lines = sentences(camera, fitted, size)
 
     factor = min(PICTURE_PX[0] / camera.width, PICTURE_PX[1] / camera.height)
@@ -71,11 +71,11 @@ def lens_residual(camera: Camera, fitted: Camera) -> NDArray[np.uint8]:
     axes.imshow(np.ma.masked_invalid(size), extent=extent, norm=scale, cmap=COLOURS)
     every = max(1, SAMPLES // ARROWS)
     middle = (slice(every // 2, None, every), slice(every // 2, None, every))
-    at, shift = grid[middle].reshape(-1, 2), apart[middle].reshape(-1, 2)
-    told = np.isfinite(shift).all(axis=1)
-    unit = shift[told] / np.maximum(np.hypot(*shift[told].T), LEAST_PX)[:, None]
+    at, shift = grid[middle].reshape(-1, 2), residuals[middle].reshape(-1, 2)
+    known = np.isfinite(shift).all(axis=1)
+    unit = shift[known] / np.maximum(np.hypot(*shift[known].T), LEAST_PX)[:, None]
     axes.quiver(
-        *at[told].T, *(0.6 * every * step * unit).T, angles="xy", scale_units="xy", scale=1.0, pivot="mid", width=0.002
+        *at[known].T, *(0.6 * every * step * unit).T, angles="xy", scale_units="xy", scale=1.0, pivot="mid", width=0.002
     )
     axes.set(xlim=extent[:2], ylim=extent[2:], xlabel="column, px", ylabel="row, px")
     bar = box(figure, MARGIN_PX + AXIS_PX, top + shown[1] + AXIS_PX, shown[0], BAR_PX)
@@ -85,14 +85,16 @@ def lens_residual(camera: Camera, fitted: Camera) -> NDArray[np.uint8]:
 
 def sentences(camera: Camera, fitted: Camera, size_px: NDArray[np.float64]) -> list[str]:
     """The lines above the picture; `size_px` are distances over the image, NaN where there is none."""
-    told = size_px[np.isfinite(size_px)]
+    known = size_px[np.isfinite(size_px)]
     names = f"{name_of(fitted)} fitted to {name_of(camera)}"
-    if len(told) == 0:
+    if len(known) == 0:
         return [f"{names}: the two have no pixel in common"]
-    apart = residual(camera, fitted)
-    rms, largest = (f"{value if value >= LEAST_PX else 0.0:.3g}" for value in (apart.rms_px, apart.max_px))
+    fit_residual = residual(camera, fitted)
+    rms, largest = (
+        f"{value if value >= LEAST_PX else 0.0:.3g}" for value in (fit_residual.rms_px, fit_residual.max_px)
+    )
     return [
         f"{names}: {rms} px rms, {largest} px at most",
-        f"Over {100 * len(told) / size_px.size:.0f} % of the image; grey: the lens or the model has no pixel there. "
+        f"Over {100 * len(known) / size_px.size:.0f} % of the image; grey: the lens or the model has no pixel there. "
         "Arrows: the direction.",
     ]

@@ -14,25 +14,25 @@ from coec.reports.curves import AXIS_TITLES
 from coec.reports.plots import png
 
 
-def normalised(found: Mapping[str, NormalisedErrors], title: str) -> bytes:
+def normalised(by_reference: Mapping[str, NormalisedErrors], title: str) -> bytes:
     """A row for each, by name: left, errors over claimed standard deviations per axis; right, the share of errors that
     lie in an interval against the share that should, up to 1, 2 and 3 standard deviations.
 
     Above the diagonal claims are wider than errors; below it they are too narrow.
     """
-    figure = Figure(figsize=(14.0, 5.0 * len(found)), layout="constrained")
+    figure = Figure(figsize=(14.0, 5.0 * len(by_reference)), layout="constrained")
     figure.suptitle(title)
-    panels = figure.subplots(len(found), 2, squeeze=False)
-    for (left, right), (against, errors) in zip(panels, found.items(), strict=True):
-        _draw_histogram(left, errors)
+    panels = figure.subplots(len(by_reference), 2, squeeze=False)
+    for (left, right), (against, errors) in zip(panels, by_reference.items(), strict=True):
+        _plot_histogram(left, errors)
         left.set_title(f"against {against}: {errors.judged} accepted, {errors.refused} refused", fontsize="medium")
-        _draw_reliability(right, errors)
+        _plot_reliability(right, errors)
         low, high = errors.nees_bounds
         right.set_title(f"NEES per axis {errors.nees:.2f}, of true claims {low:.2f} to {high:.2f}", fontsize="medium")
     return png(figure)
 
 
-def _draw_histogram(axes: Axes, errors: NormalisedErrors) -> None:
+def _plot_histogram(axes: Axes, errors: NormalisedErrors) -> None:
     edges = np.array(BIN_EDGES)
     normal = NormalDist()
     expected = np.diff([0.0, *(normal.cdf(edge) for edge in edges[1:-1]), 1.0])
@@ -46,7 +46,7 @@ def _draw_histogram(axes: Axes, errors: NormalisedErrors) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_reliability(axes: Axes, errors: NormalisedErrors) -> None:
+def _plot_reliability(axes: Axes, errors: NormalisedErrors) -> None:
     beyond = [2.0 * NormalDist().cdf(limit) - 1.0 for limit in SIGMAS]
     shares = np.array([*CONFIDENCES, *beyond])
     held = np.concatenate([errors.reliability, errors.coverage])

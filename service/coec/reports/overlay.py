@@ -28,7 +28,7 @@ INK, PAPER = (24, 24, 24), (250, 250, 250)
 Pixels = NDArray[np.uint8]
 
 
-def draw(
+def render_points(
     image_bgr: Pixels,
     camera: Camera,
     T_camera_lidar: Matrix4,

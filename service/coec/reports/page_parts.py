@@ -108,16 +108,16 @@ def axes_table(
     value_name: str,
     values: Sequence[float | None],
     sigmas: Sequence[float | None],
-    words: Mapping[int, str] | None = None,
+    labels: Mapping[int, str] | None = None,
     more: Mapping[str, Sequence[str]] | None = None,
 ) -> AxesTable:
     """A table of six axes, deg and m. `words` replace the values of axes that have none; `more` are further columns by
     head."""
-    words, more = words or {}, more or {}
+    labels, more = labels or {}, more or {}
     widest = {
         unit: max(
             (abs(value) + (sigma or 0.0) for axis, (value, sigma) in enumerate(zip(values, sigmas, strict=True))
-             if value is not None and axis not in words and UNITS[axis] == unit),
+             if value is not None and axis not in labels and UNITS[axis] == unit),
             default=0.0,
         )
         for unit in SHOWN_UNITS
@@ -126,15 +126,15 @@ def axes_table(
     for axis, (value, sigma) in enumerate(zip(values, sigmas, strict=True)):
         unit = UNITS[axis]
         scale = widest[unit] or 1.0
-        told = value is not None and axis not in words
+        known = value is not None and axis not in labels
         lines.append(
             AxisLine(
                 name=AXIS_NAMES[axis],
-                value=axis_value(value, axis) if told else words.get(axis, "not told"),
-                sigma=axis_value(sigma, axis, sign=False) if told else "",
+                value=axis_value(value, axis) if known else labels.get(axis, "not told"),
+                sigma=axis_value(sigma, axis, sign=False) if known else "",
                 unit=SHOWN_UNITS[unit],
-                share=value / scale if told and value is not None else None,
-                sigma_share=sigma / scale if told and sigma is not None else None,
+                share=value / scale if known and value is not None else None,
+                sigma_share=sigma / scale if known and sigma is not None else None,
                 more=tuple(column[axis] for column in more.values()),
             )
         )
@@ -196,8 +196,8 @@ def advice_of(reasons: Sequence[Reason]) -> tuple[str, ...]:
 def turn_and_shift(correction: Sequence[float | None]) -> str:
     """How far a correction (deg, m) turns and shifts, in words."""
     turn, shift = size(correction[:3]), size(correction[3:])
-    told = f"turned by {number(turn, 2)}°"
-    return told if not shift else f"{told} and shifted by {number(100.0 * shift, 1)} cm"
+    text = f"turned by {number(turn, 2)}°"
+    return text if not shift else f"{text} and shifted by {number(100.0 * shift, 1)} cm"
 
 
 def _advice(code: str) -> str:
@@ -211,7 +211,7 @@ def _advice(code: str) -> str:
 def _figure(name: str, metric: MetricReply, compared: bool) -> FigureLine:
     known = FIGURES.get(name)
     met = None if metric.limit is None else metric.passed
-    meaning = "" if known is None else known.tells
+    meaning = "" if known is None else known.measures
     if met is False and known is not None:
         meaning = f"{meaning} Here: {known.fails}."
     return FigureLine(

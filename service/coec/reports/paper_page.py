@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from coec.evaluation import paper_published
-from coec.reports.page import Block, Page, Section, Table, Text, Verdict
+from coec.reports.page import Block, Page, Section, Table, Text, VerdictBanner
 from coec.reports.page.words import NONE, number, percent
-from coec.reports.provenance import Made
+from coec.reports.provenance import Provenance
 
 PUBLISHED = (
     "Published: Borer, Tschirner, Ölsner and Milz, CVPR-W 2023, on KITTI-360 drive 0000, raw fisheye, with "
@@ -27,7 +27,7 @@ class Plots:
     drive: Block
 
 
-def paper_page(document: Mapping[str, Any], plots: Plots, made: Made) -> Page:
+def paper_page(document: Mapping[str, Any], plots: Plots, made: Provenance) -> Page:
     """The page of a `document` as `coec paper --json` prints it."""
     far = document["bullseye"]
     sentence = (
@@ -46,7 +46,7 @@ def paper_page(document: Mapping[str, Any], plots: Plots, made: Made) -> Page:
             (("Source", document["source"]), ("Objective", document["objective"]), ("Pairs", str(document["pairs"])))
         ),
     )
-    opening = (Verdict("none", "Repeated.", sentence), Text((PUBLISHED,), quiet=True))
+    opening = (VerdictBanner("none", "Repeated.", sentence), Text((PUBLISHED,), quiet=True))
     return Page("coec paper", "The published experiments, repeated", opening, sections)
 
 

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from coec.calibration.commissioning.equation_2 import PaperLimits
-from coec.evaluation.paper import MOVES_DEG, Figures
-from coec.evaluation.statistics import HIT_RAD, Outcome
+from coec.evaluation.paper import MOVES_DEG, FailureFigures
+from coec.evaluation.statistics import HIT_RAD, SolveOutcome
 from coec.reports.plots import png
 
-COLOURS = ("tab:green", "tab:orange", "tab:red")
+MOVE_COLOURS = ("tab:green", "tab:orange", "tab:red")
 
 PANELS = (
     ("mi", "mutual information, nats"),
@@ -21,20 +21,20 @@ PANELS = (
     ("f2", "least peakedness f'', nats per rad²"),
 )
 
-BINS = 30
+FAILURE_BINS = 30
 
 ROTATIONS = ((2, "roll"), (0, "pitch"), (1, "yaw"))
 """Axis and name, in the order of the paper."""
 
 
-def failure_metrics(figures: Sequence[Figures], limits: PaperLimits, title: str) -> bytes:
+def failure_metrics(figures: Sequence[FailureFigures], limits: PaperLimits, title: str) -> bytes:
     """The three figures at the right pose and at wrong ones, with the limits between them."""
     figure = Figure(figsize=(14.0, 4.6), layout="constrained")
     figure.suptitle(title)
     for axes, (name, label) in zip(figure.subplots(1, 3), PANELS, strict=True):
         values = {moved: [getattr(f, name) for f in figures if f.moved_deg == moved] for moved in MOVES_DEG}
-        edges = np.histogram_bin_edges(np.concatenate(list(values.values())), BINS)
-        for colour, (moved, of) in zip(COLOURS, values.items(), strict=True):
+        edges = np.histogram_bin_edges(np.concatenate(list(values.values())), FAILURE_BINS)
+        for colour, (moved, of) in zip(MOVE_COLOURS, values.items(), strict=True):
             what = "right" if moved == 0.0 else f"{moved:g}° off"
             axes.hist(of, edges, color=colour, alpha=0.55, label=what)
         limit = {"mi": limits.min_mi, "f1": limits.max_f1, "f2": limits.min_f2}[name]
@@ -45,7 +45,7 @@ def failure_metrics(figures: Sequence[Figures], limits: PaperLimits, title: str)
     return png(figure)
 
 
-def drive(runs: Mapping[str, Sequence[tuple[float, Outcome]]], title: str) -> bytes:
+def drive(runs: Mapping[str, Sequence[tuple[float, SolveOutcome]]], title: str) -> bytes:
     """Errors of roll, pitch and yaw over sensor time (seconds), for several named sets of starts."""
     figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     figure.suptitle(title)

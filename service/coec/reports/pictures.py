@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.output import write
+from coec.adapters.files.output import write_output
 from coec.adapters.images.codec import decode_bgr, encode_jpeg, encode_png
 from coec.adapters.images.range_colours import NEAREST_M, scale_of
 from coec.calibration.frames.motion_compensation import compensate
@@ -21,7 +21,7 @@ from coec.geometry.in_view import points_in_view
 from coec.reports.close_ups import Caption, close_ups, difference_text
 from coec.reports.instants import instant
 from coec.reports.lens_residual import lens_residual
-from coec.reports.overlay import draw, titled
+from coec.reports.overlay import render_points, titled
 from coec.reports.page import Block, Compare, Picture, Pictures, Text
 from coec.reports.page_parts import file_picture
 from coec.reports.residual_map import residual_map
@@ -44,7 +44,7 @@ def write_overlay(folder: Path, name: str, picture: NDArray[np.uint8], title: st
     Raises:
         OutputError: the folder or the file cannot be written.
     """
-    return write(folder / f"{name}.png", encode_png(titled(picture, title)))
+    return write_output(folder / f"{name}.png", encode_png(titled(picture, title)))
 
 
 def overlays(window: Window, poses: Sequence[Matrix4], compensated: bool) -> list[NDArray[np.uint8]]:
@@ -58,7 +58,7 @@ def overlays(window: Window, poses: Sequence[Matrix4], compensated: bool) -> lis
     image = decode_bgr(pair.camera.image, LimitsConfig())
     cloud = compensate(pair, rig, enabled=compensated)
     scale = scale_of(points_in_view(rig.camera, poses[0], cloud, rig.mask, NEAREST_M).range_m)
-    return [draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, scale) for T_camera_lidar in poses]
+    return [render_points(image, rig.camera, T_camera_lidar, cloud, rig.mask, scale) for T_camera_lidar in poses]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ def write_comparison(
     T_after: Matrix4,
     caption: Caption,
     compensated: bool,
-    looks: float | None,
+    independent_samples: float | None,
 ) -> Comparison:
     """Draws two extrinsics (4, 4) of a window: overlay_before.png, overlay_after.png, close_ups.png, and residuals.png
     at the second. The residuals are left out if they could not be trusted, because the pairs are worth too few
@@ -90,29 +90,31 @@ def write_comparison(
         CalibrationError: an image is not of the camera's size.
     """
     where = f"{window.rig.pair}  {instant(middle(window).stamp_ns)}"
-    apart = difference_text(T_before, T_after)
+    difference = difference_text(T_before, T_after)
     before, after = overlays(window, (T_before, T_after), compensated)
     near = close_ups(window, T_before, T_after, compensated=compensated, caption=caption)
     files = [
-        write_overlay(folder, "overlay_before", before, f"{where}  {caption.before}\n{apart} from {caption.after}"),
-        write_overlay(folder, "overlay_after", after, f"{where}  {caption.after}\n{apart} from {caption.before}"),
-        write(folder / "close_ups.png", encode_png(near)),
+        write_overlay(
+            folder, "overlay_before", before, f"{where}  {caption.before}\n{difference} from {caption.after}"
+        ),
+        write_overlay(folder, "overlay_after", after, f"{where}  {caption.after}\n{difference} from {caption.before}"),
+        write_output(folder / "close_ups.png", encode_png(near)),
     ]
-    told = (
-        f"Before: {caption.before}, {apart} from the other. LiDAR points, coloured by range.",
+    captions = (
+        f"Before: {caption.before}, {difference} from the other. LiDAR points, coloured by range.",
         f"After: {caption.after}.",
     )
-    slid = slid_pictures((before, after), told)
-    one_scene = looks is not None and saw_one_scene(looks, len(window.pairs))
+    slid = slid_pictures((before, after), captions)
+    one_scene = independent_samples is not None and saw_one_scene(independent_samples, len(window.pairs))
     if one_scene:
         why = (
-            f"No map of residuals: {len(window.pairs)} pairs that are worth {looks:.1f} independent looks show the "
+            f"No map of residuals: {len(window.pairs)} pairs that are worth {independent_samples:.1f} independent looks show the "
             "same edges again and again, as those of a vehicle that stands do, and a part of the image would look "
             "right or wrong by chance."
         )
         return Comparison(tuple(files), (slid, Pictures((file_picture(files[-1]),)), Text((why,), quiet=True)), (why,))
     left = residual_map(window, T_after, compensated=compensated, name=caption.after)
-    files.append(write(folder / "residuals.png", encode_png(left)))
+    files.append(write_output(folder / "residuals.png", encode_png(left)))
     return Comparison(tuple(files), (slid, Pictures(tuple(map(file_picture, files[2:])))), ())
 
 
@@ -132,7 +134,7 @@ def write_lens(folder: Path, camera: Camera, fitted: Camera) -> Path:
     Raises:
         OutputError: the folder or the file cannot be written.
     """
-    return write(folder / "lens_residual.png", encode_png(lens_residual(camera, fitted)))
+    return write_output(folder / "lens_residual.png", encode_png(lens_residual(camera, fitted)))
 
 
 def network_text(model: str, identity: str) -> str:

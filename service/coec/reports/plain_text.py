@@ -87,12 +87,12 @@ def _substitute(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
-    found = "".join(SIGNS.get(sign, "?") for sign in lacking)
+    replacement = "".join(SIGNS.get(sign, "?") for sign in lacking)
     try:
-        found.encode(error.encoding)
+        replacement.encode(error.encoding)
     except UnicodeEncodeError:  # an encoding that lacks letters of ASCII, too
-        found = "?" * len(lacking)
-    return found, error.end
+        replacement = "?" * len(lacking)
+    return replacement, error.end
 
 
 codecs.register_error(HANDLER, _substitute)

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 
-from coec.evaluation.statistics import Outcome
+from coec.evaluation.statistics import SolveOutcome
 from coec.reports.bullseye import HIT_DEG, LATITUDES_DEG, Places, end_places, latitude_radius, rim_of, start_places
 
 DPI = 110
@@ -31,7 +31,7 @@ TICKS = tuple(step * 10.0**decade for decade in range(-4, 3) for step in (1.0, 2
 COLOURS = "plasma"
 
 
-def bullseye(outcomes: Sequence[Outcome], directions: Mapping[str, NDArray[np.float64]], title: str) -> bytes:
+def bullseye(outcomes: Sequence[SolveOutcome], directions: Mapping[str, NDArray[np.float64]], title: str) -> bytes:
     """Left, for each of `directions` (title, (n, 3) unit vectors in camera axes): the start directions, coloured by
     where their solves ended. Right: where they ended, as seen from the reference.
 
@@ -41,15 +41,15 @@ def bullseye(outcomes: Sequence[Outcome], directions: Mapping[str, NDArray[np.fl
     figure.suptitle(title)
     colours = LogNorm(*ERROR_RANGE_DEG, clip=True)
     for column, (name, unit) in enumerate(directions.items()):
-        _draw_starts(_polar(figure, 1, len(directions) + 1, column), name, unit, outcomes, colours)
+        _plot_starts(_polar(figure, 1, len(directions) + 1, column), name, unit, outcomes, colours)
     axes = _polar(figure, 1, len(directions) + 1, len(directions))
-    _draw_target(axes, outcomes, colours, rim_of(outcomes))
+    _plot_target(axes, outcomes, colours, rim_of(outcomes))
     _scale(figure, [axes], colours)
     figure.legend(handles=_legend(outcomes), loc="outside lower center", ncols=4, frameon=False)
     return png(figure)
 
 
-def compared(methods: Mapping[str, Sequence[Outcome]], directions: NDArray[np.float64], title: str) -> bytes:
+def compared(methods: Mapping[str, Sequence[SolveOutcome]], directions: NDArray[np.float64], title: str) -> bytes:
     """A column per method: above, the start directions ((n, 3) unit vectors in camera axes) coloured by where their
     solves ended; below, where they ended. The targets have one radius, that of the worst method."""
     figure = Figure(figsize=(5.6 * len(methods) + 1.0, 11.5), layout="constrained")
@@ -60,8 +60,8 @@ def compared(methods: Mapping[str, Sequence[Outcome]], directions: NDArray[np.fl
     for column, (name, outcomes) in enumerate(methods.items()):
         hits = sum(outcome.hit for outcome in outcomes)
         above, below = _polar(figure, 2, len(methods), column), _polar(figure, 2, len(methods), len(methods) + column)
-        _draw_starts(above, f"{name}: {hits} of {len(outcomes)} hit", directions, outcomes, colours)
-        _draw_target(below, outcomes, colours, rim_deg)
+        _plot_starts(above, f"{name}: {hits} of {len(outcomes)} hit", directions, outcomes, colours)
+        _plot_target(below, outcomes, colours, rim_deg)
         panels += [above, below]
     _scale(figure, panels, colours)
     every = [outcome for outcomes in methods.values() for outcome in outcomes]
@@ -69,8 +69,8 @@ def compared(methods: Mapping[str, Sequence[Outcome]], directions: NDArray[np.fl
     return png(figure)
 
 
-def _draw_starts(
-    axes: PolarAxes, name: str, unit: NDArray[np.float64], outcomes: Sequence[Outcome], colours: LogNorm
+def _plot_starts(
+    axes: PolarAxes, name: str, unit: NDArray[np.float64], outcomes: Sequence[SolveOutcome], colours: LogNorm
 ) -> None:
     _marks(axes, start_places(unit), outcomes, colours)
     rings, names = [latitude_radius(ring) for ring in LATITUDES_DEG], [f"{ring:g}°" for ring in LATITUDES_DEG]
@@ -88,7 +88,7 @@ def _scale(figure: Figure, panels: Sequence[PolarAxes], colours: LogNorm) -> Non
     scale.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
 
 
-def _draw_target(axes: PolarAxes, outcomes: Sequence[Outcome], colours: LogNorm, rim_deg: float) -> None:
+def _plot_target(axes: PolarAxes, outcomes: Sequence[SolveOutcome], colours: LogNorm, rim_deg: float) -> None:
     _marks(axes, end_places(outcomes, rim_deg), outcomes, colours)
     axes.plot(np.linspace(0.0, 2.0 * pi, 181), np.full(181, HIT_DEG), color="tab:green", linewidth=1.2)
     rings = [0.25 * rim_deg, 0.5 * rim_deg, 0.75 * rim_deg, rim_deg]
@@ -100,7 +100,7 @@ def _draw_target(axes: PolarAxes, outcomes: Sequence[Outcome], colours: LogNorm,
     )
 
 
-def _marks(axes: PolarAxes, places: Places, outcomes: Sequence[Outcome], colours: LogNorm) -> None:
+def _marks(axes: PolarAxes, places: Places, outcomes: Sequence[SolveOutcome], colours: LogNorm) -> None:
     angle, radius = places.T
     final_deg = np.degrees([outcome.rotation_rad for outcome in outcomes])
     for hit in (True, False):
@@ -113,7 +113,7 @@ def _marks(axes: PolarAxes, places: Places, outcomes: Sequence[Outcome], colours
                 )  # fmt: skip
 
 
-def _legend(outcomes: Sequence[Outcome]) -> list[Line2D]:
+def _legend(outcomes: Sequence[SolveOutcome]) -> list[Line2D]:
     return [
         Line2D(
             [], [], linestyle="", marker=_marker(hit), markersize=7 if hit else 9, markerfacecolor="lightgrey",

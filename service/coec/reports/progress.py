@@ -33,7 +33,7 @@ COMPILING_S = 2.0
 COMPILING = "compiling the kernels, once on this machine, for about a minute"
 
 
-class CompilingNews:
+class CompilationProgress:
     """A compilation in progress: how many `kernels` were begun, and how long ago the first was (`lasted_s`)."""
 
     def __init__(self, now_s: Callable[[], float]) -> None:
@@ -41,7 +41,7 @@ class CompilingNews:
         self._began_s: float | None = None
         self._names: set[str] = set()
 
-    def hear(self, kernel: str) -> None:
+    def on_kernel(self, kernel: str) -> None:
         """Called by `compile_news` when a kernel is begun."""
         if self._began_s is None:
             self._began_s = self._now_s()
@@ -87,10 +87,10 @@ class Bars(Progress):
         self._say = say
         self._counted = counted
         self._now_s = now_s
-        self._told_s = now_s()
-        self._news = CompilingNews(now_s)
+        self._reported_s = now_s()
+        self._news = CompilationProgress(now_s)
         self._listening: AbstractContextManager[None] = (
-            compile_news.heard_by(self._hear) if compiling else nullcontext()
+            compile_news.listening(self._on_kernel) if compiling else nullcontext()
         )
         self._compiling: TaskID | None = None
         count = (MofNCompleteColumn(),) if counted else ()
@@ -120,10 +120,10 @@ class Bars(Progress):
         be."""
         task = self.add_task(description, note="")
 
-        def heard(done: int, total: int) -> None:
+        def on_progress(done: int, total: int) -> None:
             self.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} of {total / 1e6:.1f} MB")
 
-        return heard
+        return on_progress
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
         """Updates a task as in rich, and prints a line when it is time."""
@@ -137,8 +137,8 @@ class Bars(Progress):
         so_far = ", ".join(part for part in (done, task.fields.get("note", "")) if part)
         return f"{task.description}: {so_far}" if so_far else task.description
 
-    def _hear(self, kernel: str) -> None:
-        self._news.hear(kernel)
+    def _on_kernel(self, kernel: str) -> None:
+        self._news.on_kernel(kernel)
         if self._news.lasted_s < COMPILING_S:
             return
         first = self._compiling is None
@@ -147,11 +147,11 @@ class Bars(Progress):
         assert self._compiling is not None
         super().update(self._compiling, completed=self._news.kernels, note=f"{self._news.kernels} so far")
         if self.disable and (first or self._is_time()):
-            self._told_s = self._now_s()
+            self._reported_s = self._now_s()
             self._say(f"coec: {COMPILING}: {self._news.kernels} so far")
 
     def _is_time(self) -> bool:
-        if self._now_s() - self._told_s < LINE_S:
+        if self._now_s() - self._reported_s < LINE_S:
             return False
-        self._told_s = self._now_s()
+        self._reported_s = self._now_s()
         return True

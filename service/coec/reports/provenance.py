@@ -25,7 +25,7 @@ CALCULATING = ("numpy", "numba", "nlopt", "onnxruntime")
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class Provenance:
     """By what, when and how a document was made.
 
     Attributes:
@@ -58,10 +58,10 @@ class Made:
         return Section("Provenance", (Facts(items, frozenset({*codes, "Command"})),))
 
 
-def here() -> Made:
+def here() -> Provenance:
     """Provenance of a document that this process makes now."""
     command = shlex.join(["coec", *sys.argv[1:]])
-    return Made(
+    return Provenance(
         command,
         time.time_ns(),
         versions(),

@@ -37,8 +37,8 @@ def extrinsic(payload: bytes) -> None:
             console.show("  " + "  ".join(f"{value:+.6f}" for value in row))
     if reply.held:
         hold = reply.hold
-        told = hold_text("", None, None) if hold is None else hold_text(hold.sender, hold.since_ns, hold.reason)
-        console.show(f"nothing is applied: {told}", "bold yellow")
+        hold_summary = hold_text("", None, None) if hold is None else hold_text(hold.sender, hold.since_ns, hold.reason)
+        console.show(f"nothing is applied: {hold_summary}", "bold yellow")
     if reply.pending is not None:
         waits = f": {reply.pending.waits.text}" if reply.pending.waits else ""
         named = f"{reply.pending.sha256[:16]} " if reply.pending.sha256 else ""
@@ -129,14 +129,14 @@ def windows(payload: bytes) -> None:
     reply = from_json(replies.WindowsReply, payload)
     snippets = f", {count(len(reply.snippets), 'snippet')}" if reply.snippets else ""
     console.show(f"{reply.vehicle}/{reply.pair}  {count(len(reply.windows), 'window')}{snippets}")
-    kept = ("kept for",) if any(window.kept_for for window in reply.windows) else ()
-    table = console.table("window", "pairs", "MB", "verdict", "sha256", *kept, right=(1, 2))
+    retention_column = ("kept for",) if any(window.kept_for for window in reply.windows) else ()
+    table = console.table("window", "pairs", "MB", "verdict", "sha256", *retention_column, right=(1, 2))
     for window in reply.windows:
         size = f"{window.size_bytes / 1e6:.1f}"
         verdict = console.styled(window.decision or ("not evaluated" if window.sha256 else "not read yet"))
         pairs = "?" if window.pairs is None else str(window.pairs)
         row = (window.window_id, pairs, size, verdict, (window.sha256 or "not read yet")[:16])
-        table.add_row(*row, *([(window.kept_for or "").replace("_", " ")] if kept else []))
+        table.add_row(*row, *([(window.kept_for or "").replace("_", " ")] if retention_column else []))
     console.out.print(table)
     if reply.snippets:
         table = console.table("snippet", "MB", "event", "sha256", right=(1,))

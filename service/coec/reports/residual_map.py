@@ -69,7 +69,7 @@ def residual_map(
     shifts = local_shifts(window, GreyImages(LimitsConfig()), T_camera_lidar, compensated=compensated)
     pair = window.pairs[len(window.pairs) // 2]
     lines = folded(sentences(window, shifts, name), PICTURE_PX[0])
-    return _drawn(decode_grey(pair.camera.image, LimitsConfig()), shifts, lines)
+    return _render(decode_grey(pair.camera.image, LimitsConfig()), shifts, lines)
 
 
 def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
@@ -77,21 +77,21 @@ def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
     first, last = (instant(window.pairs[index].stamp_ns) for index in (0, -1))
     when = first if len(window.pairs) == 1 else f"{first} to {last}"
     at = f" at {name}" if name else ""
-    told, asked = int(shifts.told.sum()), int((shifts.edges >= LEAST_EDGES).sum())
+    known, eligible = int(shifts.known.sum()), int((shifts.edges >= LEAST_EDGES).sum())
     pairs = count(shifts.frames, "pair")
     lines = [f"{window.rig.pair}, {when}: range edges on edges of the image{at}"]
-    if told == 0:
+    if known == 0:
         lines.append(
-            f"No part of the image tells where its range edges belong ({asked} have enough of them, of {pairs})."
+            f"No part of the image tells where its range edges belong ({eligible} have enough of them, of {pairs})."
         )
         return lines
-    right, down = np.median(shifts.shift_px[shifts.told], axis=0).tolist()
-    beside = shifts.shift_px[shifts.told] - (right, down)
-    spread = float(np.median(np.hypot(*beside.T)))
+    right, down = np.median(shifts.shift_px[shifts.known], axis=0).tolist()
+    deviation = shifts.shift_px[shifts.known] - (right, down)
+    spread = float(np.median(np.hypot(*deviation.T)))
     pixel_deg = degrees(pixel_rad(window.rig.camera))
     in_common = f"{number(right, 1, sign=True)} px right, {number(down, 1, sign=True)} px down"
     lines += [
-        f"{told} of {asked} parts tell, from {pairs}. They lie {np.median(shifts.size_px[shifts.told]):.1f} px beside "
+        f"{known} of {eligible} parts tell, from {pairs}. They lie {np.median(shifts.size_px[shifts.known]):.1f} px beside "
         f"(median; a pixel is {pixel_deg:.3f}° on the axis).",
         f"In common to all: {in_common}; half of them are within {spread:.1f} px of it.",
         "Arrows: where range edges would lie best, enlarged. Figures: how far that is, and of how many range edges. "
@@ -100,7 +100,7 @@ def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
     return lines
 
 
-def _drawn(grey: NDArray[np.uint8], shifts: LocalShifts, lines: list[str]) -> NDArray[np.uint8]:
+def _render(grey: NDArray[np.uint8], shifts: LocalShifts, lines: list[str]) -> NDArray[np.uint8]:
     height, width = grey.shape
     factor = min(PICTURE_PX[0] / width, PICTURE_PX[1] / height)
     shown = max(1, round(width * factor)), max(1, round(height * factor))
@@ -116,7 +116,7 @@ def _drawn(grey: NDArray[np.uint8], shifts: LocalShifts, lines: list[str]) -> ND
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axes.set_axis_off()
     # A quantile, so that a cell that matches a wrong edge does not pale all others.
-    large = float(np.quantile(shifts.size_px[shifts.told], MOST)) if shifts.told.any() else 0.0
+    large = float(np.quantile(shifts.size_px[shifts.known], MOST)) if shifts.known.any() else 0.0
     end_px = max(LEAST_END_PX, large)
     colours = ScalarMappable(Normalize(0.0, end_px), COLOURS)
     for row, column in np.ndindex(shifts.edges.shape):
@@ -144,7 +144,7 @@ def _cell(
     left, top = column * width - 0.5, row * height - 0.5
     u, v = left + 0.5 * width, top + 0.5 * height
     ink, size = QUIET, ""
-    if shifts.told[row, column]:
+    if shifts.known[row, column]:
         ink, length = "black", float(shifts.size_px[row, column])
         size = f"{length:.1f} px\n"
         colour = colours.to_rgba(np.array(length))

@@ -19,7 +19,7 @@ from matplotlib.patches import Circle, FancyBboxPatch, Wedge
 from coec.calibration.types import Matrix4
 from coec.reports.plots import png
 
-STATE_COLOURS: Mapping[str, str] = MappingProxyType(
+SENSOR_COLOURS: Mapping[str, str] = MappingProxyType(
     {
         "calibrated": "tab:green",
         "camera_moved": "tab:red",
@@ -39,14 +39,14 @@ LENGTH_M, WIDTH_M, BEHIND_M = 4.6, 1.9, 0.95
 MARGIN_M = 1.3
 FAN_M = {"camera": 1.1, "lidar": 0.75}
 """Radius of the fan of a field of view: it shows the direction, not the reach."""
-LABEL_M, LABEL_APART_M, LINE_M = 0.42, 0.62, 0.26
+LABEL_M, LABEL_SPACING_M, LINE_M = 0.42, 0.62, 0.26
 """Distance of a name from its sensor, least distance between names, and height of a line of text."""
 TRIES = 16
 """Directions around its sensor that are tried for a name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorSeen:
+class PlottedSensor:
     """A sensor in the picture.
 
     Attributes:
@@ -68,7 +68,7 @@ class SensorSeen:
 
 
 @dataclass(frozen=True, slots=True)
-class EdgeSeen:
+class PlottedEdge:
     """What a pair of sensors says: it is `deg` ± `sigma_deg` from where it was."""
 
     a: str
@@ -79,11 +79,11 @@ class EdgeSeen:
     @property
     def sigmas(self) -> float:
         """The evidence that something has moved; 0 where the pair cannot tell."""
-        told = isfinite(self.deg) and isfinite(self.sigma_deg) and self.sigma_deg > 0.0
-        return abs(self.deg) / self.sigma_deg if told else 0.0
+        known = isfinite(self.deg) and isfinite(self.sigma_deg) and self.sigma_deg > 0.0
+        return abs(self.deg) / self.sigma_deg if known else 0.0
 
 
-def rig_from_above(sensors: Sequence[SensorSeen], edges: Sequence[EdgeSeen], title: str) -> bytes:
+def rig_from_above(sensors: Sequence[PlottedSensor], edges: Sequence[PlottedEdge], title: str) -> bytes:
     """The picture; ahead is up. An edge is the redder, the surer its pair is that something has moved. A sensor that
     has moved is marked.
 
@@ -100,36 +100,36 @@ def rig_from_above(sensors: Sequence[SensorSeen], edges: Sequence[EdgeSeen], tit
     colours = Normalize(0.0, CERTAIN_SIGMAS, clip=True)
     scale = ScalarMappable(colours, EDGES)
     for sensor in sensors:
-        _draw_view(axes, sensor)
+        _plot_view(axes, sensor)
     for edge in sorted(edges, key=lambda edge: edge.sigmas):  # the surest edges lie on top
         (x, y), (x2, y2) = places[edge.a], places[edge.b]
         colour = colormaps[EDGES](float(colours(edge.sigmas)))
         axes.plot([x, x2], [y, y2], color=colour, linewidth=2.6, zorder=3, solid_capstyle="round")
     for sensor in sensors:
-        _draw_sensor(axes, sensor)
-    _draw_labels(axes, sensors, list(places.values()))
+        _plot_sensor(axes, sensor)
+    _plot_labels(axes, sensors, list(places.values()))
     figure.colorbar(scale, ax=axes, shrink=0.55, label="a pair's offset from its nominal, in its standard deviations")
-    seen = [state for state in STATE_COLOURS if any(_state(sensor) == state for sensor in sensors)]
-    handles = [_dot("o", STATE_COLOURS[state], state_words(state)) for state in seen]
+    seen = [state for state in SENSOR_COLOURS if any(_state(sensor) == state for sensor in sensors)]
+    handles = [_dot("o", SENSOR_COLOURS[state], state_text(state)) for state in seen]
     handles += [_dot("^", "white", "camera"), _dot("o", "white", "LiDAR")]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return png(figure)
 
 
-def words_of(sensor: SensorSeen) -> str:
+def label_of(sensor: PlottedSensor) -> str:
     """The label beside a sensor."""
     lines = [sensor.name]
     if sensor.state in MOVED:
         by = "" if sensor.moved_deg is None else f" by {sensor.moved_deg:.2g}°"
         lines.append(f"moved{by}")
     elif sensor.state != "calibrated":
-        lines.append(state_words(sensor.state))
+        lines.append(state_text(sensor.state))
     if sensor.probability is not None and (sensor.state != "calibrated" or sensor.probability >= 0.005):
         lines.append(percent(sensor.probability))
     return "\n".join(lines)
 
 
-def state_words(state: str) -> str:
+def state_text(state: str) -> str:
     """The state of a sensor in words."""
     return state.replace("_", " ").replace("lidar", "LiDAR")
 
@@ -141,19 +141,19 @@ def percent(probability: float) -> str:
     return "< 1 %" if probability < 0.01 else f"{100.0 * probability:.0f} %"
 
 
-def _place(sensor: SensorSeen) -> tuple[float, float]:
+def _place(sensor: PlottedSensor) -> tuple[float, float]:
     """Place on the page: ahead (x of the vehicle) is up, left (y) is left."""
     return -float(sensor.T_ego_sensor[1, 3]), float(sensor.T_ego_sensor[0, 3])
 
 
-def _heading_rad(sensor: SensorSeen) -> float:
+def _heading_rad(sensor: PlottedSensor) -> float:
     """Direction on the page, counter-clockwise from the right."""
     ahead = sensor.T_ego_sensor[:3, 2 if sensor.kind == "camera" else 0]
     return atan2(float(ahead[0]), -float(ahead[1]))
 
 
-def _state(sensor: SensorSeen) -> str:
-    return sensor.state if sensor.state in STATE_COLOURS else "unknown"
+def _state(sensor: PlottedSensor) -> str:
+    return sensor.state if sensor.state in SENSOR_COLOURS else "unknown"
 
 
 def _frame(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
@@ -175,48 +175,56 @@ def _frame(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
     axes.set_ylabel("ahead of the rear axle, m")
 
 
-def _draw_view(axes: Axes, sensor: SensorSeen) -> None:
+def _plot_view(axes: Axes, sensor: PlottedSensor) -> None:
     heading_deg, half_deg = degrees(_heading_rad(sensor)), min(sensor.view_deg, 360.0) / 2
     fan = Wedge(
         _place(sensor), FAN_M.get(sensor.kind, 0.75), heading_deg - half_deg, heading_deg + half_deg,
-        facecolor=STATE_COLOURS[_state(sensor)], alpha=0.13, linewidth=0, zorder=1,
+        facecolor=SENSOR_COLOURS[_state(sensor)], alpha=0.13, linewidth=0, zorder=1,
     )  # fmt: skip
     axes.add_patch(fan)
 
 
-def _draw_sensor(axes: Axes, sensor: SensorSeen) -> None:
+def _plot_sensor(axes: Axes, sensor: PlottedSensor) -> None:
     x, y = _place(sensor)
     if sensor.state in MOVED:
-        axes.add_patch(Circle((x, y), 0.21, fill=False, edgecolor=STATE_COLOURS[sensor.state], linewidth=2.5, zorder=5))
+        axes.add_patch(
+            Circle((x, y), 0.21, fill=False, edgecolor=SENSOR_COLOURS[sensor.state], linewidth=2.5, zorder=5)
+        )
     # A triangle that points to where the camera looks.
     marker = (3, 0, degrees(_heading_rad(sensor)) - 90.0) if sensor.kind == "camera" else "o"
     axes.plot(
-        [x], [y], marker=marker, markersize=13.0, color=STATE_COLOURS[_state(sensor)], markeredgecolor="black", zorder=6
+        [x],
+        [y],
+        marker=marker,
+        markersize=13.0,
+        color=SENSOR_COLOURS[_state(sensor)],
+        markeredgecolor="black",
+        zorder=6,
     )
 
 
-def _draw_labels(axes: Axes, sensors: Sequence[SensorSeen], places: Sequence[tuple[float, float]]) -> None:
+def _plot_labels(axes: Axes, sensors: Sequence[PlottedSensor], places: Sequence[tuple[float, float]]) -> None:
     """Draws names beside their sensors, in free places; the longest labels choose first."""
     taken = list(places)
-    for number in sorted(range(len(sensors)), key=lambda number: -words_of(sensors[number]).count("\n")):
-        words = words_of(sensors[number])
-        at = _free(places[number], words, taken)
+    for number in sorted(range(len(sensors)), key=lambda number: -label_of(sensors[number]).count("\n")):
+        label = label_of(sensors[number])
+        at = _free(places[number], label, taken)
         taken.append(at)
         bold = "bold" if sensors[number].state in MOVED else "normal"
-        axes.text(*at, words, ha="center", va="center", fontsize=10, fontweight=bold, zorder=7)
+        axes.text(*at, label, ha="center", va="center", fontsize=10, fontweight=bold, zorder=7)
 
 
-def _free(place: tuple[float, float], words: str, taken: Sequence[tuple[float, float]]) -> tuple[float, float]:
+def _free(place: tuple[float, float], label: str, taken: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """The place around a sensor at which its words are far enough from all others, outwards if possible."""
-    distance = LABEL_M + LINE_M * words.count("\n") / 2
+    distance = LABEL_M + LINE_M * label.count("\n") / 2
     best, room = place, -1.0
     outwards = atan2(place[1] - (LENGTH_M / 2 - BEHIND_M), place[0]) if place[0] else 0.0
     for step in range(TRIES):
         angle = outwards + 2 * np.pi * step / TRIES
         at = (place[0] + 1.3 * distance * cos(angle), place[1] + distance * sin(angle))
-        apart = min(hypot(at[0] - x, at[1] - y) for x, y in taken)
-        if apart > room + 1e-9 and room < LABEL_APART_M:
-            best, room = at, apart
+        separation = min(hypot(at[0] - x, at[1] - y) for x, y in taken)
+        if separation > room + 1e-9 and room < LABEL_SPACING_M:
+            best, room = at, separation
     return best
 
 

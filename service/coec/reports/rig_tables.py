@@ -35,12 +35,12 @@ def show(report: RigMovesReport) -> None:
             *map(str, (of.consistent, of.biased_found, of.biased_missed)),
         )
     console.out.print(joint)
-    knocked = console.table(
+    displaced = console.table(
         "windows after a knocked LiDAR", "pairs", "rigs", "rms error, of single pairs", "without before", "NEES",
         "worst pair", "single", "consistent", "camera too, missed", right=range(1, 10),
     )  # fmt: skip
     for after in report.knocked:
-        knocked.add_row(
+        displaced.add_row(
             after.rig,
             str(after.pairs),
             str(after.rigs),
@@ -51,7 +51,7 @@ def show(report: RigMovesReport) -> None:
             f"{after.worst_of_pairs_deg:.2f}°",
             *map(str, (after.consistent, after.also_missed)),
         )
-    console.out.print(knocked)
+    console.out.print(displaced)
 
 
 def show_drives(report: RigDrivesReport) -> None:

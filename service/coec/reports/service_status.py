@@ -45,10 +45,10 @@ def status(payload: bytes) -> None:
         right=(1, *range(3, 11)),
     )  # fmt: skip
     for pair in reply.pairs:
-        looked = _looked(None if reply.budget is None else reply.budget.pairs.get(pair.name))
+        last_check = _last_check(None if reply.budget is None else reply.budget.pairs.get(pair.name))
         streams = [f"{s.accepted}/{s.received}" if s else "-" for s in (pair.camera, pair.lidar, pair.ego)]
         counts = [str(count) for count in (pair.pairs, pair.selected, pair.windows, pair.solved)]
-        table.add_row(pair.name, *looked, str(pair.checks), *streams, *counts)
+        table.add_row(pair.name, *last_check, str(pair.checks), *streams, *counts)
     console.out.print(table)
     for line in _lost(reply.pairs):
         console.show(line)
@@ -59,11 +59,11 @@ def losses(by_place: Mapping[str, Mapping[str, int]]) -> None:
     """Prints a line for each place at which something was lost, with the causes."""
     for place, causes in by_place.items():
         if causes:
-            told = ", ".join(f"{count} {cause}" for cause, count in sorted(causes.items()))
-            console.show(f"  lost, {place}: {told}")
+            text = ", ".join(f"{count} {cause}" for cause, count in sorted(causes.items()))
+            console.show(f"  lost, {place}: {text}")
 
 
-def _looked(share: replies.BudgetShare | None) -> tuple[str, Text]:
+def _last_check(share: replies.BudgetShare | None) -> tuple[str, Text]:
     """How long ago the worker looked at a pair, and a remark on its turn."""
     if share is None:
         return "-", Text()

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 
 from coec.reports.plots import png
 
-STATE_COLOURS = {
+HEALTH_COLOURS = {
     "healthy": "tab:green",
     "suspect": "gold",
     "degraded": "orange",
@@ -35,7 +35,7 @@ def timeline(
     figure.suptitle(title)
     axes = figure.subplots()
     for (begin, _, state), (end, *_) in pairwise(series):
-        axes.axvspan(begin, end, color=STATE_COLOURS.get(state, "white"), alpha=0.3, linewidth=0)
+        axes.axvspan(begin, end, color=HEALTH_COLOURS.get(state, "white"), alpha=0.3, linewidth=0)
     seconds, errors_deg = [point[0] for point in series], [point[1] for point in series]
     # Both the served extrinsic and the truth change in steps.
     curve = axes.plot(seconds, errors_deg, color="black", linewidth=1.8, drawstyle="steps-post", label="error")
@@ -50,7 +50,7 @@ def timeline(
     axes.set_xlabel("drive, s")
     axes.set_ylabel("rotation error against the truth, deg")
     seen = dict.fromkeys(state for _, _, state in series)
-    grounds = [Patch(color=STATE_COLOURS.get(state, "white"), alpha=0.3, label=state) for state in seen]
+    grounds = [Patch(color=HEALTH_COLOURS.get(state, "white"), alpha=0.3, label=state) for state in seen]
     handles = [*curve, limit, *grounds]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return png(figure)

@@ -17,7 +17,7 @@ class BusyError(CoecError):
     reply_code = "busy"
 
 
-class Handover(Generic[T]):
+class DeferredCall(Generic[T]):
     """One piece of work. The thread that owns the state calls `run`; the thread that wants the work waits in
     `result`."""
 

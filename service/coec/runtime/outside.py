@@ -5,36 +5,36 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from coec.adapters.files.scribe import Scribe
+from coec.adapters.files.scribe import DiskWriter
 from coec.adapters.zenoh.bus import Answer
-from coec.adapters.zenoh.ros_topics import Topics
+from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.calibration.types import FramePair, Matrix4, Reason
 from coec.config import PairConfig
 from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.intake import Intake
-from coec.runtime.nominal.watch import Nominal
+from coec.runtime.nominal.watch import NominalStatus
 from coec.runtime.recording.snippet_store import SnippetStore
 from coec.runtime.recording.window_store import WindowStore
-from coec.runtime.rig.keeper import RigKeeper
+from coec.runtime.rig.keeper import RigEstimatorThread
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.keys import Keys
 
 
-def given(pair: str) -> Nominal:
+def configured_nominal(pair: str) -> NominalStatus:
     """Default of `Outside.nominal`: the pair's configuration gives its nominal calibration."""
     del pair
-    return Nominal()
+    return NominalStatus()
 
 
-def fits(pair: str) -> tuple[Reason, ...]:
+def no_rig_problems(pair: str) -> tuple[Reason, ...]:
     """Default of `Outside.rig_troubles`: the pair contradicts no other."""
     del pair
     return ()
 
 
 @dataclass(frozen=True, slots=True)
-class Outside:
+class VehicleContext:
     """Everything that a pair shares with the others. The callables may be called from any thread.
 
     Attributes:
@@ -49,15 +49,15 @@ class Outside:
     keys: Keys
     intake: Intake
     store: StateStore
-    scribe: Scribe
+    disk_writer: DiskWriter
     folder: WindowStore
     worker: Worker
     budget: Budget
-    rig: RigKeeper
+    rig: RigEstimatorThread
     publish: Callable[[str, Answer], None]
-    vehicle_troubles: Callable[[], tuple[Reason, ...]]
+    vehicle_problems: Callable[[], tuple[Reason, ...]]
     show: Callable[[PairConfig, FramePair, Matrix4], None]
-    topics: Callable[[], Topics]
-    nominal: Callable[[str], Nominal] = given
-    rig_troubles: Callable[[str], tuple[Reason, ...]] = fits
+    topics: Callable[[], RosTopicList]
+    nominal: Callable[[str], NominalStatus] = configured_nominal
+    rig_problems: Callable[[str], tuple[Reason, ...]] = no_rig_problems
     snippets: SnippetStore | None = None

@@ -19,17 +19,17 @@ from coec.adapters.system.logs import LossCounter
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
-from coec.runtime.decisions.decider import Decider
+from coec.runtime.decisions.decider import CalibrationManager
 from coec.runtime.decisions.incident_pictures import IncidentPictures
-from coec.runtime.decisions.mailbox import Mailbox
+from coec.runtime.decisions.mailbox import TaskQueue
 from coec.runtime.decisions.pair_store import PairStore
-from coec.runtime.decisions.questions import Questions
-from coec.runtime.decisions.queue import DecisionQueue
+from coec.runtime.decisions.questions import JobClient
+from coec.runtime.decisions.queue import ResultSchedule
 from coec.runtime.decisions.rig_baseline import RigBaseline
-from coec.runtime.ingest.chooser import Chooser
+from coec.runtime.ingest.chooser import FrameSelector
 from coec.runtime.ingest.frame_ring import FrameRing
 from coec.runtime.ingest.pair_stream import PairStream
-from coec.runtime.outside import Outside
+from coec.runtime.outside import VehicleContext
 from coec.runtime.recording.recorder import Recorder, RecordingPlan
 from coec.runtime.recording.snippets import SnippetRecorder
 from coec.runtime.reload import settings_hash
@@ -41,36 +41,36 @@ class Pair:
     """One pair. `stream` runs on the intake's thread, `recorder` and `decider` each on their own. Any thread may use
     `answers` and `commands`."""
 
-    def __init__(self, pair: PairConfig, config: Config, outside: Outside) -> None:
+    def __init__(self, pair: PairConfig, config: Config, context: VehicleContext) -> None:
         """Builds the pair and recalls its state from the disk.
 
         Raises:
             ConfigError: the rig cannot be built.
         """
         self.name = pair.name
-        rig, folder = rig_of(pair), outside.folder
+        rig, folder = rig_of(pair), context.folder
         losses = LossCounter(_log, pair.name)
-        mailbox, queue = Mailbox(), DecisionQueue(lambda: outside.worker.compiled_s)
-        store = PairStore(rig, config.vehicle, config.state, outside.store, outside.scribe, folder, losses)
-        of_rig = outside.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.unanswered == 0)
-        questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, of_rig, outside.show)
+        task_queue, queue = TaskQueue(), ResultSchedule(lambda: context.worker.compiled_s)
+        store = PairStore(rig, config.vehicle, config.state, context.store, context.disk_writer, folder, losses)
+        of_rig = context.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.unanswered == 0)
+        job_client = JobClient(pair, queue, context.worker, context.budget, task_queue, folder, of_rig, context.show)
         baseline = RigBaseline(pair, rig, config.state)
-        outside.scribe.keep(baseline)
+        context.disk_writer.register(baseline)
         self._rig, self._vehicle, self._packed = rig, config.vehicle, config.state.packing == "lz4"
         plan = self._plan(pair, baseline.calibration)
-        snippets = self._snippets_of(plan, outside, losses)
-        self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost, snippets)
-        first_slice_s = outside.budget.join(pair.name, pair.monitor, pair.window)
-        chooser = Chooser(
-            pair, config.limits, rig, store.served, questions, self.recorder, losses, first_slice_s, store.kept
+        snippets = self._snippets_of(plan, context, losses)
+        self.recorder = Recorder(plan, folder, losses, job_client.solve, job_client.lost, snippets)
+        first_slice_s = context.budget.join(pair.name, pair.monitor, pair.window)
+        selector = FrameSelector(
+            pair, config.limits, rig, store.served, job_client, self.recorder, losses, first_slice_s, store.carried_over
         )
-        ring = None if snippets is None else FrameRing(config.snippets, _ring_bytes(config), snippets.give)
-        self.stream = PairStream(pair, config, outside.intake, chooser, lambda: self.recorder.has_room, losses, ring)
+        ring = None if snippets is None else FrameRing(config.snippets, _ring_bytes(config), snippets.submit)
+        self.stream = PairStream(pair, config, context.intake, selector, lambda: self.recorder.has_room, losses, ring)
         self.answers = PairAnswers(
-            pair, config, rig, store, folder, self.recorder, self.stream, outside, lambda: self.commands.counts
+            pair, config, rig, store, folder, self.recorder, self.stream, context, lambda: self.commands.counts
         )
-        pictures = IncidentPictures(store.add_picture, folder, questions, losses)
-        self.decider = Decider(
+        pictures = IncidentPictures(store.add_picture, folder, job_client, losses)
+        self.manager = CalibrationManager(
             pair,
             config.stale_after_s,
             store,
@@ -79,53 +79,53 @@ class Pair:
             pictures,
             self.stream,
             of_rig,
-            mailbox,
+            task_queue,
             losses,
-            self.recorder.use,
-            self.answers.hear,
+            self.recorder.reconfigure,
+            self.answers.on_update,
         )
-        questions.answer_to(self.decider)
+        job_client.connect(self.manager)
         self.commands = Commands(
             pair,
             config.vehicle,
             rig,
-            self.decider,
-            mailbox,
+            self.manager,
+            task_queue,
             store,
             self.stream,
-            chooser,
+            selector,
             self.recorder,
             folder,
-            questions,
+            job_client,
         )
-        self._chooser, self._questions, self._mailbox = chooser, questions, mailbox
-        self.decider.tell_now()
+        self._selector, self._job_client, self._task_queue = selector, job_client, task_queue
+        self.manager.publish()
 
-    def use(self, pair: PairConfig, stale_after_s: float, told: str) -> None:
+    def reconfigure(self, pair: PairConfig, stale_after_s: float, history_text: str) -> None:
         """Goes on with other settings, which differ only in what `reload.RELOADED` names. `told` is the entry for the
         history. Called on the main thread; each part takes over its settings on the thread that owns them."""
-        self._questions.use(pair)
-        self.answers.use(pair)
-        self.commands.use(pair)
+        self._job_client.reconfigure(pair)
+        self.answers.reconfigure(pair)
+        self.commands.reconfigure(pair)
         self.recorder.follow(self._plan(pair, pair.calibration))
-        self.stream.call(lambda: self._chooser.use(pair.window))
-        self._mailbox.post(lambda: self.decider.use(pair, stale_after_s, told))
+        self.stream.call(lambda: self._selector.reconfigure(pair.window))
+        self._task_queue.post(lambda: self.manager.reconfigure(pair, stale_after_s, history_text))
 
     def _plan(self, pair: PairConfig, calibration: CalibrationConfig) -> RecordingPlan:
         metadata = {"vehicle": self._vehicle, "pair": pair.name, "settings_hash": settings_hash(pair)}
         return RecordingPlan(self._rig, calibration, pair.window.min_pairs, metadata, self._packed)
 
     @staticmethod
-    def _snippets_of(plan: RecordingPlan, outside: Outside, losses: LossCounter) -> SnippetRecorder | None:
-        if outside.snippets is None:
+    def _snippets_of(plan: RecordingPlan, context: VehicleContext, losses: LossCounter) -> SnippetRecorder | None:
+        if context.snippets is None:
             return None
-        return SnippetRecorder(plan.rig, plan.metadata, outside.snippets, losses, packed=plan.packed)
+        return SnippetRecorder(plan.rig, plan.metadata, context.snippets, losses, packed=plan.packed)
 
     def finish_window(self) -> None:
         """Ends the open window when the service ends; called after the intake's thread has ended."""
         self.stream.finish_snippet()
         self.stream.finish_pairs()
-        self._chooser.finish()
+        self._selector.finish()
 
 
 def _ring_bytes(config: Config) -> int:

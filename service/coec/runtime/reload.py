@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.adapters.files.rig import check_given, rig_of
-from coec.adapters.zenoh.settings import check_certificates, settings_of, where
+from coec.adapters.zenoh.settings import check_certificates, settings_of, settings_source
 from coec.config import Config, OpenPairConfig, PairConfig, config_hash
 from coec.errors import require_readable
 
@@ -62,11 +62,11 @@ def reload_of(running: Config, read: Config) -> Reload:
     Raises:
         ConfigError: a service could not start with `read`, so nothing of it may be taken over.
     """
-    check_certificates(settings_of(read.zenoh, read.limits), where(read.zenoh))
+    check_certificates(settings_of(read.zenoh, read.limits), settings_source(read.zenoh))
     for pair in read.pairs:
         rig_of(pair)
-    for awaited in read.awaited:
-        check_given(awaited)
+    for pending in read.awaited:
+        check_given(pending)
     for each in read.every_pair:
         _network_of(each)
     old, new = _by_name(running.model_dump()), _by_name(read.model_dump())

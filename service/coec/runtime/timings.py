@@ -15,7 +15,7 @@ LONG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Counted:
+class HistogramCounts:
     """Durations under one set of labels. `counts` has one entry for each bucket and one more for what took longer than
     the last bound; the counts are not cumulative."""
 
@@ -41,7 +41,9 @@ class Histogram:
             counts[bucket] += 1
             self._sums_s[labels] = self._sums_s.get(labels, 0.0) + seconds
 
-    def counted(self) -> dict[tuple[str, ...], Counted]:
+    def counted(self) -> dict[tuple[str, ...], HistogramCounts]:
         """The durations so far, by labels."""
         with self._lock:
-            return {labels: Counted(tuple(counts), self._sums_s[labels]) for labels, counts in self._counts.items()}
+            return {
+                labels: HistogramCounts(tuple(counts), self._sums_s[labels]) for labels, counts in self._counts.items()
+            }

@@ -15,25 +15,25 @@ from pathlib import Path
 from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.inputs import InputSample
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.calibration.types import Reason
 from coec.config import Config, PairConfig
 from coec.errors import ConfigError
-from coec.runtime.api.awaited import AwaitedAnswers
-from coec.runtime.nominal.findings import CANNOT_BE_BUILT, Found, info_topic_of, needs_transforms
-from coec.runtime.nominal.kept import KeptNominals, completed
-from coec.runtime.nominal.watch import Nominal, NominalWatch
-from coec.runtime.outside import Outside
+from coec.runtime.api.awaited import PendingPairAnswers
+from coec.runtime.nominal.findings import CANNOT_BE_BUILT, DiscoveredPair, info_topic_of, needs_transforms
+from coec.runtime.nominal.kept import DiscoveryStore, completed
+from coec.runtime.nominal.watch import DiscoveryListener, NominalStatus
+from coec.runtime.outside import VehicleContext
 
 _log = logging.getLogger(__name__)
 
 
-class _Shared:
+class _SharedSubscription:
     """One subscription to a topic or key, shared by all pairs that wait for it."""
 
     def __init__(self) -> None:
-        self._takers: dict[str, Callable[[Sample], None]] = {}
+        self._takers: dict[str, Callable[[InputSample], None]] = {}
         self.end: Callable[[], None] = lambda: None
 
     @property
@@ -41,7 +41,7 @@ class _Shared:
         """Whether only one pair has joined."""
         return len(self._takers) == 1
 
-    def join(self, name: str, take: Callable[[Sample], None]) -> None:
+    def join(self, name: str, take: Callable[[InputSample], None]) -> None:
         """A pair waits for it."""
         self._takers = {**self._takers, name: take}
 
@@ -54,13 +54,13 @@ class _Shared:
         self.end()
         return True
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: InputSample) -> None:
         """Hands a sample to every pair that waits; called on the network's thread."""
         for taker in self._takers.values():
             taker(sample)
 
 
-class WaitingRoom:
+class PendingPairs:
     """The awaited pairs of a vehicle.
 
     Attributes:
@@ -76,39 +76,39 @@ class WaitingRoom:
         """
         for pair in config.awaited:
             check_given(pair)
-        self._asked = {pair.name: pair for pair in config.awaited}
+        self._requested = {pair.name: pair for pair in config.awaited}
         self._read = config
-        self._kept = KeptNominals(folder)
-        earlier = self._kept.found(config)
-        self._watch = NominalWatch(config, earlier)
-        self._streams: dict[str, _Shared] = {}
-        self._outside: Outside
-        self.answers: dict[str, AwaitedAnswers] = {}
+        self._store = DiscoveryStore(folder)
+        earlier = self._store.load(config)
+        self._listener = DiscoveryListener(config, earlier)
+        self._streams: dict[str, _SharedSubscription] = {}
+        self._context: VehicleContext
+        self.answers: dict[str, PendingPairAnswers] = {}
 
     @property
     def threads(self) -> tuple[ServiceThread, ...]:
         """The running threads; none if no pair is awaited."""
-        return (self._watch.thread,) if self._asked else ()
+        return (self._listener.thread,) if self._requested else ()
 
     def complete(self, config: Config) -> Config:
         """The configuration as it was read, completed by what has been found for pairs that still ask for the same."""
-        return completed(config, {name: found.pair for name, found in self._kept.found(config).items()})
+        return completed(config, {name: discovered.pair for name, discovered in self._store.load(config).items()})
 
-    def nominal(self, pair: str) -> Nominal:
+    def nominal(self, pair: str) -> NominalStatus:
         """Where a pair's nominal calibration comes from. Any thread."""
-        return self._watch.nominal(pair)
+        return self._listener.nominal(pair)
 
     def origins(self) -> dict[str, dict[str, str]]:
         """Where each found value comes from, by pair and place in the configuration."""
-        told = {name: dict(self.nominal(name).origins) for name in self._asked}
-        return {name: origins for name, origins in told.items() if origins}
+        by_pair = {name: dict(self.nominal(name).origins) for name in self._requested}
+        return {name: origins for name, origins in by_pair.items() if origins}
 
-    def open(self, config: Config, outside: Outside) -> Mapping[str, AwaitedAnswers]:
+    def open(self, config: Config, context: VehicleContext) -> Mapping[str, PendingPairAnswers]:
         """Makes answers for the pairs that are still awaited in this configuration."""
-        self._outside = outside
-        if self._asked:
-            outside.scribe.keep(self._kept)
-        self.answers = {pair.name: AwaitedAnswers(pair, config.vehicle, outside) for pair in config.awaited}
+        self._context = context
+        if self._requested:
+            context.disk_writer.register(self._store)
+        self.answers = {pair.name: PendingPairAnswers(pair, config.vehicle, context) for pair in config.awaited}
         return self.answers
 
     def listen(self, bus: Bus, side: RosSide) -> None:
@@ -116,50 +116,50 @@ class WaitingRoom:
         subscribed for as long as the service runs."""
         for thread in self.threads:
             thread.start()
-        if any(needs_transforms(pair) for pair in self._asked.values()):
-            bus.subscribe_latched(side.input_of_static_transforms(), self._watch.take_transforms)
-        infos: dict[str, _Shared] = {}
-        for name, pair in self._asked.items():
+        if any(needs_transforms(pair) for pair in self._requested.values()):
+            bus.subscribe_latched(side.input_of_static_transforms(), self._listener.take_transforms)
+        infos: dict[str, _SharedSubscription] = {}
+        for name, pair in self._requested.items():
             topic = info_topic_of(pair)
             if topic is not None:
-                shared = infos.setdefault(topic, _Shared())
-                shared.join(name, partial(self._watch.take_info, name))
+                shared = infos.setdefault(topic, _SharedSubscription())
+                shared.join(name, partial(self._listener.take_info, name))
                 if shared.is_new:
                     bus.subscribe_latched(side.input_of_info(topic), shared.take)
             for kind, stream in pair.streams.items() if name in self.answers else ():
-                shared = self._streams.setdefault(stream.place, _Shared())
-                shared.join(name, partial(self._watch.take_frame, name, kind))
+                shared = self._streams.setdefault(stream.place, _SharedSubscription())
+                shared.join(name, partial(self._listener.take_frame, name, kind))
                 if shared.is_new:
                     shared.end = bus.subscribe(side.input_of(stream), shared.take)
 
-    def found(self) -> dict[str, PairConfig]:
+    def pop_discovered(self) -> dict[str, PairConfig]:
         """Pairs of which everything is known by now and that can be built. Each is returned once."""
         good: dict[str, PairConfig] = {}
-        for name, found in self._watch.ready().items():
+        for name, discovered in self._listener.ready().items():
             if name not in self.answers:
                 continue
             try:
-                rig_of(found.pair)
+                rig_of(discovered.pair)
             except ConfigError as error:
                 self.refuse(name, str(error))
                 continue
-            self._admit(name, found)
-            good[name] = found.pair
+            self._admit(name, discovered)
+            good[name] = discovered.pair
         return good
 
-    def _admit(self, name: str, found: Found) -> None:
+    def _admit(self, name: str, discovered: DiscoveredPair) -> None:
         for place, shared in list(self._streams.items()):
             if shared.leave(name):
                 del self._streams[place]
         self.answers = {other: answers for other, answers in self.answers.items() if other != name}
-        self._kept.keep(found, self._asked[name], self._read, time.time_ns())
-        self._outside.scribe.write(self._kept)
-        self._watch.end(name, found)
+        self._store.update(discovered, self._requested[name], self._read, time.time_ns())
+        self._context.disk_writer.write(self._store)
+        self._listener.end(name, discovered)
 
     def refuse(self, name: str, why: str) -> None:
         """What was found for a pair cannot be used. The pair is awaited again until something else is heard."""
         _log.error(f"what was found of a pair cannot be used: {why}", extra={"fields": {"pair": name}})
-        self._watch.end(name, Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {why}."))
+        self._listener.end(name, Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {why}."))
 
     def renew(self) -> None:
         """Renews the answers; called once a second."""

@@ -19,7 +19,7 @@ needs a new `@v2` in the keys instead."""
 MAX_JSON_DEPTH: Final = 64
 """Deepest nesting of a JSON document that is read; ours have at most 10."""
 
-MAX_PLACE: Final = 100
+MAX_LOCATION: Final = 100
 """Most characters of the place of a mistake in a message."""
 
 Text = Annotated[str, AfterValidator(Untrusted)]
@@ -78,7 +78,7 @@ def from_json(model: type[M], payload: bytes) -> M:
     try:
         return model.model_validate(json.loads(payload))
     except (ValueError, RecursionError) as error:
-        raise DecodeError("message_malformed", f"not a {model.__name__} in JSON: {_places(error)}") from error
+        raise DecodeError("message_malformed", f"not a {model.__name__} in JSON: {_error_locations(error)}") from error
 
 
 def json_value(payload: bytes) -> Any:
@@ -98,13 +98,13 @@ def json_value(payload: bytes) -> Any:
         raise DecodeError("message_malformed", "not JSON: a number with too many digits") from error
     except RecursionError as error:
         raise DecodeError("message_malformed", f"not read: nested deeper than {MAX_JSON_DEPTH}") from error
-    waiting = [(value, 0)]
-    while waiting:
-        part, depth = waiting.pop()
+    stack = [(value, 0)]
+    while stack:
+        part, depth = stack.pop()
         if depth > MAX_JSON_DEPTH:
             raise DecodeError("message_malformed", f"not read: nested deeper than {MAX_JSON_DEPTH}")
         if isinstance(part, dict | list):
-            waiting += ((item, depth + 1) for item in (part.values() if isinstance(part, dict) else part))
+            stack += ((item, depth + 1) for item in (part.values() if isinstance(part, dict) else part))
         elif isinstance(part, float) and not math.isfinite(part):
             raise DecodeError("message_malformed", "not JSON: a number that is not finite")
     return value
@@ -120,7 +120,9 @@ def from_msgpack(model: type[M], payload: bytes) -> M:
     try:
         return model.model_validate(msgpack.unpackb(payload))
     except (ValueError, RecursionError, msgpack.UnpackException) as error:
-        raise DecodeError("message_malformed", f"not a {model.__name__} in msgpack: {_places(error)}") from error
+        raise DecodeError(
+            "message_malformed", f"not a {model.__name__} in msgpack: {_error_locations(error)}"
+        ) from error
 
 
 def _sorted(value: Any) -> Any:
@@ -131,11 +133,11 @@ def _sorted(value: Any) -> Any:
     return value
 
 
-def _places(error: Exception) -> str:
+def _error_locations(error: Exception) -> str:
     if isinstance(error, ValidationError):
         # At most three places, and never the values: they are text from the sender, as are keys in a place.
         return "; ".join(
-            f"{printable('.'.join(str(part) for part in item['loc']), MAX_PLACE)}: {item['type']}"
+            f"{printable('.'.join(str(part) for part in item['loc']), MAX_LOCATION)}: {item['type']}"
             for item in error.errors()[:3]
         )
     return type(error).__name__

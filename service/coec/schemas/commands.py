@@ -13,7 +13,7 @@ from coec.schemas.base import Message
 CommandName = Literal["calibrate", "apply", "rollback", "reset", "commission", "hold"]
 """Commands of CONTRACT."""
 
-NAMES: Final[tuple[CommandName, ...]] = get_args(CommandName)
+COMMAND_NAMES: Final[tuple[CommandName, ...]] = get_args(CommandName)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ REASON: Final = Argument(
 )
 SENSOR: Final = Argument("sensor", str, "of the rig: all pairs of this sensor, and no others")
 
-OF_PAIR: Final[Mapping[str, tuple[Argument, ...]]] = {
+PAIR_ARGUMENTS: Final[Mapping[str, tuple[Argument, ...]]] = {
     "apply": (CANDIDATE,),
     "rollback": (TO,),
     "hold": (RELEASE,),
@@ -55,8 +55,8 @@ MAX_REASON: Final = 200
 def arguments_of(command: str, *, for_rig: bool) -> tuple[Argument, ...]:
     """What the payload of a command may hold, for a pair or for the rig. For the rig there is neither `to` nor
     `candidate`, because a window belongs to one pair."""
-    own = (*OF_PAIR.get(command, ()), REASON)
-    return (*(argument for argument in own if argument not in (TO, CANDIDATE)), SENSOR) if for_rig else own
+    arguments = (*PAIR_ARGUMENTS.get(command, ()), REASON)
+    return (*(argument for argument in arguments if argument not in (TO, CANDIDATE)), SENSOR) if for_rig else arguments
 
 
 class ProvenCommand(Message):

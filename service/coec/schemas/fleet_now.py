@@ -10,14 +10,14 @@ from coec.schemas.base import Message, Part
 from coec.schemas.last_word import LastWord
 from coec.schemas.replies import Count, Counts
 
-Standing = Literal["live", "parked", "silent"]
+Connectivity = Literal["live", "parked", "silent"]
 
 
 class PairNow(Part):
     """A pair of a vehicle. Nothing in it is newer than its last word; ages are counted up to now."""
 
     word: LastWord
-    standing: Standing = Field(
+    standing: Connectivity = Field(
         description="`live`: its last word is current; `parked`: it said goodbye; `silent`: it is overdue, or its "
         "vehicle left without a goodbye, and the state shown is the last known one"
     )

@@ -16,7 +16,7 @@ from coec.schemas.base import Message, Text
 from coec.schemas.keys import LAST, VERSION_CHUNK
 from coec.schemas.replies import Alarms, Count, HealthState, Maybe6, Provenance, Reason, Status, Vector6
 
-MAX_BYTES: Final = 16_384
+MAX_HEARTBEAT_BYTES: Final = 16_384
 """Largest word; one with every reason that it may have takes a third of this."""
 
 MAX_REASONS: Final = 8
@@ -62,22 +62,22 @@ class LastWord(Message):
     event: Text | None = Field(max_length=128, description="id of the newest kept red event; null: none")
 
 
-def read(key: str, payload: bytes) -> LastWord:
+def decode_heartbeat(key: str, payload: bytes) -> LastWord:
     """The word that was received under a key.
 
     Raises:
         DecodeError: `word_too_large`, `word_malformed`, or `word_of_another`: the word names another vehicle or pair
             than its key.
     """
-    if len(payload) > MAX_BYTES:
-        raise DecodeError("word_too_large", f"a last word of more than {MAX_BYTES} bytes")
+    if len(payload) > MAX_HEARTBEAT_BYTES:
+        raise DecodeError("word_too_large", f"a last word of more than {MAX_HEARTBEAT_BYTES} bytes")
     try:
         document = msgpack.unpackb(
-            payload, max_map_len=MAX_NESTING, max_array_len=MAX_NESTING, max_str_len=MAX_BYTES, max_bin_len=0
+            payload, max_map_len=MAX_NESTING, max_array_len=MAX_NESTING, max_str_len=MAX_HEARTBEAT_BYTES, max_bin_len=0
         )
-        word = LastWord.model_validate(document)
+        heartbeat = LastWord.model_validate(document)
     except (ValueError, RecursionError, msgpack.UnpackException, ValidationError) as error:
         raise DecodeError("word_malformed", "no last word in msgpack") from error
-    if not key.endswith(f"/{VERSION_CHUNK}/{word.vehicle}/{LAST}/{word.pair}"):
+    if not key.endswith(f"/{VERSION_CHUNK}/{heartbeat.vehicle}/{LAST}/{heartbeat.pair}"):
         raise DecodeError("word_of_another", "a last word under the key of another")
-    return word
+    return heartbeat

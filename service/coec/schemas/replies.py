@@ -38,7 +38,7 @@ ROS_LEVELS: dict[HealthState, Literal[0, 1, 2, 3]] = {
 }
 """Level of `diagnostic_msgs/DiagnosticStatus`: 0 OK, 1 WARN, 2 ERROR, 3 STALE. `unknown` is never OK."""
 
-STUCK: Final = "service_stuck"
+SERVICE_STUCK: Final = "service_stuck"
 """Code of the reason that a reply has not been renewed, so that it may be out of date."""
 
 
@@ -419,7 +419,7 @@ class EvidenceReply(Message):
     events: tuple[EvidenceEvent, ...]
 
 
-KeptFor = Literal["red_event", "commissioning"]
+RetentionReason = Literal["red_event", "commissioning"]
 
 
 class WindowInfo(Part):
@@ -432,7 +432,7 @@ class WindowInfo(Part):
     size_bytes: Count
     pairs: Count | None = Field(description="null until the file was read, or if it cannot be read")
     decision: Decision | None = Field(description="null while it is not evaluated, or `sha256` is null")
-    kept_for: KeptFor | None = Field(
+    kept_for: RetentionReason | None = Field(
         default=None, description="why it is kept longer than others when room is made; null: it is removed in turn"
     )
 

@@ -15,7 +15,7 @@ from coec.adapters.images.codec import encode_depth_png, encode_jpeg
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4
 from coec.geometry.cameras import Camera
 from coec.simulation import faults as wrong
-from coec.simulation.exposure import Lens, against_the_sun, at_night, dirt_cover, expose
+from coec.simulation.exposure import LensProperties, against_the_sun, at_night, dirt_cover, expose
 from coec.simulation.faults import Fault, late_s
 from coec.simulation.journey import Journey
 from coec.simulation.lamps import around
@@ -41,7 +41,7 @@ _LOSS, _EXPOSURE, _BEAMS, _SWEEP = 130, 131, 132, 133
 """Keys of random numbers, by purpose."""
 
 
-class Aboard(Protocol):
+class SimulatedSensor(Protocol):
     """A sensor that sends frames."""
 
     @property
@@ -90,7 +90,7 @@ class Wire:
         return bool(shares) and journey.rng(_LOSS, self.number, index).random() < max(shares)
 
 
-class OdometerAboard:
+class SimulatedOdometer:
     """The odometer, which sends ego-motion."""
 
     def __init__(self, journey: Journey, wire: Wire) -> None:
@@ -115,7 +115,7 @@ class OdometerAboard:
         return self._journey.motion(index, self.time_s(index), stamp_ns)
 
 
-class LidarAboard:
+class SimulatedLidar:
     """A LiDAR, which sends sweeps.
 
     Attributes:
@@ -174,22 +174,22 @@ class LidarAboard:
             return np.asarray(np.einsum("nij,jk->nik", journey.trip.poses(times_s), mounted), np.float64)
 
         noise = journey.rng(_SWEEP, *key, index)
-        found = sweep(journey.scene(time_s), self._model, poses, time_s, noise, dead, air)
+        measured = sweep(journey.scene(time_s), self._model, poses, time_s, noise, dead, air)
         if self._own_body is not None:
-            found = _past(self._own_body, mounted, found)
+            measured = _past(self._own_body, mounted, measured)
         return LidarFrame(
-            stamp_ns, self._wire.name, found.xyz_m, found.intensity, found.ring, found.time_offset_s, sequence=index
+            stamp_ns, self._wire.name, measured.xyz_m, measured.intensity, measured.ring, measured.time_offset_s, sequence=index
         )  # fmt: skip
 
 
-def _past(own_body: Solid, T_ego_lidar: Matrix4, found: Sweep) -> Sweep:
+def _past(own_body: Solid, T_ego_lidar: Matrix4, measured: Sweep) -> Sweep:
     """The points that the vehicle itself does not hide."""
-    rays = np.einsum("ij,nj->ni", T_ego_lidar[:3, :3], found.xyz_m).astype(np.float32)
+    rays = np.einsum("ij,nj->ni", T_ego_lidar[:3, :3], measured.xyz_m).astype(np.float32)
     origins = np.empty_like(rays)
     origins[:] = T_ego_lidar[:3, 3]
     free = ~own_body.blocked(origins, rays)
-    ring = None if found.ring is None else found.ring[free]
-    return Sweep(found.xyz_m[free], found.intensity[free], ring, found.time_offset_s[free])
+    ring = None if measured.ring is None else measured.ring[free]
+    return Sweep(measured.xyz_m[free], measured.intensity[free], ring, measured.time_offset_s[free])
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +205,7 @@ class Optics:
     delay_s: float
     rolling_shutter_s: float = 0.0
     depth: bool = False
-    lens: Lens = field(default_factory=Lens)
+    lens: LensProperties = field(default_factory=LensProperties)
     rows: tuple[float, float] = (0.0, 1.0)
 
     @property
@@ -219,7 +219,7 @@ class Optics:
         return round(self.rows[1] * self.camera.height)
 
 
-class CameraAboard:
+class SimulatedCamera:
     """A camera, which sends pictures.
 
     Attributes:

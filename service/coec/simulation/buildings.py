@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from coec.simulation.mesh import Colour, Material, Mesh, box, join, quads, triangles, tube
 
-Doubles = NDArray[np.float64]
+DoublesOfHouses = NDArray[np.float64]
 Floating = NDArray[np.floating]
 
 FOOT_M = -2.5
@@ -27,7 +27,7 @@ ROOF_COLOURS: tuple[Colour, ...] = ((0.10, 0.13, 0.32), (0.12, 0.12, 0.14), (0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class HousePlan:
     """Dimensions of a house, metres."""
 
     width_m: float
@@ -44,7 +44,7 @@ class Plan:
         return self.floors * self.floor_m + 0.4
 
 
-def house(rng: np.random.Generator, plan: Plan) -> Mesh:
+def house(rng: np.random.Generator, plan: HousePlan) -> Mesh:
     """A house of a plan, in random colours."""
     colour = np.asarray(WALL_COLOURS[rng.integers(len(WALL_COLOURS))]) * rng.uniform(0.75, 1.1)
     wall = Material.BRICK if rng.random() < 0.4 else Material.PLASTER
@@ -68,7 +68,14 @@ def house(rng: np.random.Generator, plan: Plan) -> Mesh:
 
 
 def _wall(
-    rng: np.random.Generator, plan: Plan, width_m: float, colour: Doubles, kind: Material, frame: Doubles, *, door: bool
+    rng: np.random.Generator,
+    plan: HousePlan,
+    width_m: float,
+    colour: DoublesOfHouses,
+    kind: Material,
+    frame: DoublesOfHouses,
+    *,
+    door: bool,
 ) -> Mesh:
     """A wall in the plane y = 0, seen from y < 0, of bays with a window each."""
     bays = max(1, round(width_m / plan.bay_m))
@@ -144,7 +151,7 @@ def _turned(mesh: Mesh, at_m: tuple[float, float], angle_rad: float) -> Mesh:
     return mesh.placed(at_m[0], at_m[1], 0.0, angle_rad)
 
 
-def _roof(rng: np.random.Generator, plan: Plan, colour: Doubles, wall: Material) -> Mesh:
+def _roof(rng: np.random.Generator, plan: HousePlan, colour: DoublesOfHouses, wall: Material) -> Mesh:
     w, d, h = plan.width_m, plan.depth_m, plan.height_m
     if not plan.gabled:
         top, rim = h + rng.uniform(0.3, 0.9), 0.3
@@ -178,7 +185,7 @@ def _roof(rng: np.random.Generator, plan: Plan, colour: Doubles, wall: Material)
     return join(parts)
 
 
-def _balconies(rng: np.random.Generator, plan: Plan, frame: Doubles) -> Mesh:
+def _balconies(rng: np.random.Generator, plan: HousePlan, frame: DoublesOfHouses) -> Mesh:
     width = rng.uniform(2.0, 3.5)
     x = rng.uniform(0.3, max(0.4, plan.width_m - width - 0.3))
     out = rng.uniform(0.9, 1.4)

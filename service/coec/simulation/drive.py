@@ -20,15 +20,23 @@ from coec.calibration.types import Matrix4, Rig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera, build, intrinsics_of, name_of
 from coec.geometry.se3 import inverse, perturb
-from coec.simulation.aboard import Aboard, CameraAboard, LidarAboard, OdometerAboard, Optics, Wire, product
-from coec.simulation.exposure import Lens
+from coec.simulation.aboard import (
+    Optics,
+    SimulatedCamera,
+    SimulatedLidar,
+    SimulatedOdometer,
+    SimulatedSensor,
+    Wire,
+    product,
+)
+from coec.simulation.exposure import LensProperties
 from coec.simulation.faults import Fault, shifted
 from coec.simulation.journey import Journey
 from coec.simulation.lidar import LIDARS, LidarModel
 from coec.simulation.scene import Solid
 from coec.simulation.schedule import Arrival, arrivals, seconds_of
 from coec.simulation.vehicle import T_ego_lidar, body, workshop_T_camera_lidar
-from coec.sources.recording import MOTION_REACH_NS, Message, chosen_indices
+from coec.sources.recording import MOTION_REACH_NS, SensorMessage, selected_indices
 
 XI, ALPHA = -0.2, 0.6
 """Parameters of the double sphere fisheye, close to those of common lenses."""
@@ -83,7 +91,7 @@ class DriveConfig:
     faults: tuple[Fault, ...] = ()
     workshop: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     depth: bool = False
-    lens: Lens = field(default_factory=Lens)
+    lens: LensProperties = field(default_factory=LensProperties)
 
     def drive(self) -> SimulatedDrive:
         """The drive that it describes."""
@@ -115,7 +123,7 @@ class SimulatedDrive:
             go_s=config.go_s, stop_s=config.stop_s,
         )  # fmt: skip
         self._true = workshop_T_camera_lidar()
-        self._turning = LidarAboard(
+        self._turning = SimulatedLidar(
             self._journey, Wire("lidar", config.lidar_hz, _LIDAR, faults=config.faults), lidar_of(config.lidar),
             lambda _: T_ego_lidar(),
         )  # fmt: skip
@@ -133,16 +141,16 @@ class SimulatedDrive:
             config.depth,
             config.lens,
         )
-        eye = CameraAboard(
+        eye = SimulatedCamera(
             self._journey, Wire("camera", config.camera_hz, _CAMERA, faults=config.faults), optics,
             self._T_ego_camera, Solid(body()),
         )  # fmt: skip
-        odometer = OdometerAboard(self._journey, Wire("ego", config.ego_hz, _EGO, faults=config.faults))
-        self._streams: tuple[Aboard, ...] = (odometer, self._turning, eye)
+        odometer = SimulatedOdometer(self._journey, Wire("ego", config.ego_hz, _EGO, faults=config.faults))
+        self._streams: tuple[SimulatedSensor, ...] = (odometer, self._turning, eye)
         xi = np.array([*np.deg2rad(config.workshop[:3]), *config.workshop[3:]])
-        told = _told(self.camera, config.intrinsics_off)
+        assumed = _assumed_camera(self.camera, config.intrinsics_off)
         mask = eye.mask_at(product(T_ego_lidar(), inverse(self._true)))
-        self.rig = Rig("sim", told, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask)
+        self.rig = Rig("sim", assumed, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask)
 
     def through(self, camera: str | Camera, half_view_deg: float) -> SimulatedDrive:
         """The same drive with another lens. Both share their surroundings, so they are best drawn in step.
@@ -188,12 +196,12 @@ class SimulatedDrive:
         """True T_world_ego (4, 4) at a time."""
         return self._journey.pose(seconds_of(stamp_ns))
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
         """See `Recording.messages`."""
         for entry in self._plan if cameras is None else needed(self._plan, cameras, _CAMERA, _LIDAR, _EGO):
             yield self._message(entry)
 
-    def part(self, begin: int, end: int) -> list[Message]:
+    def part(self, begin: int, end: int) -> list[SensorMessage]:
         """Messages `begin` to `end` (excluded) of `messages()`, so that several processes can share the work."""
         return [self._message(entry) for entry in self._plan[begin:end]]
 
@@ -206,7 +214,7 @@ class SimulatedDrive:
     def _plan(self) -> list[Arrival]:
         return arrivals(self._streams, self.config.seconds)
 
-    def _message(self, entry: Arrival) -> Message:
+    def _message(self, entry: Arrival) -> SensorMessage:
         return self._streams[entry.stream].frame(entry.number, entry.stamp_ns)
 
     def _T_ego_camera(self, time_s: float) -> Matrix4:
@@ -261,15 +269,15 @@ def needed(plan: list[Arrival], cameras: Collection[int], camera: int, lidar: in
         UsageError: an index out of range.
     """
     exposures = [entry for entry in plan if entry.stream == camera]
-    picked = [exposures[index] for index in chosen_indices(cameras, len(exposures))]
+    picked = [exposures[index] for index in selected_indices(cameras, len(exposures))]
     stamps = np.array([entry.stamp_ns for entry in picked], dtype=np.int64)
     sweeps = [entry for entry in plan if entry.stream == lidar]
     times = np.array([entry.stamp_ns for entry in sweeps], dtype=np.int64)
     near = {int(np.abs(times - stamp).argmin()) for stamp in stamps} if len(times) else set()
-    wanted = {*picked, *(sweeps[index] for index in near)}
+    required = {*picked, *(sweeps[index] for index in near)}
     for entry in plan:
         around = entry.stream == ego and len(stamps) and np.abs(stamps - entry.stamp_ns).min() <= MOTION_REACH_NS
-        if entry in wanted or around:
+        if entry in required or around:
             yield entry
 
 
@@ -286,10 +294,10 @@ def camera_of(choice: str | Camera, half_view_deg: float) -> Camera:
     """The camera of a name, see `DriveConfig`. Raises UsageError, which lists the allowed forms."""
     if not isinstance(choice, str):
         return choice
-    if found := re.fullmatch(r"fisheye(\d{2,4})", choice):
-        return fisheye(int(found[1]), half_view_deg)
-    if found := re.fullmatch(r"pinhole(\d{2,4})x(\d{2,4})(?:@(\d{1,3}))?", choice):
-        width, height, wide_deg = int(found[1]), int(found[2]), int(found[3] or WIDE_DEG)
+    if match := re.fullmatch(r"fisheye(\d{2,4})", choice):
+        return fisheye(int(match[1]), half_view_deg)
+    if match := re.fullmatch(r"pinhole(\d{2,4})x(\d{2,4})(?:@(\d{1,3}))?", choice):
+        width, height, wide_deg = int(match[1]), int(match[2]), int(match[3] or WIDE_DEG)
         if PINHOLE_DEG[0] <= wide_deg <= PINHOLE_DEG[1]:
             focal = width / 2 / math.tan(math.radians(wide_deg) / 2) if wide_deg != WIDE_DEG else width / 2
             return build(
@@ -301,16 +309,16 @@ def camera_of(choice: str | Camera, half_view_deg: float) -> Camera:
     )
 
 
-def _told(camera: Camera, off_percent: tuple[float, float, float]) -> Camera:
+def _assumed_camera(camera: Camera, off_percent: tuple[float, float, float]) -> Camera:
     """The camera as the workshop assumes it to be."""
     focal, across, down = (value / 100.0 for value in off_percent)
-    told = {
+    parameters = {
         "fx": camera.fx * (1.0 + focal),
         "fy": camera.fy * (1.0 + focal),
         "cx": camera.cx + across * camera.width,
         "cy": camera.cy + down * camera.height,
     }
-    return build(name_of(camera), **intrinsics_of(camera) | told)
+    return build(name_of(camera), **intrinsics_of(camera) | parameters)
 
 
 def fisheye(width_px: int, half_view_deg: float) -> Camera:

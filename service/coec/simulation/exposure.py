@@ -14,7 +14,7 @@ from coec.simulation.render import tone
 
 
 @dataclass(frozen=True, slots=True)
-class Lens:
+class LensProperties:
     """How a camera degrades a picture.
 
     Attributes:
@@ -49,7 +49,7 @@ NIGHT_TARGET = 0.08
 """Mean level of pictures at night, which cameras leave dark."""
 
 
-def at_night(lens: Lens) -> Lens:
+def at_night(lens: LensProperties) -> LensProperties:
     """The camera in the dark: it exposes longer and amplifies more."""
     return replace(
         lens,
@@ -61,13 +61,19 @@ def at_night(lens: Lens) -> Lens:
     )
 
 
-def against_the_sun(lens: Lens) -> Lens:
+def against_the_sun(lens: LensProperties) -> LensProperties:
     """The lens with the sun in it, or just outside."""
     return replace(lens, flare=LOW_SUN_FLARE)
 
 
 def expose(
-    linear: Floats, seen: NDArray[np.bool_], lens: Lens, rng: np.random.Generator, *, light: float, dirt: Floats | None
+    linear: Floats,
+    seen: NDArray[np.bool_],
+    lens: LensProperties,
+    rng: np.random.Generator,
+    *,
+    light: float,
+    dirt: Floats | None,
 ) -> NDArray[np.uint8]:
     """(h, w, 3) uint8 BGR picture of (h, w, 3) radiance.
 

@@ -49,12 +49,12 @@ class _Shift(Fault):
 
 
 @dataclass(frozen=True, slots=True)
-class Step(_Shift):
+class StepFault(_Shift):
     """The mount is knocked at once, and returns at the end."""
 
 
 @dataclass(frozen=True, slots=True)
-class Drift(_Shift):
+class DriftFault(_Shift):
     """The mount creeps evenly from begin to end, and then stays."""
 
 
@@ -111,7 +111,7 @@ class ZeroEgo(Fault):
 
 
 @dataclass(frozen=True, slots=True)
-class Offset(Fault):
+class StampOffset(Fault):
     """The stamps of the camera are late by this many seconds (early if negative)."""
 
     seconds: float = 0.05
@@ -160,8 +160,8 @@ class OffsetDrift(Fault):
 
 
 KINDS: dict[str, type[Fault]] = {
-    "step": Step,
-    "drift": Drift,
+    "step": StepFault,
+    "drift": DriftFault,
     "swing": Swing,
     "dirt": Dirt,
     "dark": Dark,
@@ -170,7 +170,7 @@ KINDS: dict[str, type[Fault]] = {
     "beams": Beams,
     "no-ego": NoEgo,
     "zero-ego": ZeroEgo,
-    "offset": Offset,
+    "offset": StampOffset,
     "loss": Loss,
     "tunnel": Tunnel,
     "open_road": OpenRoad,
@@ -243,8 +243,8 @@ class SensorFault:
 
 OF_ALL: tuple[type[Fault], ...] = (NoEgo, ZeroEgo, Loss, Tunnel, OpenRoad, Night, Rain, LowSun)
 """Faults that need no sensor."""
-OF_CAMERAS: tuple[type[Fault], ...] = (Step, Drift, Swing, Dirt, Dark, Frozen, Offset, OffsetDrift, Loss)
-OF_LIDARS: tuple[type[Fault], ...] = (Step, Drift, Swing, LidarFrozen, Beams, Loss)
+OF_CAMERAS: tuple[type[Fault], ...] = (StepFault, DriftFault, Swing, Dirt, Dark, Frozen, StampOffset, OffsetDrift, Loss)
+OF_LIDARS: tuple[type[Fault], ...] = (StepFault, DriftFault, Swing, LidarFrozen, Beams, Loss)
 
 
 def parse_sensor_fault(text: str, cameras: Collection[str], lidars: Collection[str]) -> SensorFault:
@@ -292,10 +292,10 @@ def shifted(T_camera_lidar: NDArray[np.float64], faults: tuple[Fault, ...], time
     """(4, 4): the extrinsic after all steps, drifts and swings up to a time, in their order."""
     result = T_camera_lidar
     for fault in faults:
-        if isinstance(fault, Drift):
+        if isinstance(fault, DriftFault):
             share = _share(fault, time_s)
             result = perturb(result, share * fault.xi()) if share > 0 else result
-        elif isinstance(fault, Step) and fault.active(time_s):
+        elif isinstance(fault, StepFault) and fault.active(time_s):
             result = perturb(result, fault.xi())
         elif isinstance(fault, Swing) and fault.active(time_s):
             result = perturb(result, fault.phase(time_s) * fault.xi())
@@ -306,7 +306,7 @@ def late_s(faults: tuple[Fault, ...], time_s: float) -> float:
     """How late the stamp of a camera frame is that is taken at a time, seconds."""
     total = 0.0
     for fault in faults:
-        if isinstance(fault, Offset) and fault.active(time_s):
+        if isinstance(fault, StampOffset) and fault.active(time_s):
             total += fault.seconds
         elif isinstance(fault, OffsetDrift):
             total += fault.seconds * _share(fault, time_s)

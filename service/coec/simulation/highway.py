@@ -15,13 +15,13 @@ OWN_LEFT_M = -(MEDIAN_M + 1.5 * LANE_M)
 """Middle of the right lane."""
 RAIL_LOW_M, RAIL_HIGH_M, POSTS_M = 0.45, 0.78, 4.0
 GROUND_HALF_M = 60.0
-STEP_M = 3.0
+HIGHWAY_STEP_M = 3.0
 DELINEATORS_M = 50.0
 
 
 def highway(rng: np.random.Generator, site: Site, length_m: float) -> None:
     """Adds a stretch of highway."""
-    s = np.arange(0.0, length_m + 1e-6, STEP_M)
+    s = np.arange(0.0, length_m + 1e-6, HIGHWAY_STEP_M)
     grey, white = np.array([0.19, 0.19, 0.19]) * rng.uniform(0.9, 1.1), (0.72, 0.74, 0.74)
     site.meshes.append(quads(site.strip(s, (-OUTER_M, OUTER_M), (0.0, 0.0)), grey, Material.ASPHALT))
     for side in (-1.0, 1.0):

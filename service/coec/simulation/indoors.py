@@ -84,7 +84,7 @@ def _furnish(rng: np.random.Generator, site: Site, begin_m: float, half_m: float
         for _ in range(int(rng.integers(4, 8))):
             at = begin_m + rng.uniform(0.9, ROOM_M - 0.9)
             left = side * rng.uniform(AISLE_M + 0.5, half_m - 0.4)
-            mesh = (_desk, _shelf, _box, _chair, _stand)[int(rng.integers(5))](rng)
+            mesh = (_work_table, _shelf, _box, _chair, _stand)[int(rng.integers(5))](rng)
             site.put(mesh, at, left, rng.choice([0.0, np.pi / 2]) + rng.normal(0, 0.1))
         for _ in range(int(rng.integers(1, 4))):
             at = begin_m + rng.uniform(1.2, ROOM_M - 1.2)
@@ -160,7 +160,7 @@ def _on_wall(rng: np.random.Generator) -> Mesh:
     return box([-0.35, -0.3, 0.0], [0.35, 0.05, rng.uniform(0.9, 2.0)], colour, Material.LACQUER)
 
 
-def _desk(rng: np.random.Generator) -> Mesh:
+def _work_table(rng: np.random.Generator) -> Mesh:
     long, deep, high = rng.uniform(0.6, 1.0), 0.4, rng.uniform(0.7, 0.8)
     top = box([-long, -deep, high - 0.04], [long, deep, high], rng.uniform(0.15, 0.7, 3), Material.BARK)
     legs = [

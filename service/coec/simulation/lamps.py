@@ -16,7 +16,7 @@ from coec.simulation.scene import Hits, Scene
 from coec.simulation.sky import Sky
 from coec.simulation.tunnel import SPINE_M
 
-Doubles = NDArray[np.float64]
+DoublesOfLamps = NDArray[np.float64]
 
 # Unit of light: that of the sun on a white wall, as in `Sky`.
 MOUTH_SHARE, MOUTH_DEPTH_M = 0.5, 7.0
@@ -41,7 +41,7 @@ class Incident(NamedTuple):
     lamps: Floats
 
 
-def incident(scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits) -> Incident:
+def incident(scene: Scene, origin_m: DoublesOfLamps, directions: Floats, hits: Hits) -> Incident:
     """The light, by lamps and tunnels, at the points where rays from `origin_m` (world) hit something."""
     share, lamps = np.ones(len(directions), np.float32), np.zeros(len(directions), np.float32)
     origin = np.asarray(origin_m, np.float64)
@@ -53,7 +53,7 @@ def incident(scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits) ->
     return Incident(share, lamps)
 
 
-def around(scene: Scene, place_m: Doubles) -> tuple[float, float]:
+def around(scene: Scene, place_m: DoublesOfLamps) -> tuple[float, float]:
     """Share of the sky's light, and light of lamps, on a surface at a place (3,), world, that faces down."""
     still = Hits(np.zeros(1, np.float32), np.zeros(1, np.int32), np.array([[0.0, 0.0, -1.0]], np.float32))
     light = incident(scene, place_m, np.array([[0.0, 0.0, 1.0]], np.float32), still)
@@ -66,7 +66,7 @@ def night_sky(sky: Sky) -> Sky:
     return replace(sky, sun=(0.0, 0.0, 0.0), zenith=(zenith,) * 3, horizon=(horizon,) * 3)
 
 
-def headlights(T_world_ego: Matrix4) -> Doubles:
+def headlights(T_world_ego: Matrix4) -> DoublesOfLamps:
     """(2, 4, 3): for each dipped beam its place and its axes forward, left and up, world."""
     axes = T_world_ego[:3, :3].T
     return np.array(
@@ -76,7 +76,7 @@ def headlights(T_world_ego: Matrix4) -> Doubles:
 
 @njit(cache=True, parallel=PRANGE)
 def _in_bore(
-    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, spine: Doubles, half_m: float, high_m: float,
+    origin: DoublesOfLamps, directions: Floats, range_m: Floats, normal: Floats, spine: DoublesOfLamps, half_m: float, high_m: float,
     light: float, share: Floats, lamps: Floats,
 ) -> None:  # fmt: skip
     last = len(spine) - 1
@@ -108,7 +108,7 @@ def _in_bore(
 
 @njit(cache=True, parallel=PRANGE)
 def _headlit(
-    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, beams: Doubles, lamps: Floats
+    origin: DoublesOfLamps, directions: Floats, range_m: Floats, normal: Floats, beams: DoublesOfLamps, lamps: Floats
 ) -> None:
     for i in prange(len(directions)):
         r = float(range_m[i])

@@ -99,9 +99,9 @@ def sweep(
     times = np.repeat(time_s + offset_s, beams)
     origins = np.repeat(pose[:, :3, 3], beams, axis=0)
 
-    def cast(local: Doubles, chosen: NDArray[np.int64]) -> Hits:
-        turned = np.einsum("nij,nj->ni", pose[chosen // beams, :3, :3], local).astype(np.float32)
-        return scene.cast(origins[chosen], turned, times[chosen], model.reach_m)
+    def cast(local: Doubles, selected: NDArray[np.int64]) -> Hits:
+        turned = np.einsum("nij,nj->ni", pose[selected // beams, :3, :3], local).astype(np.float32)
+        return scene.cast(origins[selected], turned, times[selected], model.reach_m)
 
     everything = np.arange(columns * beams)
     flat = rays.reshape(-1, 3)
@@ -156,20 +156,20 @@ def _jumps(range_m: Doubles) -> NDArray[np.bool_]:
     held = np.where(np.isfinite(range_m), range_m, 1e4)
     across = np.abs(np.diff(held, axis=0, append=held[:1])) > JUMP * np.minimum(held, np.roll(held, -1, axis=0))
     result |= across | np.roll(across, 1, axis=0)
-    apart = np.abs(np.diff(held, axis=1))
+    difference = np.abs(np.diff(held, axis=1))
     # Neighbouring beams also differ on level ground: only a much larger difference is an edge.
-    up = apart > 0.12 * np.minimum(held[:, 1:], held[:, :-1])
+    up = difference > 0.12 * np.minimum(held[:, 1:], held[:, :-1])
     result[:, 1:] |= up
     result[:, :-1] |= up
     return result
 
 
 def _cones(
-    model: LidarModel, flat: Doubles, chosen: NDArray[np.int64], middle_m: Doubles, middle: Doubles,
+    model: LidarModel, flat: Doubles, selected: NDArray[np.int64], middle_m: Doubles, middle: Doubles,
     cast: Callable[[Doubles, NDArray[np.int64]], Hits], scene: Scene,
 ) -> tuple[Doubles, Doubles]:  # fmt: skip
     """Range and strength of beams as cones: the strongest echo, mixed with the echoes within a pulse's length of it."""
-    if not len(chosen):
+    if not len(selected):
         return middle_m, middle
     ranges, strengths = [middle_m], [middle]
     side = np.column_stack([-flat[:, 1], flat[:, 0], np.zeros(len(flat))])
@@ -178,7 +178,7 @@ def _cones(
     for across, over in SPREAD:
         ray = flat + model.divergence_rad * (across * side + over * above)
         ray /= np.linalg.norm(ray, axis=1)[:, None]
-        hits = cast(ray, chosen)
+        hits = cast(ray, selected)
         ranges.append(hits.range_m.astype(np.float64))
         strengths.append(_reflectance(scene, hits) * np.where(np.isfinite(hits.range_m), 0.7, 0.0))
     echo, weight = np.stack(ranges, axis=1), np.stack(strengths, axis=1)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from typing import Any, Protocol
 
-from coec.sources.recording import Message
+from coec.sources.recording import SensorMessage
 
 PART = 128
 """Messages per piece of work: about 2 s of a drive at the usual rates, some 45 MB of sweeps to transfer."""
@@ -25,11 +25,11 @@ class Drive(Protocol):
         """How many `messages()` there are."""
         ...
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[SensorMessage]:
         """All messages in the order of their stamps."""
         ...
 
-    def part(self, begin: int, end: int) -> list[Message]:
+    def part(self, begin: int, end: int) -> list[SensorMessage]:
         """Messages `begin` to `end` (excluded) of `messages()`."""
         ...
 
@@ -49,7 +49,7 @@ _left: Event | None = None
 """Set when nobody waits any more for what is being made."""
 
 
-def messages_by(config: Driven, processes: int) -> Iterator[Message]:
+def messages_by(config: Driven, processes: int) -> Iterator[SensorMessage]:
     """The messages of the drive, in the same order and the same to the byte as from its own `messages`.
 
     At most two pieces of work per process are in progress or waiting, whatever the length of the drive.
@@ -62,7 +62,7 @@ def messages_by(config: Driven, processes: int) -> Iterator[Message]:
     left = SPAWN.Event()
     with spawned(processes, _open, config, left) as pool:
         try:
-            waiting: deque[Future[list[Message]]] = deque()
+            waiting: deque[Future[list[SensorMessage]]] = deque()
             for begin in range(0, count, PART):
                 waiting.append(pool.submit(_part, begin))
                 if len(waiting) > 2 * processes:
@@ -98,10 +98,10 @@ def _open(config: Driven, left: Event) -> None:
     _drive, _left = config.drive(), left
 
 
-def _part(begin: int) -> list[Message]:
+def _part(begin: int) -> list[SensorMessage]:
     assert _drive is not None
     assert _left is not None
-    made: list[Message] = []
+    made: list[SensorMessage] = []
     while len(made) < PART and not _left.is_set():
         one = _drive.part(begin + len(made), begin + len(made) + 1)
         if not one:

@@ -42,7 +42,7 @@ class PixelRays(NamedTuple):
     pixel_rad: float
 
 
-class View(NamedTuple):
+class RenderedView(NamedTuple):
     """A picture.
 
     Attributes:
@@ -81,7 +81,7 @@ def render_view(
     half_view_rad: float = np.pi,
     smooth_edges: bool = True,
     exposure: float = 0.9,
-) -> View:
+) -> RenderedView:
     """A perfect camera's picture: no noise, no blur, no vignetting.
 
     Args:
@@ -94,7 +94,7 @@ def render_view(
     radiance = render_radiance(
         scene, camera, T_world_camera, time_s=time_s, half_view_rad=half_view_rad, smooth_edges=smooth_edges
     )
-    return View(tone(radiance.linear, exposure), radiance.range_m)
+    return RenderedView(tone(radiance.linear, exposure), radiance.range_m)
 
 
 def tone(linear: Floats, exposure: float) -> NDArray[np.uint8]:
@@ -140,12 +140,12 @@ def render_rows(
     linear = np.zeros((size, 3), np.float32)
     range_m = np.full(size, np.nan, np.float32)
     for part in exposures:
-        chosen = _rows(rays.pixel, part, camera)
+        selected = _rows(rays.pixel, part, camera)
         rotation, origin = _placed(part)
-        directions = _rotated(rays.directions[chosen], rotation)
+        directions = _rotated(rays.directions[selected], rotation)
         hits = scene.cast(origin, directions, part.time_s)
-        linear[rays.pixel[chosen]] = _lit(scene, origin, directions, hits, part.time_s, rays.pixel_rad)
-        range_m[rays.pixel[chosen]] = np.where(hits.triangle < 0, np.float32(np.nan), hits.range_m)
+        linear[rays.pixel[selected]] = _lit(scene, origin, directions, hits, part.time_s, rays.pixel_rad)
+        range_m[rays.pixel[selected]] = np.where(hits.triangle < 0, np.float32(np.nan), hits.range_m)
     if smooth_edges:
         seen = np.zeros(size, bool)
         seen[rays.pixel] = True
@@ -203,11 +203,11 @@ def _facing_sun(triangle: NDArray[np.int32], normal: Floats, sun: Floats) -> NDA
     return np.flatnonzero((triangle >= 0) & (cosine > 0))
 
 
-def _points(hits: Hits, directions: Floats, origin: Floats, chosen: NDArray[np.int64]) -> Floats:
+def _points(hits: Hits, directions: Floats, origin: Floats, selected: NDArray[np.int64]) -> Floats:
     return np.asarray(
         origin
-        + directions[chosen] * hits.range_m[chosen, None]
-        + hits.normal[chosen] * np.float32(SHADOW_LIFT_M)
+        + directions[selected] * hits.range_m[selected, None]
+        + hits.normal[selected] * np.float32(SHADOW_LIFT_M)
     )  # fmt: skip
 
 
@@ -247,11 +247,11 @@ def _edges(linear: Floats, range_m: Floats, seen: NDArray[np.bool_]) -> NDArray[
                     continue
                 a, b = range_m[y, x], range_m[y2, x2]
                 gone_a, gone_b = a != a, b != b
-                apart = gone_a != gone_b or (not gone_a and abs(a - b) > EDGE_RANGE * min(a, b))
-                if not apart:
+                differs = gone_a != gone_b or (not gone_a and abs(a - b) > EDGE_RANGE * min(a, b))
+                if not differs:
                     low, high = min(linear[y, x, 1], 1.5), min(linear[y2, x2, 1], 1.5)
-                    apart = abs(low - high) > 0.15 * (low + high) + 0.01
-                if apart:
+                    differs = abs(low - high) > 0.15 * (low + high) + 0.01
+                if differs:
                     out[y, x] = True
                     out[y2, x2] = True
     return out

@@ -17,16 +17,25 @@ from coec.calibration.types import Matrix4, Rig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera
 from coec.geometry.se3 import inverse, perturb
-from coec.simulation.aboard import Aboard, CameraAboard, LidarAboard, Mount, OdometerAboard, Optics, Wire, product
+from coec.simulation.aboard import (
+    Mount,
+    Optics,
+    SimulatedCamera,
+    SimulatedLidar,
+    SimulatedOdometer,
+    SimulatedSensor,
+    Wire,
+    product,
+)
 from coec.simulation.drive import camera_of, check_rates, needed, stamps_of
-from coec.simulation.exposure import Lens
+from coec.simulation.exposure import LensProperties
 from coec.simulation.faults import Fault, SensorFault, shifted
 from coec.simulation.journey import Journey
 from coec.simulation.rigs import FOUR_FISHEYES, RigLayout
 from coec.simulation.scene import Solid
 from coec.simulation.schedule import Arrival, arrivals, seconds_of
 from coec.simulation.vehicle import whole_body
-from coec.sources.recording import Message
+from coec.sources.recording import SensorMessage
 
 EGO = "ego"
 """Name of the odometer's stream, and of the vehicle's frame."""
@@ -35,7 +44,7 @@ Vector6 = tuple[float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class RigConfig:
+class RigDriveConfig:
     """What to drive: like `drive.DriveConfig`, for a rig.
 
     Attributes:
@@ -60,7 +69,7 @@ class RigConfig:
     faults: tuple[SensorFault, ...] = ()
     workshop: tuple[tuple[str, Vector6], ...] = ()
     depth: bool = False
-    lens: Lens = field(default_factory=Lens)
+    lens: LensProperties = field(default_factory=LensProperties)
     rows: tuple[float, float] = (0.0, 1.0)
 
     def drive(self) -> RigDrive:
@@ -80,7 +89,7 @@ class RigDrive:
         UsageError: an unknown camera or sensor, or figures out of range; the message names them.
     """
 
-    def __init__(self, config: RigConfig) -> None:
+    def __init__(self, config: RigDriveConfig) -> None:
         check_rates(config)
         layout = config.layout
         self.config = config
@@ -103,10 +112,12 @@ class RigDrive:
         )  # fmt: skip
         self._body = Solid(whole_body())
         self._order = (EGO, *self.lidars, *self.cameras)
-        self._eyes: dict[str, CameraAboard] = {}
-        self._streams: dict[str, Aboard] = {EGO: OdometerAboard(self._journey, Wire(EGO, config.ego_hz, 0, (), common))}
+        self._eyes: dict[str, SimulatedCamera] = {}
+        self._streams: dict[str, SimulatedSensor] = {
+            EGO: SimulatedOdometer(self._journey, Wire(EGO, config.ego_hz, 0, (), common))
+        }
         for lidar in layout.lidars:
-            self._streams[lidar.name] = LidarAboard(
+            self._streams[lidar.name] = SimulatedLidar(
                 self._journey, self._wire(lidar.name, config.lidar_hz), lidar.model, self._mount(lidar.name),
                 delay_s=lidar.phase / config.lidar_hz, own_body=self._body,
             )  # fmt: skip
@@ -115,7 +126,7 @@ class RigDrive:
                 self.camera, layout.half_view_deg, camera.phase / config.camera_hz,
                 depth=config.depth, lens=config.lens, rows=config.rows,
             )  # fmt: skip
-            self._eyes[camera.name] = CameraAboard(
+            self._eyes[camera.name] = SimulatedCamera(
                 self._journey, self._wire(camera.name, config.camera_hz), optics, self._mount(camera.name), self._body
             )
         self._streams |= self._eyes
@@ -135,16 +146,16 @@ class RigDrive:
         """Everything that arrives, in the order of the stamps. Streams are numbered: ego, LiDARs, cameras."""
         return arrivals([self._streams[name] for name in self._order], self.config.seconds)
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[SensorMessage]:
         """All frames of all sensors in the order of their stamps; `frame_id` is the name of the sensor."""
         for entry in self.plan:
             yield self.message(entry)
 
-    def part(self, begin: int, end: int) -> list[Message]:
+    def part(self, begin: int, end: int) -> list[SensorMessage]:
         """Messages `begin` to `end` (excluded) of `messages()`, so that several processes can share the work."""
         return [self.message(entry) for entry in self.plan[begin:end]]
 
-    def message(self, entry: Arrival) -> Message:
+    def message(self, entry: Arrival) -> SensorMessage:
         """The message of one entry of the plan."""
         return self._streams[self._order[entry.stream]].frame(entry.number, entry.stamp_ns)
 
@@ -169,7 +180,7 @@ class RigDrive:
         """(height, width): pixels of a camera that show the world, from where the camera was mounted."""
         return self._eyes[camera].mask_at(inverse(self._mounted[camera]))
 
-    def pair(self, camera: str, lidar: str) -> RigPair:
+    def pair(self, camera: str, lidar: str) -> SimulatedRigPair:
         """The recording of a camera and a LiDAR of the rig.
 
         Raises:
@@ -178,7 +189,7 @@ class RigDrive:
         for sensor, known, kind in ((camera, self.cameras, "camera"), (lidar, self.lidars, "LiDAR")):
             if sensor not in known:
                 raise UsageError(f"the rig has no {kind} {sensor!r}; it has {', '.join(known)}")
-        return RigPair(self, camera, lidar)
+        return SimulatedRigPair(self, camera, lidar)
 
     def _wire(self, name: str, hz: float) -> Wire:
         number = self._order.index(name)
@@ -189,7 +200,7 @@ class RigDrive:
         return lambda time_s: inverse(shifted(self._mounted[name], faults, time_s))
 
 
-class RigPair:
+class SimulatedRigPair:
     """A camera and a LiDAR of a rig, as a `sources.recording.Recording` whose truth is known.
 
     Attributes:
@@ -237,13 +248,13 @@ class RigPair:
         T_lidar_ego = self._drive.T_sensor_ego(self._lidar, stamp_ns)
         return product(self._drive.T_sensor_ego(self._camera, stamp_ns), inverse(T_lidar_ego))
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
         """See `Recording.messages`."""
         of = self._drive.stream
-        chosen = self._plan
+        entries = self._plan
         if cameras is not None:
-            chosen = list(needed(chosen, cameras, of(self._camera), of(self._lidar), of(EGO)))
-        for entry in chosen:
+            entries = list(needed(entries, cameras, of(self._camera), of(self._lidar), of(EGO)))
+        for entry in entries:
             yield self._drive.message(entry)
 
     @cached_property

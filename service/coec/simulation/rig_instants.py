@@ -14,7 +14,7 @@ from coec.calibration.types import FramePair
 from coec.config import PairingConfig
 from coec.simulation.rig_drive import EGO, RigDrive
 from coec.simulation.schedule import Arrival
-from coec.sources.recording import Message
+from coec.sources.recording import SensorMessage
 
 MOTION_NS = 250_000_000
 """Ego-motion this near to the sweep is a part of its instant: pictures are within 50 ms, motion within 200 ms of it."""
@@ -44,7 +44,7 @@ def instants(drive: RigDrive, lidar: str, period_s: float) -> list[Instant]:
     for entry in drive.plan:
         by_stream.setdefault(entry.stream, []).append(entry)
     turn_ns = NS_PER_S / drive.config.lidar_hz
-    found: list[Instant] = []
+    result: list[Instant] = []
     next_ns = drive.plan[0].stamp_ns if drive.plan else 0
     for sweep in by_stream.get(drive.stream(lidar), []):
         pictures = {}
@@ -55,12 +55,12 @@ def instants(drive: RigDrive, lidar: str, period_s: float) -> list[Instant]:
         if sweep.stamp_ns < next_ns or len(pictures) < len(cameras):
             continue
         motions = [m for m in by_stream.get(drive.stream(EGO), []) if abs(m.stamp_ns - sweep.stamp_ns) <= MOTION_NS]
-        found.append(Instant(sweep, pictures, tuple(motions)))
+        result.append(Instant(sweep, pictures, tuple(motions)))
         next_ns = max(next_ns, sweep.stamp_ns - round(turn_ns / 2)) + round(period_s * NS_PER_S)
-    return found
+    return result
 
 
-def pair_of(picture: Message, sweep: Message, motions: tuple[Message, ...]) -> FramePair | None:
+def pair_of(picture: SensorMessage, sweep: SensorMessage, motions: tuple[SensorMessage, ...]) -> FramePair | None:
     """The pair that the service would make of a picture, a sweep and the motion around them; None if it makes none."""
     pairer = Pairer(PairingConfig(), expects_motion=True)
     pairs = []

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Doubles = NDArray[np.float64]
+DoublesOfPatterns = NDArray[np.float64]
 
 PRISM_HZ = (121.57, -77.73)
 """Turns of the two prisms, 7294 and -4664 a minute, as in the first Livox sensors. Their ratio is not one of small
@@ -28,8 +28,8 @@ class Fired(NamedTuple):
         offset_s: (columns,) when each column is fired, relative to the stamp.
     """
 
-    rays: Doubles
-    offset_s: Doubles
+    rays: DoublesOfPatterns
+    offset_s: DoublesOfPatterns
 
 
 class Pattern(Protocol):
@@ -102,7 +102,7 @@ class Rosette:
 
     columns: int = 4000
     beams: int = 6
-    apart_rad: float = 0.005
+    spacing_rad: float = 0.005
 
     ringed = False
 
@@ -112,7 +112,7 @@ class Rosette:
         first, second = (2 * np.pi * hertz * (time_s + offset_s) for hertz in PRISM_HZ)
         left = PRISM_RAD * (np.cos(first) + np.cos(second))
         up = PRISM_RAD * (np.sin(first) + np.sin(second))
-        row = self.apart_rad * (np.arange(self.beams) - (self.beams - 1) / 2)
+        row = self.spacing_rad * (np.arange(self.beams) - (self.beams - 1) / 2)
         left, up = np.broadcast_arrays(left[:, None], up[:, None] + row)
         away = np.hypot(left, up)
         share = np.sinc(away / np.pi)  # sin(x)/x: from the angle to the unit vector

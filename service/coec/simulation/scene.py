@@ -13,7 +13,7 @@ from coec.geometry.compiler import njit
 from coec.simulation.mesh import Floats, Mesh, join
 from coec.simulation.passages import Passages
 from coec.simulation.road import Road, build_road
-from coec.simulation.sky import Sky, draw_sky
+from coec.simulation.sky import Sky, sample_sky
 from coec.simulation.street import NO_PASSAGES, STRETCH_M, Stretch, backdrop
 from coec.simulation.surroundings import Street, Surroundings
 from coec.simulation.traffic import MODELS, Mover, Progress
@@ -60,8 +60,8 @@ class Solid:
         normal = np.empty((count, 3), np.float32)
         for low in range(0, count, RAYS_AT_ONCE):
             part = slice(low, low + RAYS_AT_ONCE)
-            found = self._scene.run(origins_m[part], directions[part], query="INTERSECT", output=1)
-            _take(found["tfar"], found["primID"], found["Ng"], directions[part], float(reach_m),
+            embree_hits = self._scene.run(origins_m[part], directions[part], query="INTERSECT", output=1)
+            _take(embree_hits["tfar"], embree_hits["primID"], embree_hits["Ng"], directions[part], float(reach_m),
                   range_m[part], triangle[part], normal[part])  # fmt: skip
         return Hits(range_m, triangle, normal)
 
@@ -149,12 +149,12 @@ class Scene:
         poses = np.broadcast_to(mover.poses(self.road, times), (len(rays), 4))
         start = _turned(local[rays] - (poses[:, :3] - self.origin_m), -poses[:, 3])
         way = _turned(directions[rays].astype(np.float64), -poses[:, 3])
-        found = model.cast(start, way, float(np.inf))
-        nearer = found.range_m < hits.range_m[rays]
-        chosen = rays[nearer]
-        hits.range_m[chosen] = found.range_m[nearer]
-        hits.triangle[chosen] = found.triangle[nearer] + np.int32(self._first[mover.model])
-        hits.normal[chosen] = _turned(found.normal[nearer].astype(np.float64), poses[nearer, 3])
+        mover_hits = model.cast(start, way, float(np.inf))
+        nearer = mover_hits.range_m < hits.range_m[rays]
+        nearer_rays = rays[nearer]
+        hits.range_m[nearer_rays] = mover_hits.range_m[nearer]
+        hits.triangle[nearer_rays] = mover_hits.triangle[nearer] + np.int32(self._first[mover.model])
+        hits.normal[nearer_rays] = _turned(mover_hits.normal[nearer].astype(np.float64), poses[nearer, 3])
 
 
 class Town:
@@ -172,7 +172,7 @@ class Town:
         """A street, unless other surroundings are given; `traffic` says whether anything moves there."""
         self.seed = seed
         self.surroundings: Surroundings = Street(seed) if surroundings is None else surroundings
-        self.sky: Sky = draw_sky(seed)
+        self.sky: Sky = sample_sky(seed)
         margin = STRETCH_M * (BEHIND + AHEAD + 2) + 300.0
         self.road = build_road(seed, -margin, length_m + margin, self.surroundings.calmer)
         self._passages = passages
@@ -180,12 +180,12 @@ class Town:
         # Almost as far as the road reaches, so that the end of a ceiling is never in sight.
         self._bores = self.surroundings.bores(self.road, -margin + 1.0, length_m + margin - 1.0, passages)
         rng = np.random.default_rng([seed, 103])
-        self._models = [Solid(self.surroundings.look(rng)) for _ in range(MODELS)]
+        self._models = [Solid(self.surroundings.sample_model(rng)) for _ in range(MODELS)]
         self._stretches: dict[int, Stretch] = {}
         self._scene: tuple[int, Scene] | None = None
 
     @property
-    def stretches_kept(self) -> int:
+    def stretch_count(self) -> int:
         """How many stretches are in memory."""
         return len(self._stretches)
 
@@ -208,16 +208,16 @@ class Town:
         return scene
 
     def _build(self, place: int) -> Scene:
-        wanted = range(place - BEHIND, place + AHEAD + 1)
+        indices = range(place - BEHIND, place + AHEAD + 1)
         # In the order of the road, wherever the vehicle comes from, because the order of triangles changes the bytes.
-        kept = {
+        stretches = {
             index: self._stretches.get(index) or self.surroundings.build(index, self.road, self._passages)
-            for index in wanted
+            for index in indices
         }
-        self._stretches = kept
+        self._stretches = stretches
         origin = self.road.points(place * STRETCH_M, 0.0, 0.0)
         parts = []
-        for stretch in kept.values():
+        for stretch in stretches.values():
             shift = (stretch.origin_m - origin).astype(np.float32)
             parts.append(Mesh(stretch.mesh.corners_m + shift, stretch.mesh.colour, stretch.mesh.material))
         lowest = min(float(mesh.corners_m[:, :, 2].min()) for mesh in parts)
@@ -278,6 +278,6 @@ def _near(origins: Floats, directions: Floats, centre: Doubles, radius_m: float)
         y = centre[1] - origins[i, 1]
         z = centre[2] - origins[i, 2]
         along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
-        apart = x * x + y * y + z * z - along * along
-        result[i] = along > -radius_m and apart < radius_m * radius_m
+        distance2 = x * x + y * y + z * z - along * along
+        result[i] = along > -radius_m and distance2 < radius_m * radius_m
     return result

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from coec.simulation.aboard import Aboard
+from coec.simulation.aboard import SimulatedSensor
 from coec.simulation.journey import START_NS
 
 
@@ -18,7 +18,7 @@ class Arrival(NamedTuple):
     number: int
 
 
-def arrivals(streams: Sequence[Aboard], seconds: float) -> list[Arrival]:
+def arrivals(streams: Sequence[SimulatedSensor], seconds: float) -> list[Arrival]:
     """Everything that arrives, in the order of the stamps."""
     plan = []
     for stream, sensor in enumerate(streams):

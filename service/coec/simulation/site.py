@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.simulation.mesh import Floats, Mesh
-from coec.simulation.passages import Span
+from coec.simulation.passages import RoadSpan
 from coec.simulation.road import Road
 
 Doubles = NDArray[np.float64]
@@ -20,7 +20,7 @@ class Site:
         meshes: what was put there so far.
     """
 
-    def __init__(self, road: Road, begin_m: float, empty: tuple[Span, ...] = ()) -> None:
+    def __init__(self, road: Road, begin_m: float, empty: tuple[RoadSpan, ...] = ()) -> None:
         """`empty`: spans of the road on which nothing is put."""
         self.road = road
         self.begin_m = begin_m

@@ -29,7 +29,7 @@ class Sky:
     haze_m: float
 
 
-def draw_sky(seed: int) -> Sky:
+def sample_sky(seed: int) -> Sky:
     """The weather of a seed: a quarter of all are overcast, the others have the sun 12° to 65° high."""
     rng = np.random.default_rng([seed, 106])
     height, around = np.deg2rad(rng.uniform(12, 65)), rng.uniform(0, 2 * np.pi)

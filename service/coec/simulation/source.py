@@ -11,7 +11,7 @@ from coec.simulation.faults import parse_fault, parse_sensor_fault
 
 if TYPE_CHECKING:
     from coec.simulation.drive import DriveConfig, SimulatedDrive
-    from coec.simulation.rig_drive import RigDrive, RigPair
+    from coec.simulation.rig_drive import RigDrive, SimulatedRigPair
 
 NUMBERS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**31 - 1),
@@ -32,7 +32,7 @@ WHOLE = ("seed",)
 NAMES = ("scene", "camera", "lidar")
 """Query keys with a name; `DriveConfig` says which names exist."""
 SWITCHES = ("depth", "traffic")
-WORDS = (*NAMES, *SWITCHES, "faults", "workshop", "intrinsics_off")
+TEXT_KEYS = (*NAMES, *SWITCHES, "faults", "workshop", "intrinsics_off")
 
 
 MOST_OFF_PERCENT = 20.0
@@ -65,7 +65,7 @@ def drive_config_of(query: dict[str, str]) -> DriveConfig:
     require_extra()
     from coec.simulation.drive import DriveConfig
 
-    known = (*NUMBERS, *WORDS)
+    known = (*NUMBERS, *TEXT_KEYS)
     if unknown := sorted(set(query) - set(known)):
         raise UsageError(f"unknown query key {', '.join(unknown)} of a simulated drive; known: {', '.join(known)}")
     values = _values(query)
@@ -102,7 +102,7 @@ def open_rig(query: dict[str, str]) -> RigDrive:
         SourceError: the optional extra is not installed.
     """
     require_extra()
-    from coec.simulation.rig_drive import RigConfig, RigDrive
+    from coec.simulation.rig_drive import RigDrive, RigDriveConfig
     from coec.simulation.rigs import RIGS
 
     if unknown := sorted(set(query) - set(RIG_KEYS)):
@@ -121,10 +121,10 @@ def open_rig(query: dict[str, str]) -> RigDrive:
         if not all(colon for _, colon, _ in parts):
             raise UsageError(f"workshop={query['workshop']} of a rig: of which sensor? Write roof:0,0,1;front:0,1,0")
         values["workshop"] = tuple((sensor, _six(numbers)) for sensor, _, numbers in parts)
-    return RigDrive(RigConfig(layout, **values))  # type: ignore[arg-type]  # checked key by key above
+    return RigDrive(RigDriveConfig(layout, **values))  # type: ignore[arg-type]  # checked key by key above
 
 
-def open_pair_of_rig(query: dict[str, str]) -> RigPair:
+def open_pair_of_rig(query: dict[str, str]) -> SimulatedRigPair:
     """The recording of `sim:rig=...&pair=CAMERA-LIDAR&...`.
 
     Raises:

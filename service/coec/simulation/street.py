@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.simulation import props
-from coec.simulation.buildings import Plan, house
+from coec.simulation.buildings import HousePlan, house
 from coec.simulation.mesh import Material, Mesh, join, quads
 from coec.simulation.passages import Passages
 from coec.simulation.road import Road
@@ -62,7 +62,7 @@ class Style:
         return self.half_road_m + KERB_WIDTH_M + self.sidewalk_m
 
 
-def draw_style(seed: int) -> Style:
+def sample_style(seed: int) -> Style:
     """The style of a seed."""
     rng = np.random.default_rng([seed, 101])
     low = int(rng.integers(1, 4))
@@ -205,10 +205,10 @@ def _row(rng: np.random.Generator, site: Site, style: Style, side: float, begin_
             site.put(mesh, *place, up_m=KERB_M)
 
 
-def _plan(rng: np.random.Generator, style: Style, kind: int, shop: bool) -> Plan:
+def _plan(rng: np.random.Generator, style: Style, kind: int, shop: bool) -> HousePlan:
     floors = int(rng.integers(style.floors[0], style.floors[1] + 1))
     width = (rng.uniform(6, 14), rng.uniform(8, 14), rng.uniform(16, 30))[kind]
-    return Plan(
+    return HousePlan(
         width_m=float(width),
         depth_m=float(rng.uniform(8, 13)),
         floors=(max(floors, 2), min(floors, 2), floors + int(rng.integers(1, 4)))[kind],
@@ -219,7 +219,7 @@ def _plan(rng: np.random.Generator, style: Style, kind: int, shop: bool) -> Plan
     )
 
 
-def _stand(rng: np.random.Generator, site: Site, plan: Plan, side: float, at_m: float, front_m: float) -> None:
+def _stand(rng: np.random.Generator, site: Site, plan: HousePlan, side: float, at_m: float, front_m: float) -> None:
     mesh = house(rng, plan)
     half = plan.width_m / 2
     centred = Mesh(mesh.corners_m - np.array([half, 0, 0], dtype=np.float32), mesh.colour, mesh.material)

@@ -15,7 +15,7 @@ from coec.simulation.mesh import Mesh, join
 from coec.simulation.passages import Passages
 from coec.simulation.road import Road
 from coec.simulation.site import Site
-from coec.simulation.street import STRETCH_M, Stretch, Style, build_stretch, draw_style
+from coec.simulation.street import STRETCH_M, Stretch, Style, build_stretch, sample_style
 from coec.simulation.traffic import Mover, Progress
 from coec.simulation.tunnel import Bore, bore
 
@@ -42,7 +42,7 @@ class Surroundings(Protocol):
         """The stretch of a number; it does not depend on other stretches."""
         ...
 
-    def look(self, rng: np.random.Generator) -> Mesh:
+    def sample_model(self, rng: np.random.Generator) -> Mesh:
         """A random model of something that moves there."""
         ...
 
@@ -67,7 +67,7 @@ class Street:
     poor: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "style", draw_style(self.seed))
+        object.__setattr__(self, "style", sample_style(self.seed))
 
     @property
     def left_m(self) -> float:
@@ -78,7 +78,7 @@ class Street:
         """See `Surroundings`."""
         return build_stretch(self.seed, index, road, self.style, passages)
 
-    def look(self, rng: np.random.Generator) -> Mesh:
+    def sample_model(self, rng: np.random.Generator) -> Mesh:
         """See `Surroundings`."""
         return props.car(rng)
 
@@ -110,7 +110,7 @@ class Highway:
         """See `Surroundings`."""
         return _furnished(self.seed, index, road, highway)
 
-    def look(self, rng: np.random.Generator) -> Mesh:
+    def sample_model(self, rng: np.random.Generator) -> Mesh:
         """See `Surroundings`."""
         return props.car(rng)
 
@@ -142,7 +142,7 @@ class Garage:
         """See `Surroundings`."""
         return _furnished(self.seed, index, road, garage)
 
-    def look(self, rng: np.random.Generator) -> Mesh:
+    def sample_model(self, rng: np.random.Generator) -> Mesh:
         """See `Surroundings`."""
         return props.car(rng)
 
@@ -180,7 +180,7 @@ class Room:
         half_m = self.half_m
         return _furnished(self.seed, index, road, lambda rng, site, length_m: rooms(rng, site, length_m, half_m))
 
-    def look(self, rng: np.random.Generator) -> Mesh:
+    def sample_model(self, rng: np.random.Generator) -> Mesh:
         """See `Surroundings`."""
         return props.person(rng)
 

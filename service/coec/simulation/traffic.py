@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from coec.simulation.road import Road
 
-Doubles = NDArray[np.float64]
-Progress = Callable[[Doubles], Doubles]
+DoublesOfTraffic = NDArray[np.float64]
+Progress = Callable[[DoublesOfTraffic], DoublesOfTraffic]
 """Arc length in metres at times in seconds."""
 
 MODELS = 10
@@ -36,7 +36,7 @@ class Mover:
     left_m: float
     oncoming: bool
 
-    def poses(self, road: Road, time_s: Doubles) -> Doubles:
+    def poses(self, road: Road, time_s: DoublesOfTraffic) -> DoublesOfTraffic:
         """(N, 4): x, y, z in metres and heading in radians."""
         s = self.progress(time_s)
         xyz = road.points(s, self.left_m, 0.0)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.simulation.mesh import Material, quads
-from coec.simulation.passages import Span
+from coec.simulation.passages import RoadSpan
 from coec.simulation.road import Road
 from coec.simulation.site import Site
 
-Doubles = NDArray[np.float64]
+DoublesOfTunnel = NDArray[np.float64]
 
 HIGH_M = 4.8
 """Height of the ceiling above the road: room for a lorry of 4.0 m and for signs."""
@@ -42,13 +42,13 @@ class Bore:
         light: of its lamps, relative to those of a tunnel.
     """
 
-    spine: Doubles
+    spine: DoublesOfTunnel
     half_m: float
     high_m: float = HIGH_M
     light: float = 1.0
 
 
-def bore(road: Road, span: Span, lane_m: float) -> Bore:
+def bore(road: Road, span: RoadSpan, lane_m: float) -> Bore:
     """The room of the tunnel of a span, on a road with lanes of this width."""
     return bore_of(road, span.begin_m, span.end_m, lane_m + VERGE_M, HIGH_M, 1.0)
 
@@ -60,7 +60,7 @@ def bore_of(road: Road, begin_m: float, end_m: float, half_m: float, high_m: flo
     return Bore(np.column_stack([x, y, z, np.cos(heading), np.sin(heading)]), half_m, high_m, light)
 
 
-def dig(site: Site, span: Span, part: Span, lane_m: float) -> None:
+def dig(site: Site, span: RoadSpan, part: RoadSpan, lane_m: float) -> None:
     """Adds the part of a tunnel that lies on a site, with the face of the hill at its mouths."""
     half = lane_m + VERGE_M
     first, last = part.begin_m - site.begin_m, part.end_m - site.begin_m
@@ -82,7 +82,7 @@ def dig(site: Site, span: Span, part: Span, lane_m: float) -> None:
 
 
 def _face(site: Site, at_m: float, half_m: float, top_m: float) -> None:
-    def across(*corners: tuple[float, float]) -> Doubles:
+    def across(*corners: tuple[float, float]) -> DoublesOfTunnel:
         """(4, 3) of corners (left, up)."""
         left, up = np.array(corners).T
         return site.road.points(at_m, left, up) - site.origin_m

@@ -21,7 +21,7 @@ LENS_DROPS_PER_MMPH, LENS_DROP_SHARE = 2.0, (0.008, 0.03)
 """Drops on the lens per millimetre an hour, and their radius as a share of the width of the picture."""
 SHOWER_S = 4.0
 """How long drops stay on the lens: the time between two strokes of a wiper."""
-SUN_LOW_RAD, SUN_ASIDE_RAD = math.radians(5.0), math.radians(8.0)
+SUN_LOW_RAD, SUN_AZIMUTH_RAD = math.radians(5.0), math.radians(8.0)
 """Height of a low sun, and how far to the left of the heading it stands."""
 SUN_POWER = (0.45, 0.75, 1.1)
 """Light of a low sun: reddish, as in `sky.draw_sky` at its lowest."""
@@ -73,7 +73,7 @@ def rained_lens(shape: tuple[int, int], mm_per_h: float, seed: int, shower: int)
 
 def low_sun_sky(sky: Sky, heading_rad: float) -> Sky:
     """The sky of the same place with a low sun ahead of a vehicle with this heading, and few clouds."""
-    around = heading_rad + SUN_ASIDE_RAD
+    around = heading_rad + SUN_AZIMUTH_RAD
     towards = np.array(
         [math.cos(SUN_LOW_RAD) * math.cos(around), math.cos(SUN_LOW_RAD) * math.sin(around), math.sin(SUN_LOW_RAD)]
     )

@@ -6,13 +6,13 @@ import shlex
 from pathlib import Path
 
 from coec.errors import SourceError, UsageError
-from coec.sources.recording import Recording
+from coec.sources.recording import RecordingSource
 from coec.sources.spec import FORMS, SourceSpec, is_bag, parse_spec
 
-__all__ = ["Recording", "open_source"]
+__all__ = ["RecordingSource", "open_source"]
 
 
-def open_source(spec: str) -> Recording:
+def open_source(spec: str) -> RecordingSource:
     """Opens the recording that a SOURCE argument names (CONTRACT, "Command line"). Frames are loaded later.
 
     Raises:
@@ -49,7 +49,7 @@ def _bags_of_ros_1(path: Path) -> list[Path]:
     return [path] if path.suffix == ROS_1 else []
 
 
-def _open_path(spec: SourceSpec) -> Recording:
+def _open_path(spec: SourceSpec) -> RecordingSource:
     if not spec.path.exists():
         raise SourceError(f"{spec.path} does not exist", FORMS)
     ros_1 = _bags_of_ros_1(spec.path)

@@ -38,8 +38,8 @@ from coec.sources.kitti_files import (
     read_stamps,
     read_text,
     rigid,
+    select_one,
     stamp_of,
-    the_only,
 )
 from coec.sources.recording import FramewiseRecording, RecordedFrame
 from coec.sources.spec import SourceSpec
@@ -72,7 +72,7 @@ def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
     images_root = root / "data_2d_raw"
     if not images_root.is_dir():
         raise SourceError(f"{root} is not a KITTI-360 root: it has no folder data_2d_raw")
-    drive = the_only(sorted(p.name for p in images_root.iterdir() if p.is_dir()), query.get("drive"), "drive", root)
+    drive = select_one(sorted(p.name for p in images_root.iterdir() if p.is_dir()), query.get("drive"), "drive", root)
     camera = query.get("camera", "image_00")
     if camera not in (*PERSPECTIVE, *FISHEYE):
         raise SourceError(f"KITTI-360 has no camera {camera}; there are {', '.join((*PERSPECTIVE, *FISHEYE))}")
@@ -130,9 +130,9 @@ def _stamps_path(images: Path, camera: str, velodyne: Path) -> Path:
     raise SourceError(f"there is no timestamps.txt, looked for {candidates[0]} and those of the other sensors")
 
 
-def _depth_maps(root: Path, camera: str, asked: str | None) -> dict[int, Path]:
-    folder = root / (asked or f"stereo_disparity_{camera.removeprefix('image_')}")
-    if asked is None and not folder.is_dir():
+def _depth_maps(root: Path, camera: str, requested: str | None) -> dict[int, Path]:
+    folder = root / (requested or f"stereo_disparity_{camera.removeprefix('image_')}")
+    if requested is None and not folder.is_dir():
         return {}
     return numbered_files(folder, ".png")
 

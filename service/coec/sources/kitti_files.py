@@ -118,7 +118,7 @@ def numbered_files(folder: Path, suffix: str) -> dict[int, Path]:
     return {int(path.stem): path for path in sorted(folder.glob(f"*{suffix}")) if path.stem.isdecimal()}
 
 
-def the_only(candidates: list[str], asked: str | None, what: str, root: Path) -> str:
+def select_one(candidates: list[str], requested: str | None, what: str, root: Path) -> str:
     """The candidate that was asked for, or the only one there.
 
     Raises:
@@ -126,10 +126,10 @@ def the_only(candidates: list[str], asked: str | None, what: str, root: Path) ->
             is there.
     """
     there = ", ".join(candidates[:12]) or "none"
-    if asked is not None:
-        if asked not in candidates:
-            raise SourceError(f"{root} has no {what} {asked}; there: {there}")
-        return asked
+    if requested is not None:
+        if requested not in candidates:
+            raise SourceError(f"{root} has no {what} {requested}; there: {there}")
+        return requested
     if not candidates:
         raise SourceError(f"{root} has no {what}: give the folder that holds the {what}s as they were unpacked")
     if len(candidates) != 1:

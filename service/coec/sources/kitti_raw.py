@@ -30,8 +30,8 @@ from coec.sources.kitti_files import (
     read_stamps,
     read_text,
     rigid,
+    select_one,
     stamp_of,
-    the_only,
 )
 from coec.sources.recording import FramewiseRecording, RecordedFrame
 from coec.sources.spec import SourceSpec
@@ -99,17 +99,17 @@ def open_kitti_raw(spec: SourceSpec) -> FramewiseRecording:
     return FramewiseRecording(name, rig, T_camera_lidar, tuple(frames), _motions(drive / "oxts", stamps_ns))
 
 
-def _locate(root: Path, asked: str | None) -> tuple[Path, Path]:
+def _locate(root: Path, requested: str | None) -> tuple[Path, Path]:
     """The folder of the drive and the folder of its calibration."""
     if not root.is_dir():
         raise SourceError(f"there is no folder {root}")
     if (root / "velodyne_points").is_dir():
-        if asked is not None and asked != root.name:
+        if requested is not None and requested != root.name:
             raise SourceError(f"{root} is a single drive: leave ?drive= out")
-        beside = (root / "calib_velo_to_cam.txt").is_file()
-        return root, root if beside else root.resolve().parent
+        has_calibration = (root / "calib_velo_to_cam.txt").is_file()
+        return root, root if has_calibration else root.resolve().parent
     drives = {path.parent.name: path.parent for depth in ("*", "*/*") for path in root.glob(f"{depth}/velodyne_points")}
-    drive = drives[the_only(sorted(drives), asked, "drive", root)]
+    drive = drives[select_one(sorted(drives), requested, "drive", root)]
     return drive, drive.parent
 
 

@@ -13,12 +13,12 @@ from coec.errors import SourceError, UsageError
 from coec.sources.recording import MOTION_REACH_NS
 from coec.sources.spec import SourceSpec, is_bag, is_rig, parse_spec
 
-APART_NS = 60_000_000
+MAX_STAMP_DIFFERENCE_NS = 60_000_000
 """Two sweeps are a pair if their stamps differ by at most this, ns: a little more than half a turn at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class FrameStream:
     """The frames of one stream: ascending stamps, and a function that loads the frame at an index when it is needed."""
 
     stamps_ns: tuple[int, ...]
@@ -36,9 +36,9 @@ class LidarRecording:
 
     name: str
     rig: LidarRig
-    a: Frames
-    b: Frames
-    motion: Frames
+    a: FrameStream
+    b: FrameStream
+    motion: FrameStream
     truth: Callable[[int], Matrix4] | None = None
 
     def pairs(self, count: int) -> list[SweepPair]:
@@ -48,14 +48,16 @@ class LidarRecording:
             SourceError: a frame cannot be read, or no sweep of one LiDAR is near a sweep of the other.
         """
         near = [
-            (i, j) for i, stamp in enumerate(self.a.stamps_ns) if (j := _nearest(self.b, stamp, APART_NS)) is not None
+            (i, j)
+            for i, stamp in enumerate(self.a.stamps_ns)
+            if (j := _nearest(self.b, stamp, MAX_STAMP_DIFFERENCE_NS)) is not None
         ]
         if not near:
             raise SourceError(
-                f"{self.name}: no sweep of {self.rig.a} within {APART_NS / 1e6:g} ms of one of {self.rig.b}"
+                f"{self.name}: no sweep of {self.rig.a} within {MAX_STAMP_DIFFERENCE_NS / 1e6:g} ms of one of {self.rig.b}"
             )
-        chosen = sorted({round(place) for place in np.linspace(0, len(near) - 1, count)})
-        return [self._pair(*near[place]) for place in chosen]
+        selected = sorted({round(place) for place in np.linspace(0, len(near) - 1, count)})
+        return [self._pair(*near[place]) for place in selected]
 
     def _pair(self, i: int, j: int) -> SweepPair:
         a, b = self.a.load(i), self.b.load(j)
@@ -94,7 +96,7 @@ def _of_rig(spec: SourceSpec, a: str, b: str) -> LidarRecording:
     if unknown := [name for name in (a, b) if name not in drive.lidars]:
         raise UsageError(f"the rig has no LiDAR {', '.join(unknown)}; it has {', '.join(drive.lidars)}")
 
-    def frames(sensor: str) -> Frames:
+    def frames(sensor: str) -> FrameStream:
         places = [entry for entry in drive.plan if entry.stream == drive.stream(sensor)]
 
         def load(place: int) -> LidarFrame | EgoMotion:
@@ -102,7 +104,7 @@ def _of_rig(spec: SourceSpec, a: str, b: str) -> LidarRecording:
             assert isinstance(frame, LidarFrame | EgoMotion)
             return frame
 
-        return Frames(tuple(entry.stamp_ns for entry in places), load)
+        return FrameStream(tuple(entry.stamp_ns for entry in places), load)
 
     T_a_ego = drive.T_sensor_ego_nominal(a)
     rig = LidarRig(a, b, T_a_ego @ inverse(drive.T_sensor_ego_nominal(b)), T_a_ego)
@@ -112,10 +114,10 @@ def _of_rig(spec: SourceSpec, a: str, b: str) -> LidarRecording:
     )  # fmt: skip
 
 
-def _nearest(frames: Frames, stamp_ns: int, within_ns: int) -> int | None:
+def _nearest(frames: FrameStream, stamp_ns: int, within_ns: int) -> int | None:
     """Index of the frame nearest to a stamp; None if none is near enough."""
     if not frames.stamps_ns:
         return None
-    apart = np.abs(np.array(frames.stamps_ns, np.int64) - stamp_ns)
-    place = int(apart.argmin())
-    return place if apart[place] <= within_ns else None
+    differences_ns = np.abs(np.array(frames.stamps_ns, np.int64) - stamp_ns)
+    place = int(differences_ns.argmin())
+    return place if differences_ns[place] <= within_ns else None

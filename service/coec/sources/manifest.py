@@ -24,7 +24,7 @@ from coec.calibration.frames.origin import ApparentOrigin
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Name, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
-from coec.sources.bag.rig import with_camera_info
+from coec.sources.bag.rig import with_ros_camera_info
 from coec.sources.clouds import load_cloud, measured_from
 from coec.sources.kitti_files import load_image
 from coec.sources.reading import read_bytes, read_npy
@@ -99,7 +99,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
             f"in a {FILE_NAME}, or behind a bag as BAG?intrinsics={path.name}"
         )
     try:
-        document = ManifestDocument.model_validate(with_camera_info(text, path, rectified=False))
+        document = ManifestDocument.model_validate(with_ros_camera_info(text, path, rectified=False))
         camera = camera_of(document.camera)
         T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
         T_cloud_lidar = rigid_matrix(document.T_cloud_lidar, "T_cloud_lidar")

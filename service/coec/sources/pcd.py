@@ -86,11 +86,11 @@ def _parse_header(data: bytes) -> _Header:
         if end < 0:
             raise PcdError(f"line {line_number}: the header ends without a DATA line")
         try:
-            words = data[start:end].decode("ascii").split()
+            tokens = data[start:end].decode("ascii").split()
         except UnicodeDecodeError as error:
             raise PcdError(f"line {line_number}: not a PCD header") from error
-        if words and not words[0].startswith("#"):
-            values[words[0]] = words[1:]
+        if tokens and not tokens[0].startswith("#"):
+            values[tokens[0]] = tokens[1:]
         start = end + 1
 
     def integers(key: str, count: int | None = None) -> list[int]:
@@ -202,12 +202,12 @@ def _ascii_rows(lines: list[str], point: np.dtype[np.void], first_line: int) -> 
     return table
 
 
-def _check_row(words: list[str], width: int, number: int) -> None:
-    if len(words) != width:
-        raise PcdError(f"line {number}: expected {width} numbers, found {len(words)}")
-    for word in words:
+def _check_row(tokens: list[str], width: int, number: int) -> None:
+    if len(tokens) != width:
+        raise PcdError(f"line {number}: expected {width} numbers, found {len(tokens)}")
+    for token in tokens:
         try:
-            float(word)
+            float(token)
         except ValueError as error:
             raise PcdError(f"line {number}: not a number") from error
 

@@ -50,7 +50,7 @@ def read_npy(path: Path) -> NDArray[np.generic]:
     except FileNotFoundError as error:
         raise SourceError(f"{path} does not exist") from error
     except Exception as error:  # NumPy parses the header as Python source, and raises whatever such a parser may
-        raise SourceError(f"{path} is not a NumPy array, or is truncated: {_told(error)}") from error
+        raise SourceError(f"{path} is not a NumPy array, or is truncated: {_error_text(error)}") from error
     if array.nbytes > MAX_FILE_BYTES:
         raise SourceError(f"{path} has more than {MAX_FILE_BYTES} bytes: too large for a single file of a recording")
     return array
@@ -65,20 +65,20 @@ def read_npz(path: Path, names: Collection[str]) -> dict[str, NDArray[np.generic
     try:
         with zipfile.ZipFile(path) as archive:
             members = {item.filename: item for item in archive.infolist()}
-            wanted = {name: members[f"{name}.npy"] for name in names if f"{name}.npy" in members}
-            unpacked = sum(item.file_size for item in wanted.values())
+            selected = {name: members[f"{name}.npy"] for name in names if f"{name}.npy" in members}
+            unpacked = sum(item.file_size for item in selected.values())
             if unpacked > MAX_FILE_BYTES:
                 raise SourceError(f"{path} would unpack to {unpacked} bytes: refused")
-            return {name: _member(archive, item) for name, item in wanted.items()}
+            return {name: _npz_member(archive, item) for name, item in selected.items()}
     except (FileNotFoundError, SourceError) as error:
         raise SourceError(f"{path} does not exist" if isinstance(error, OSError) else str(error)) from error
     except Exception as error:  # zip, zlib and NumPy's header parser each raise more than they document
-        raise SourceError(f"{path} is not an .npz file, or is damaged: {_told(error)}") from error
+        raise SourceError(f"{path} is not an .npz file, or is damaged: {_error_text(error)}") from error
 
 
-def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[np.generic]:
+def _npz_member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[np.generic]:
     with archive.open(item) as stream:
-        shape, _, dtype = _header(stream)
+        shape, _, dtype = _npy_header(stream)
         if shape and (min(shape) < 0 or max(shape) > MAX_FILE_BYTES):
             raise ValueError("its shape is invalid")
         if int(np.prod(shape, dtype=object)) * dtype.itemsize > item.file_size:
@@ -87,7 +87,7 @@ def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[np.gener
         return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
 
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[np.generic]]:
+def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[np.generic]]:
     match np.lib.format.read_magic(stream):
         case (1, 0):
             return np.lib.format.read_array_header_1_0(stream)
@@ -95,6 +95,6 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[np.gener
             return np.lib.format.read_array_header_2_0(stream)
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     """The text of an error in one short line, because some errors quote the whole file."""
     return f"{type(error).__name__}: {str(error).splitlines()[0][:120]}" if str(error) else type(error).__name__

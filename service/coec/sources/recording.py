@@ -10,7 +10,7 @@ from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, 
 from coec.config import CalibrationConfig
 from coec.errors import UsageError
 
-Message = CameraFrame | LidarFrame | EgoMotion
+SensorMessage = CameraFrame | LidarFrame | EgoMotion
 
 MOTION_REACH_NS = 1_000_000_000
 """Ego-motion within this time of a chosen camera frame is handed out with it, ns: five times the default motion
@@ -20,7 +20,7 @@ _EGO, _LIDAR, _CAMERA = 0, 1, 2
 """Order of messages with equal stamps, so that the partners of a camera frame come before it."""
 
 
-class Recording(Protocol):
+class RecordingSource(Protocol):
     """A recorded drive of one camera-LiDAR pair."""
 
     @property
@@ -58,7 +58,7 @@ class Recording(Protocol):
         """Stamps of the ego-motion, ascending, nanoseconds; empty if there is none."""
         ...
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
         """Messages in ascending order of their stamps, each loaded when it is its turn.
 
         Args:
@@ -73,7 +73,7 @@ class Recording(Protocol):
 
 
 @runtime_checkable
-class KnowsTruth(Protocol):
+class HasGroundTruth(Protocol):
     """A recording whose true extrinsic is known, because it was simulated."""
 
     def truth(self, stamp_ns: int) -> Matrix4:
@@ -122,12 +122,12 @@ class FramewiseRecording:
         """See `Recording`."""
         return tuple(motion.stamp_ns for motion in self.motions)
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
         """See `Recording.messages`."""
-        frames = [self.frames[index] for index in chosen_indices(cameras, len(self.frames))]
+        frames = [self.frames[index] for index in selected_indices(cameras, len(self.frames))]
         stamps_ns = [frame.camera_stamp_ns for frame in frames]
         motions = self.motions if cameras is None else motions_near(self.motions, stamps_ns)
-        queue: list[tuple[int, int, int, Callable[[], Message]]] = []
+        queue: list[tuple[int, int, int, Callable[[], SensorMessage]]] = []
         for place, frame in enumerate(frames):
             queue.append((frame.lidar_stamp_ns, _LIDAR, place, frame.load_lidar))
             queue.append((frame.camera_stamp_ns, _CAMERA, place, frame.load_camera))
@@ -137,7 +137,7 @@ class FramewiseRecording:
             yield load()
 
 
-def chosen_indices(cameras: Collection[int] | None, count: int) -> list[int]:
+def selected_indices(cameras: Collection[int] | None, count: int) -> list[int]:
     """The indices asked for, ascending and once each; None asks for all.
 
     Raises:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import parse_qsl
 
-from coec.adapters.files.home import from_home
+from coec.adapters.files.home import expand_home
 from coec.errors import UsageError
 
 FORMS = """accepted forms of a source:
@@ -61,7 +61,7 @@ def parse_spec(text: str) -> SourceSpec:
     location, _, query = place.partition("?")
     if not location and layout != "sim":
         raise UsageError(f"no path in source {text!r}", FORMS)
-    return SourceSpec(text, layout, from_home(location), _parse_query(query, text))
+    return SourceSpec(text, layout, expand_home(location), _parse_query(query, text))
 
 
 def is_bag(spec: SourceSpec) -> bool:

@@ -17,7 +17,7 @@ from coec.calibration.types import FramePair, Matrix4, Window
 from coec.config import CalibrationConfig, Config, PairingConfig
 from coec.errors import SourceError, UsageError
 from coec.geometry import se3
-from coec.sources import Recording, open_source
+from coec.sources import RecordingSource, open_source
 from coec.sources.spec import parse_spec
 
 WHOLE = (0.0, math.inf)
@@ -36,7 +36,7 @@ class NoPairsError(SourceError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Loaded:
+class LoadedWindow:
     """A window and what came with it.
 
     Attributes:
@@ -51,13 +51,13 @@ class Loaded:
     unpaired: dict[str, int]
 
 
-def load(
+def load_window(
     source: str,
     frames: int | None,
     default_frames: int,
-    heard: Callable[[int, int], None],
+    on_progress: Callable[[int, int], None],
     between_s: tuple[float, float] = WHOLE,
-) -> Loaded:
+) -> LoadedWindow:
     """The window of a SOURCE. A recorded window's file gives its own window. From any other recording, at most `frames`
     (`default_frames` if None) camera frames are chosen evenly and paired. `heard(done, total)` counts camera frames.
     Only camera frames from `between_s` (begin, end) seconds after the first one are used.
@@ -74,12 +74,15 @@ def load(
         and is_window(spec.path)
     ):
         return _recorded(spec.path, frames, between_s)
-    return chosen_from(open_source(source), frames or default_frames, heard, between_s)
+    return window_of_recording(open_source(source), frames or default_frames, on_progress, between_s)
 
 
-def chosen_from(
-    recording: Recording, frames: int, heard: Callable[[int, int], None], between_s: tuple[float, float] = WHOLE
-) -> Loaded:
+def window_of_recording(
+    recording: RecordingSource,
+    frames: int,
+    on_progress: Callable[[int, int], None],
+    between_s: tuple[float, float] = WHOLE,
+) -> LoadedWindow:
     """The window of an open recording: at most `frames` of its camera frames, evenly chosen and paired. `heard` and
     `between_s` as in `load`. The recording's own extrinsic counts as one in use, not as a guess.
 
@@ -87,23 +90,23 @@ def chosen_from(
         SourceError: a file cannot be read, or no camera frame has a sweep.
     """
     within = _within(recording.camera_stamps_ns, between_s)
-    chosen = [within[index] for index in evenly(len(within), frames)]
+    selected = [within[index] for index in evenly_spread(len(within), frames)]
     pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
     pairs: list[FramePair] = []
-    for message in recording.messages(chosen):
+    for message in recording.messages(selected):
         pairs += pairer.push(message)
-        heard(len(pairs), len(chosen))
+        on_progress(len(pairs), len(selected))
     pairs += pairer.flush()
-    heard(len(pairs), len(chosen))
+    on_progress(len(pairs), len(selected))
     if not pairs:
         raise NoPairsError(
-            f"{recording.name}: none of {len(chosen)} camera frames has a sweep within "
+            f"{recording.name}: none of {len(selected)} camera frames has a sweep within "
             f"{PairingConfig().tolerance_s} s: {clocks_text(recording.camera_stamps_ns, recording.sweep_stamps_ns)}"
         )
     window_id = f"{recording.rig.pair}-{pairs[0].stamp_ns}"
     window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
     losses = {cause: count for cause, count in pairer.losses.items() if count}
-    return Loaded(window, recording.configuration, _default_vehicle(), losses)
+    return LoadedWindow(window, recording.configuration, _default_vehicle(), losses)
 
 
 def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:
@@ -122,15 +125,15 @@ def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int])
     )
 
 
-def evenly(count: int, wanted: int) -> list[int]:
+def evenly_spread(count: int, limit: int) -> list[int]:
     """At most `wanted` of `count` indices, evenly spread. They include the first and the last; a single one is the
     first."""
-    if wanted >= count:
+    if limit >= count:
         return list(range(count))
-    return sorted({round(index) for index in np.linspace(0, count - 1, wanted)})
+    return sorted({round(index) for index in np.linspace(0, count - 1, limit)})
 
 
-def vector_of(option: str, text: str) -> NDArray[np.float64]:
+def parse_perturbation(option: str, text: str) -> NDArray[np.float64]:
     """ξ (6,) in radians and metres from the value of an option, `rx,ry,rz[,tx,ty,tz]` in degrees and metres.
 
     Raises:
@@ -140,10 +143,10 @@ def vector_of(option: str, text: str) -> NDArray[np.float64]:
         values = [float(part) for part in text.split(",")]
     except ValueError as error:
         raise UsageError(f"{option} {text}: give numbers with commas between, as 1,0,-0.5") from error
-    return xi_of(f"{option} {text}", values)
+    return perturbation_vector(f"{option} {text}", values)
 
 
-def xi_of(what: str, values: Sequence[float]) -> NDArray[np.float64]:
+def perturbation_vector(what: str, values: Sequence[float]) -> NDArray[np.float64]:
     """ξ (6,) in radians and metres from `rx, ry, rz[, tx, ty, tz]` in degrees and metres.
 
     Raises:
@@ -161,7 +164,7 @@ def xi_of(what: str, values: Sequence[float]) -> NDArray[np.float64]:
     return xi
 
 
-def started_at(window: Window, xi: NDArray[np.float64]) -> Window:
+def with_perturbed_start(window: Window, xi: NDArray[np.float64]) -> Window:
     """The window with its start moved by ξ (6,), applied on the left. The start then counts as a mere guess."""
     start = se3.perturb(window.T_camera_lidar_start, xi)
     return replace(window, T_camera_lidar_start=start, start_known_to_rad=math.pi)
@@ -178,16 +181,16 @@ def _within(stamps_ns: Sequence[int], between_s: tuple[float, float]) -> list[in
     return [index for index, stamp in enumerate(stamps_ns) if first_s <= (stamp - stamps_ns[0]) * 1e-9 <= last_s]
 
 
-def _recorded(path: Path, frames: int | None, between_s: tuple[float, float]) -> Loaded:
+def _recorded(path: Path, frames: int | None, between_s: tuple[float, float]) -> LoadedWindow:
     window, configuration = read_window(path)
     within = _within([pair.stamp_ns for pair in window.pairs], between_s)
     if not within:
         raise NoPairsError(f"{path}: no pair was recorded {between_s[0]:g} to {between_s[1]:g} s after the first")
     window = replace(window, pairs=tuple(window.pairs[index] for index in within))
     if frames is not None:
-        window = replace(window, pairs=tuple(window.pairs[index] for index in evenly(len(window.pairs), frames)))
+        window = replace(window, pairs=tuple(window.pairs[index] for index in evenly_spread(len(window.pairs), frames)))
     result = read_result(path)
-    return Loaded(window, configuration, result.vehicle if result else _default_vehicle(), {})
+    return LoadedWindow(window, configuration, result.vehicle if result else _default_vehicle(), {})
 
 
 def _default_vehicle() -> str:

@@ -23,7 +23,7 @@ import numpy as np
 import zenoh
 
 from coec.adapters.files.rig import intrinsics_config
-from coec.adapters.zenoh.client import ask_one, connected
+from coec.adapters.zenoh.client import connected, query_one
 from coec.config import (
     BudgetConfig,
     CalibrationConfig,
@@ -245,7 +245,7 @@ def _query(session: zenoh.Session, process: ProcessReading, seconds: float, *, a
     while (now_s := time.monotonic()) < end_s:
         worker_s = worker.cpu_s
         begin_s = time.perf_counter()
-        ask_one(session, KEYS.extrinsic(PAIR), TIMEOUT_S)
+        query_one(session, KEYS.extrinsic(PAIR), TIMEOUT_S)
         elapsed_s = time.perf_counter() - begin_s
         # The pace of the queries is part of what is measured.
         time.sleep(max(QUERY_PERIOD_S - (time.monotonic() - now_s), 0.0))
@@ -407,7 +407,7 @@ def status(session: zenoh.Session) -> dict[str, Any]:
 
 def answered(session: zenoh.Session, key: str) -> dict[str, Any]:
     """The document that is served on a key."""
-    document: dict[str, Any] = json.loads(ask_one(session, f"{key}?format=json", TIMEOUT_S).payload)
+    document: dict[str, Any] = json.loads(query_one(session, f"{key}?format=json", TIMEOUT_S).payload)
     return document
 
 

@@ -118,9 +118,9 @@ def measure(bars: Progress, size: Size) -> dict[str, Any]:
 def measure_fused(bars: Progress, street: str = STREET, repeats: int = 3) -> dict[str, Any]:
     """The figures of a fused solve with six degrees of freedom, without depth inference: its time, and the error of its
     end. The first run may compile."""
-    loaded = windows.load(street, None, WindowConfig().pairs, lambda *_: None)
+    loaded = windows.load_window(street, None, WindowConfig().pairs, lambda *_: None)
     xi = np.array([*np.radians(FAR_START_DEG), 0.0, 0.0, 0.0])
-    window = windows.started_at(loaded.window, xi)
+    window = windows.with_perturbed_start(loaded.window, xi)
     configuration = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=30.0))
     depth = open_depth(configuration.depth, LimitsConfig())
     seconds = []
@@ -141,7 +141,7 @@ def measure_checks(on_step: Callable[[str], None]) -> dict[str, Any]:
     off_deg: dict[str, float] = {}
     for side, camera in SIDES_PX.items():
         on_step(f"a check at {side} px")
-        window = windows.load(f"sim:{CHECK_DRIVE}&camera={camera}", None, CHECK_PAIRS, lambda *_: None).window
+        window = windows.load_window(f"sim:{CHECK_DRIVE}&camera={camera}", None, CHECK_PAIRS, lambda *_: None).window
         spent_s, observation = _check(window)
         right = not (observation.flagged or observation.weak or observation.causes)
         spent[side] = 1e3 * spent_s if right else None

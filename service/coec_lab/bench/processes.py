@@ -155,7 +155,7 @@ def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
         idle_mb = process.resident_mb
         process.reset_peak()
         begin = time.perf_counter()
-        worker.ask(jobs.solve(name, window, window.stem, outcomes.put))
+        worker.submit(jobs.solve(name, window, window.stem, outcomes.put))
         _await_result(outcomes)
         solve_s, peak_mb = time.perf_counter() - begin, process.peak_mb
     return {
@@ -173,7 +173,7 @@ def _first_result_s(name: str, window: Path, config: Config) -> float:
     with _worker(config) as worker:
         begin = time.perf_counter()
         check = jobs.check(name, pair.calibration, scene.T_TRUE, pairs, outcomes.put)
-        worker.ask(replace(check, deadline_s=TIMEOUT_S))
+        worker.submit(replace(check, deadline_s=TIMEOUT_S))
         worker.start()
         _await_result(outcomes)
         return time.perf_counter() - begin

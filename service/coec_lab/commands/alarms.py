@@ -39,8 +39,8 @@ def alarms(
         figures = measured(config, hours, steps, lambda done, total: bars.update(task, completed=done, total=total))
     report = alarm_reports.document_of(figures)
     if output is not None:
-        files.write(output / "alarms.json", to_json(report))
-        files.write(output / "delay.png", alarm_reports.delay_curve(report))
+        files.write_output(output / "alarms.json", to_json(report))
+        files.write_output(output / "delay.png", alarm_reports.delay_curve(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:

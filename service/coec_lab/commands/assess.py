@@ -12,7 +12,7 @@ import typer
 from coec.cli.options import Frames, Json, Source
 
 if TYPE_CHECKING:
-    from coec.calibration.estimators import Sight
+    from coec.calibration.estimators import WindowData
     from coec.calibration.ports import DepthModel
     from coec.calibration.types import Window
     from coec.evaluation.depth_quality import DepthQuality
@@ -42,7 +42,7 @@ def assess(
     from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
     from coec.adapters.files import output as files
     from coec.adapters.images.codec import GreyImages
-    from coec.calibration.estimators import sight_of
+    from coec.calibration.estimators import prepare_window_data
     from coec.calibration.ports import Silence
     from coec.calibration_options import SolverOptions, configuration_of
     from coec.config import LimitsConfig, WindowConfig
@@ -57,12 +57,12 @@ def assess(
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
-        loaded = windows.load(source, frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        loaded = windows.load_window(source, frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         window = loaded.window
         configuration = configuration_of(SolverOptions(depth=model, objective="mi", dof=3), loaded.configuration)
         depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
         inference_ms = _infer(window, depth, stages)
-        data = sight_of(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
+        data = prepare_window_data(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
         quality = depth_quality.assess(data, configuration, stages.begin("compare", STAGES))
         if output is not None:
             on_plotted = stages.begin("draw", None)
@@ -72,7 +72,7 @@ def assess(
     timed_ms: list[float | None] = inference_ms if model != STEREO else [None] * len(inference_ms)
     report = _report((model, source), window, depth.identity, quality, timed_ms, elapsed_s)
     if output is not None:
-        files.write(output / "report.json", to_json(report))
+        files.write_output(output / "report.json", to_json(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
@@ -101,7 +101,7 @@ def _infer(window: Window, depth: DepthModel, stages: Stages) -> list[float | No
     return times_ms
 
 
-def _write_pictures(folder: Path, model: str, data: Sight, quality: DepthQuality) -> None:
+def _write_pictures(folder: Path, model: str, data: WindowData, quality: DepthQuality) -> None:
     from coec.adapters.files import output as files
     from coec.adapters.images.codec import decode_bgr
     from coec.config import LimitsConfig
@@ -110,13 +110,15 @@ def _write_pictures(folder: Path, model: str, data: Sight, quality: DepthQuality
 
     name = f"{Path(model).name} on {data.window.window_id}"
     _, sentence = depth_quality.suitability(quality)
-    files.write(folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames"))
-    files.write(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
+    files.write_output(
+        folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames")
+    )
+    files.write_output(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
     index = len(data.window.pairs) // 2
     frame, pairing = data.window.pairs[index].camera, quality.pairings[index]
     title = f"{name}, frame at {frame.stamp_ns} ns: rank correlation {pairing.rank_correlation:+.2f}"
     picture = depth_plots.frame(decode_bgr(frame.image, LimitsConfig()), data.depth.infer(frame).values, pairing, title)
-    files.write(folder / "frame.png", picture)
+    files.write_output(folder / "frame.png", picture)
 
 
 def _report(

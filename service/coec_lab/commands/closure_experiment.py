@@ -70,7 +70,7 @@ def run(request: ClosureRequest, folder: Path | None, *, as_json: bool) -> int:
         name = f"closure of {bench_a.window.window_id} and {bench_b.window.window_id}"
         of_frames = {f"closure on {closure.frames.value}": closure.normalised for closure in closures}
         evaluation_pictures.write_normalised(folder, name, of_frames)
-        output.write(folder / "report.json", to_json(document))
+        output.write_output(folder / "report.json", to_json(document))
     if as_json:
         console.print_json(document.model_dump(mode="json"))
     else:
@@ -84,12 +84,12 @@ def relative_of(text: str) -> Matrix4:
     Raises:
         UsageError: the text is not three or six finite numbers.
     """
-    return se3.perturbation(windows.vector_of("--relative", text))
+    return se3.perturbation(windows.parse_perturbation("--relative", text))
 
 
 def _bench(request: ClosureRequest, source: str, name: str, stages: Stages) -> Bench:
     load = stages.begin(f"load {name}", None)
-    loaded = windows.load(source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+    loaded = windows.load_window(source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
     configuration = configuration_of(request.plan, request.choices, loaded.configuration)
     model = open_depth(configuration.depth, LimitsConfig())
     depth = experiments.inferred(loaded.window, model, stages.begin(f"depth {name}", len(loaded.window.pairs)))

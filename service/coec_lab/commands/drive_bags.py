@@ -9,11 +9,11 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coec.adapters.files.output import require_absent, write
+from coec.adapters.files.output import require_absent, write_output
 from coec.adapters.files.rig import mask_to_png
 from coec.adapters.mcap.bag_writer import write_bag, write_messages
 from coec.adapters.ros import messages, outgoing
-from coec.adapters.ros.outgoing import Placed
+from coec.adapters.ros.outgoing import PlacedFrame
 from coec.adapters.ros.sensor_topics import SensorTopics, image_topic, points_topic
 from coec.adapters.ros.topics import Frame, TopicMessage
 from coec.calibration.types import CameraFrame
@@ -125,7 +125,7 @@ def write_picture(options: DriveOptions, at_s: float, output: Path, *, as_json: 
     simulated = open_sim(options.query())
     index = min(round(at_s * options.camera_hz), len(simulated.camera_stamps_ns) - 1)
     frame = next(frame for frame in simulated.messages([index]) if isinstance(frame, CameraFrame))
-    path = write(output, frame.image.data)
+    path = write_output(output, frame.image.data)
     if as_json:
         console.print_json({"written": str(path)})
     else:
@@ -212,17 +212,17 @@ def source_of(folder: Path, camera: str, lidar: str) -> str:
 
 def _write_camera(simulated: RigDrive, camera: str, folder: Path) -> None:
     """Writes the mask of a camera next to the bag, which has no place for it, and the YAML file that names it."""
-    write(folder / f"{camera}_mask.png", mask_to_png(simulated.mask(camera)))
+    write_output(folder / f"{camera}_mask.png", mask_to_png(simulated.mask(camera)))
     intrinsics = {"model": name_of(simulated.camera), **intrinsics_of(simulated.camera)}
     lines = ["camera:", *(f"  {key}: {value}" for key, value in intrinsics.items()), f"mask: {camera}_mask.png", ""]
-    write(folder / f"{camera}.yaml", "\n".join(lines).encode())
+    write_output(folder / f"{camera}.yaml", "\n".join(lines).encode())
 
 
 def _truth_of_rig(simulated: RigDrive, stamp_ns: int) -> bytes:
     """True poses of all sensors in the vehicle, and of the vehicle in the world."""
     sensors = (*simulated.lidars, *simulated.cameras)
-    placed = [Placed("ego", name, inverse(simulated.T_sensor_ego(name, stamp_ns))) for name in sensors]
-    return outgoing.encode_transforms([Placed("world", "ego", simulated.true_pose(stamp_ns)), *placed], stamp_ns)
+    placed = [PlacedFrame("ego", name, inverse(simulated.T_sensor_ego(name, stamp_ns))) for name in sensors]
+    return outgoing.encode_transforms([PlacedFrame("world", "ego", simulated.true_pose(stamp_ns)), *placed], stamp_ns)
 
 
 def _truth_of_pair(simulated: SimulatedDrive, frame: Frame) -> list[tuple[str, str, bytes]]:

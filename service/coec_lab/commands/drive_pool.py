@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 from coec.adapters.files import output
 from coec.adapters.system.cores import one_thread_each
-from coec.adapters.system.parent import die_with
+from coec.adapters.system.parent import die_with_parent
 from coec.errors import CoecError
 
 _Drive = TypeVar("_Drive")
@@ -44,7 +44,7 @@ def finished(work: Callable[[_Drive], _Row], drives: Sequence[_Drive], jobs: int
     with one_thread_each():
         spawn = multiprocessing.get_context("spawn")
         # If the command is killed, its processes end, too.
-        pool = ProcessPoolExecutor(processes, spawn, initializer=die_with, initargs=(os.getpid(),))
+        pool = ProcessPoolExecutor(processes, spawn, initializer=die_with_parent, initargs=(os.getpid(),))
         try:
             for done in as_completed([pool.submit(work, drive) for drive in drives]):
                 yield done.result()
@@ -67,5 +67,5 @@ def resumed(
 ) -> dict[str, _Document]:
     """Results that an earlier run left in the folder, by the name of their drive; without those that are damaged or not
     current."""
-    rows = ((name, output.kept(drive_file(folder, name), model)) for name in names)
+    rows = ((name, output.load_document(drive_file(folder, name), model)) for name in names)
     return {name: row for name, row in rows if row is not None and is_current(row)}

@@ -13,7 +13,7 @@ import numpy as np
 
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
-from coec.calibration.estimators import depth_features, sight_of
+from coec.calibration.estimators import depth_features, prepare_window_data
 from coec.calibration.ports import Silence
 from coec.calibration_options import SolverOptions, configuration_of
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
@@ -21,7 +21,7 @@ from coec.errors import SourceError
 from coec.evaluation import paper, paper_published, starts, statistics
 from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
 from coec.evaluation.paper_speed import run_times
-from coec.evaluation.statistics import Outcome
+from coec.evaluation.statistics import SolveOutcome
 from coec.reports import console, page, paper_charts, paper_plots, plots, provenance
 from coec.reports.bullseye import bullseye
 from coec.reports.page import Block
@@ -69,7 +69,9 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
-        loaded = windows.load(request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        loaded = windows.load_window(
+            request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, "")
+        )
         choices = SolverOptions(depth=request.depth, objective=request.objective)
         configuration = configuration_of(choices, loaded.configuration)
         window = loaded.window
@@ -90,7 +92,7 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
             "run_times": [asdict(row) for row in run_times(request.source, configuration, stages)],
             "published": paper_published.document(),
         }
-    written = output.write(folder / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
+    written = output.write_output(folder / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
     page.write(folder / "report.html", paper_page(document, Plots(metrics, ends, drive), provenance.here()))
     if as_json:
         console.print_json(document)
@@ -102,7 +104,7 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
 
 def _failure_metrics(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) -> tuple[dict[str, Any], Block]:
     """Learns limits on every second pair and applies them to the others; returns the figures and a plot."""
-    data = sight_of(bench.window, bench.depth, bench.images, bench.configuration, Silence())
+    data = prepare_window_data(bench.window, bench.depth, bench.images, bench.configuration, Silence())
     frames = depth_features(data, bench.reference)
     on_done = stages.begin("metrics", 2 * request.samples)
     rig, right = bench.window.rig, bench.reference
@@ -126,7 +128,7 @@ def _failure_metrics(bench: Bench, request: PaperRequest, folder: Path, stages: 
     title = (
         f"{bench.window.window_id}: equation (2), limits learned on the other half of the pairs; flagged at {shares}"
     )
-    output.write(folder / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
+    output.write_output(folder / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
     return {"limits": asdict(limits), "moves": rows}, paper_charts.failure_figures(tried, limits)
 
 
@@ -134,7 +136,7 @@ def _bullseye(bench: Bench, request: PaperRequest, folder: Path, stages: Stages)
     on_done = stages.begin(f"{FAR_DEG:g} deg", request.runs)
     far = Bench(bench.window, bench.depth, bench.images, _reaching(bench.configuration, FAR_DEG))
     outcomes = []
-    for start in starts.starts(bench.reference, request.runs, radians(FAR_DEG), 0.0):
+    for start in starts.start_poses(bench.reference, request.runs, radians(FAR_DEG), 0.0):
         outcomes.append(far.solve(start))
         on_done(len(outcomes), f"{sum(outcome.hit for outcome in outcomes)} hits")
     of = statistics.summarise(outcomes)
@@ -142,8 +144,8 @@ def _bullseye(bench: Bench, request: PaperRequest, folder: Path, stages: Stages)
         f"{bench.window.window_id}: {request.objective}, {request.runs} runs from {FAR_DEG:g}°: {of.hits} hits, "
         f"{100 * of.classified_correctly:.0f} % classified correctly"
     )
-    spheres = {"Rotation vectors of the starts": starts.directions(request.runs)}
-    output.write(folder / "bullseye.png", plots.bullseye(outcomes, spheres, title))
+    spheres = {"Rotation vectors of the starts": starts.sphere_directions(request.runs)}
+    output.write_output(folder / "bullseye.png", plots.bullseye(outcomes, spheres, title))
     return {"start_deg": FAR_DEG, **_figures(outcomes)}, bullseye({"": outcomes}, spheres)
 
 
@@ -152,12 +154,12 @@ def _drive(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) ->
     count = _window_count(bench, request)
     per_window = max(request.runs // count, 1)
     on_done = stages.begin("drive", len(DRIVE_DEG) * count * per_window)
-    solved: dict[float, list[tuple[float, Outcome]]] = {radius_deg: [] for radius_deg in DRIVE_DEG}
+    solved: dict[float, list[tuple[float, SolveOutcome]]] = {radius_deg: [] for radius_deg in DRIVE_DEG}
     done = 0
     for number, (middle_s, of_window, indices) in enumerate(_drive_windows(bench, request)):
         for radius_deg in DRIVE_DEG:
             near = replace(of_window, configuration=_reaching(bench.configuration, radius_deg))
-            poses = starts.starts(bench.reference, per_window * count, radians(radius_deg), 0.0)
+            poses = starts.start_poses(bench.reference, per_window * count, radians(radius_deg), 0.0)
             # Every window gets starts from all over the sphere.
             for start in poses[number::count]:
                 solved[radius_deg].append((middle_s, near.solve(start, indices)))
@@ -183,7 +185,7 @@ def _drive(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) ->
     windows = f"{count} window{'' if count == 1 else 's'}"
     title = f"{bench.window.window_id}: {request.objective}, {windows}"
     named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in solved.items()}
-    output.write(folder / "drive.png", paper_plots.drive(named, title))
+    output.write_output(folder / "drive.png", paper_plots.drive(named, title))
     return rows, paper_charts.drive(named)
 
 
@@ -214,7 +216,7 @@ def _drive_windows(bench: Bench, request: PaperRequest) -> Iterator[tuple[float,
     for number in range(_window_count(bench, request)):
         begin_s, end_s = number * request.slice_s, (number + 1) * request.slice_s
         try:
-            loaded = windows.load(request.source, None, WindowConfig().pairs, lambda *_: None, (begin_s, end_s))
+            loaded = windows.load_window(request.source, None, WindowConfig().pairs, lambda *_: None, (begin_s, end_s))
         except SourceError:
             # A slice in which no camera frame has a sweep is no window.
             continue
@@ -229,7 +231,7 @@ def _reaching(configuration: CalibrationConfig, radius_deg: float) -> Calibratio
     return configuration.model_copy(update={"search": configuration.search.model_copy(update=reach)})
 
 
-def _figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def _figures(outcomes: Sequence[SolveOutcome]) -> dict[str, Any]:
     of = statistics.summarise(outcomes)
     errors = np.degrees([outcome.error[:3] for outcome in outcomes])
     return {

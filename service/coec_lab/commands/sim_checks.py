@@ -68,11 +68,11 @@ def checks(
         baselines = _baselines({drive.rig for outing in pending for drive in outing}, jobs)
         for outing in finished(partial(check_run.run, baselines=baselines), pending, jobs):
             for row in outing:
-                files.write(drive_file(output, row.name), to_json(row))
+                files.write_output(drive_file(output, row.name), to_json(row))
                 rows[row.name] = row
                 bars.update(task, advance=1, note=row.name)
     report = check_statistics.report([rows[name] for name in names], hours)
-    files.write(output / "report.json", to_json(report))
+    files.write_output(output / "report.json", to_json(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:

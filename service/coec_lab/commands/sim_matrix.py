@@ -69,12 +69,12 @@ def matrix(
         task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
         pending = [drive for drive in drives if drive.name not in rows]
         for row in finished(partial(matrix_run.run, settings=settings), pending, jobs):
-            files.write(drive_file(output, row.name), to_json(row))
+            files.write_output(drive_file(output, row.name), to_json(row))
             rows[row.name] = row
             bars.update(task, advance=1, note=row.name)
     report = matrix.report([rows[name] for name in names])
-    files.write(output / "report.json", to_json(report))
-    files.write(output / "normalised.png", matrix_plots.normalised(report))
+    files.write_output(output / "report.json", to_json(report))
+    files.write_output(output / "normalised.png", matrix_plots.matrix_errors(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
@@ -97,7 +97,7 @@ def _selected(
 
     if WINDOWS * frames < CHECK_PAIRS:
         raise UsageError(f"--frames {frames}: a check needs {CHECK_PAIRS} pairs, {WINDOWS} windows have fewer")
-    drives = list(matrix_drives.chosen(number, only))
+    drives = list(matrix_drives.selected_drives(number, only))
     if not drives:
         names = ", ".join(drive.name for drive in matrix_drives.drives(number)[:3])
         raise UsageError(f"no drive of the matrix is called {only!r}; they are called {names}, ...")

@@ -30,7 +30,7 @@ def rig_drives(
     """
     from coec.adapters.files import output as files
     from coec.evaluation import rig_drive_statistics, rig_drives
-    from coec.evaluation.knocked_drive import KnockedDrive
+    from coec.evaluation.knocked_drive import DisplacedRigDrive
     from coec.reports import console, rig_tables
     from coec.schemas.base import to_json
     from coec.schemas.rig import RigDriveRow
@@ -38,18 +38,18 @@ def rig_drives(
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
 
     require_extra()
-    planned = [KnockedDrive(number, camera) for number in range(drives)]
+    planned = [DisplacedRigDrive(number, camera) for number in range(drives)]
     names = [drive.name for drive in planned]
     rows = resumed(output, names, RigDriveRow)
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(names), completed=len(rows), note="")
         pending = [drive for drive in planned if drive.name not in rows]
         for row in finished(rig_drives.driven, pending, jobs):
-            files.replace(drive_file(output, row.name), to_json(row))
+            files.replace_output(drive_file(output, row.name), to_json(row))
             rows[row.name] = row
             bars.update(task, advance=1, note=row.name)
     report = rig_drive_statistics.report([rows[name] for name in names], camera)
-    files.write(output / "report.json", to_json(report))
+    files.write_output(output / "report.json", to_json(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:

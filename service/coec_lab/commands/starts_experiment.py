@@ -14,7 +14,7 @@ from coec.cli.calibrate import picture_of_lens_error
 from coec.config import WindowConfig
 from coec.errors import CalibrationError
 from coec.evaluation.experiments import Stages
-from coec.evaluation.statistics import Outcome
+from coec.evaluation.statistics import SolveOutcome
 from coec.exit_codes import ExitCode
 from coec.library.evaluating import Plan, Subject, bench_of, report_of, subject_of, tried
 from coec.reports import console, evaluation_tables, page, provenance
@@ -46,7 +46,7 @@ class Evaluated:
     """One method; `page()` makes the page of it."""
 
     report: EvaluationReport
-    outcomes: list[Outcome]
+    outcomes: list[SolveOutcome]
     page: Callable[[], Page]
 
 
@@ -62,7 +62,9 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
-        loaded = windows.load(request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        loaded = windows.load_window(
+            request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, "")
+        )
         # What all methods share is loaded with the first.
         choices = (
             with_objective(request.choices, METHODS[0]) if request.choices.get("objective") == ALL else request.choices
@@ -85,7 +87,7 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
         evaluation_tables.show(document)
     # Printed first, so that the figures are not lost if they cannot be written.
     if folder is not None:
-        output.write(folder / "report.json", to_json(document))
+        output.write_output(folder / "report.json", to_json(document))
         page.write(folder / "report.html", make_page())
     if document.interrupted:
         console.say("coec: interrupted: the figures are of what was finished")
@@ -120,7 +122,7 @@ def _compare(
             not_evaluated[method] = str(error)
             continue
         if of_method is not None:
-            output.write(of_method / "report.json", to_json(evaluated[method].report))
+            output.write_output(of_method / "report.json", to_json(evaluated[method].report))
             page.write(of_method / "report.html", evaluated[method].page())
         on_done(1, "")
         if evaluated[method].report.interrupted:
@@ -170,6 +172,6 @@ def _evaluate(plan: Plan, choices: SolverOptions, subject: Subject, folder: Path
             evaluation_pictures.write_normalised(folder, bench.window.window_id, done.normalised)
     if folder is not None:
         table = evaluation_tables.csv_of(bench.reference, done.outcomes)
-        output.write(folder / "starts.csv", table.encode())
+        output.write_output(folder / "starts.csv", table.encode())
     report = report_of(subject, plan, bench, done, stages.elapsed_s())
     return Evaluated(report, done.outcomes, lambda: evaluation_page(report, ends, worst, provenance.here()))

@@ -33,7 +33,7 @@ from coec.geometry import compile_news
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
 from coec.reports.page.words import count
-from coec.reports.progress import COMPILING, COMPILING_S, CompilingNews
+from coec.reports.progress import COMPILING, COMPILING_S, CompilationProgress
 from coec.schemas.keys import Keys
 from coec_lab.demo import pair_drive, pair_report
 from coec_lab.demo.pair_client import QUERY_S, Observer, PairOutcome, Snapshot, outcome_of
@@ -82,7 +82,7 @@ def run(output: Path, *, as_json: bool) -> int:
         with running(folder / "coec.yaml", folder / "coec.log") as daemon, Screen() as screen:
             screen.show_text("The service starts, the street is built …")
             # Compiles kernels that the renderers then find compiled, while the service compiles its own.
-            with compile_news.heard_by(screen.on_compiling):
+            with compile_news.listening(screen.on_compiling):
                 picture, page = pair_report.write_first(output, drive)
             console.say(f"demo: the first picture is {picture}, and {page} shows it until there is a result")
             with connected(config.zenoh.connect, START_S) as session:
@@ -114,9 +114,9 @@ def _configure(drive: SimulatedDrive, folder: Path) -> Config:
     """Writes the configuration of the service, and the files that it names, into the folder."""
     rig = drive.rig
     mask = np.ones((rig.camera.height, rig.camera.width), bool) if rig.mask is None else rig.mask
-    files.write(folder / "mask.png", mask_to_png(mask))
+    files.write_output(folder / "mask.png", mask_to_png(mask))
     config = pair_drive.service_config(rig, Path("mask.png"), free_endpoint())
-    files.write(folder / "coec.yaml", commented_yaml(config).encode())
+    files.write_output(folder / "coec.yaml", commented_yaml(config).encode())
     return config
 
 
@@ -204,7 +204,7 @@ class Screen:
     def __init__(self) -> None:
         self._live = Live(console=console.err, transient=True, auto_refresh=False)
         self._last_line = ""
-        self._news = CompilingNews(time.monotonic)
+        self._news = CompilationProgress(time.monotonic)
         self._compiling_shown = False
 
     def __enter__(self) -> Screen:
@@ -216,7 +216,7 @@ class Screen:
 
     def on_compiling(self, kernel: str) -> None:
         """Called by `compile_news` when a kernel is being compiled in this process."""
-        self._news.hear(kernel)
+        self._news.on_kernel(kernel)
         if self._news.lasted_s >= COMPILING_S:
             self._compiling(f"{COMPILING}: {self._news.kernels} so far, {self._news.lasted_s:.0f} s")
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from coec.adapters.zenoh.client import ask, ask_one
+from coec.adapters.zenoh.client import query_all, query_one
 from coec.calibration.types import Matrix4
 from coec.errors import NotFoundError, RemoteError
 from coec.geometry import se3
@@ -98,7 +98,7 @@ class Observer:
     def poll(self, drive_s: float, sent: int) -> Snapshot | None:
         """The state after so many seconds of driving and `sent` pictures, or None while the service is not there
         yet."""
-        if not ask(self.session, self.keys.status, QUERY_S):
+        if not query_all(self.session, self.keys.status, QUERY_S):
             return None
         try:
             snapshot = self._query_all(drive_s)
@@ -158,7 +158,7 @@ class Observer:
         return Snapshot(moment, status, health, extrinsic)
 
     def _query(self, key: str) -> bytes:
-        return ask_one(self.session, f"{key}?format=json", QUERY_S).payload
+        return query_one(self.session, f"{key}?format=json", QUERY_S).payload
 
 
 def with_alarm(timeline: Sequence[Moment], drive_s: float) -> list[Moment]:

@@ -15,7 +15,7 @@ import zenoh
 
 from coec.adapters.files.rig import intrinsics_config, matrix_rows
 from coec.adapters.zenoh.cadence import Played
-from coec.adapters.zenoh.player import CAMERA, Frame, Player, Streams
+from coec.adapters.zenoh.player import CAMERA, Frame, Player, StreamKeys
 from coec.calibration.types import Rig
 from coec.config import (
     BudgetConfig,
@@ -95,7 +95,7 @@ def drive_config() -> DriveConfig:
     """
     require_extra()
     from coec.simulation.drive import DriveConfig
-    from coec.simulation.faults import Step
+    from coec.simulation.faults import StepFault
 
     return DriveConfig(
         seed=SEED,
@@ -105,14 +105,14 @@ def drive_config() -> DriveConfig:
         camera_hz=PAIR_HZ,
         lidar_hz=PAIR_HZ,
         ego_hz=EGO_HZ,
-        faults=(Step(KNOCK_S, LONGEST_S, rx=KNOCK_DEG),),
+        faults=(StepFault(KNOCK_S, LONGEST_S, rx=KNOCK_DEG),),
         workshop=WORKSHOP,
     )
 
 
 def service_config(rig: Rig, mask: Path, endpoint: str) -> Config:
     """Configuration of the service: defaults, except for rig, address, and what is shorter than on a vehicle."""
-    streams = Streams.default(rig.pair)
+    streams = StreamKeys.default(rig.pair)
     pair = PairConfig(
         name=rig.pair,
         camera=CameraConfig(
@@ -187,7 +187,7 @@ class PairVehicle:
         """`may_pass`: whether the drive may go on to a sensor time."""
         self._drive = drive
         self._may_pass = may_pass
-        self._player = Player(session, Streams.default(drive.rig.pair), "msgpack")
+        self._player = Player(session, StreamKeys.default(drive.rig.pair), "msgpack")
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vehicle")
         self.stamp_ns = drive.camera_stamps_ns[0]

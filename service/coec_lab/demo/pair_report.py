@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.output import write as write_file
+from coec.adapters.files.output import write_output as write_file
 from coec.adapters.images.codec import decode_bgr
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.frames.motion_compensation import compensate
@@ -20,7 +20,7 @@ from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import cameras
 from coec.reports import console, page, pictures, provenance
-from coec.reports.overlay import draw as draw_overlay
+from coec.reports.overlay import render_points as draw_overlay
 from coec.reports.page import (
     Block,
     Cell,
@@ -37,11 +37,11 @@ from coec.reports.page import (
     Series,
     Table,
     Text,
-    Verdict,
+    VerdictBanner,
 )
 from coec.reports.page.words import count
 from coec.reports.page_parts import TONES, copies_of, figures_block, file_picture
-from coec.reports.provenance import Made
+from coec.reports.provenance import Provenance
 from coec.reports.timeline_plot import timeline
 from coec.schemas import replies
 from coec.schemas.base import to_json
@@ -85,7 +85,7 @@ def write_first(output: Path, drive: SimulatedDrive) -> tuple[Path, Path]:
     Raises:
         OutputError: a file cannot be written.
     """
-    window = windows.chosen_from(drive, 1, lambda *_: None).window
+    window = windows.window_of_recording(drive, 1, lambda *_: None).window
     start = window.T_camera_lidar_start
     error_deg = windows.rotation_error_deg(start, drive.truth(window.pairs[0].stamp_ns))
     title = f"as the workshop calibrated it: {error_deg:.2f} deg from the truth"
@@ -94,7 +94,7 @@ def write_first(output: Path, drive: SimulatedDrive) -> tuple[Path, Path]:
     stand_in = Page(
         "coec demo",
         pair_drive.TITLE,
-        (Verdict("none", "Under way.", "The service has not reported anything yet."), Text((FIRST_ABOUT,))),
+        (VerdictBanner("none", "Under way.", "The service has not reported anything yet."), Text((FIRST_ABOUT,))),
         (Section("What the vehicle sees", (Pictures((file_picture(picture),)),)), provenance.here().section()),
     )
     return picture, page.write(output / pair_drive.REPORT, stand_in)
@@ -256,7 +256,7 @@ def demo_page(
     result: replies.CalibrationResult | None,
     compared: Compare | None,
     window: Path | None,
-    made: Made,
+    made: Provenance,
 ) -> Page:
     """The page.
 
@@ -275,9 +275,9 @@ def demo_page(
     if result is not None:
         sections.append(Section("The window that corrected it", _repair(result, window)))
     verdict = (
-        Verdict("good", "Corrected.", "The displacement was detected and corrected.")
+        VerdictBanner("good", "Corrected.", "The displacement was detected and corrected.")
         if outcome.passed
-        else Verdict("bad", "Not corrected.", " ".join(outcome.failures()))
+        else VerdictBanner("bad", "Not corrected.", " ".join(outcome.failures()))
     )
     opening = (verdict, Text((ABOUT,)), Facts(tuple(summary)))
     return Page("coec demo", title, opening, (*sections, made.section()))
@@ -297,7 +297,7 @@ def _curve(series: Sequence[Sample], outcome: PairOutcome) -> Chart:
         x_label="drive, s",
         y_label="rotation error, °",
         series=(Series("error against the truth", list(_turns(series)), "steps"),),
-        told=f"the error is {worst_deg:.2f}° at most and {series[-1][1]:.2f}° at the end",
+        description=f"the error is {worst_deg:.2f}° at most and {series[-1][1]:.2f}° at the end",
         grounds=tuple(grounds),
         marks=tuple(Mark(second, f"{name}, {second:.0f} s") for second, name in marks if second is not None),
         limits=(Limit(pair_drive.MAX_ERROR_DEG, f"{pair_drive.MAX_ERROR_DEG:g}°: a good error"),),

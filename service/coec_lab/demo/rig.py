@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from coec.adapters.files.output import write as write_file
+from coec.adapters.files.output import write_output as write_file
 from coec.geometry.se3 import inverse
 from coec.reports import console, provenance
-from coec.reports.page import Cell, Page, Picture, Pictures, Section, Table, Text, Verdict
+from coec.reports.page import Cell, Page, Picture, Pictures, Section, Table, Text, VerdictBanner
 from coec.reports.page import write as write_page
 from coec.reports.page_parts import TONES, read
-from coec.reports.provenance import Made
-from coec.reports.rig_plot import SensorSeen, percent, rig_from_above, state_words
+from coec.reports.provenance import Provenance
+from coec.reports.rig_plot import PlottedSensor, percent, rig_from_above, state_text
 from coec.simulation.rig_drive import RigDrive
 from coec_lab.demo.rig_drive import (
     SCENARIO,
@@ -135,7 +135,7 @@ def picture(drive: RigDrive, act: Act, snapshot: RigSnapshot, scenario: Scenario
     """PNG of the rig from above, in the state that the service reports."""
     half_deg = drive.config.layout.half_view_deg
     seen = [
-        SensorSeen(
+        PlottedSensor(
             name=sensor.name, kind=sensor.kind, T_ego_sensor=inverse(drive.T_sensor_ego_nominal(sensor.name)),
             view_deg=LIDAR_VIEW_DEG if sensor.kind == "lidar" else 2.0 * half_deg, state=sensor.state,
             probability=sensor.probability, moved_deg=sensor.moved_deg,
@@ -211,7 +211,7 @@ def document(
     }
 
 
-def page(pictures: Sequence[Path], acts: Sequence[Performance], made: Made, scenario: Scenario) -> Page:
+def page(pictures: Sequence[Path], acts: Sequence[Performance], made: Provenance, scenario: Scenario) -> Page:
     """The page of all acts.
 
     Raises:
@@ -232,15 +232,15 @@ def page(pictures: Sequence[Path], acts: Sequence[Performance], made: Made, scen
     ]
     failures = [failure for outcome, _ in acts for failure in outcome.failures()]
     verdict = (
-        Verdict("bad", "Not identified.", " ".join(failures))
+        VerdictBanner("bad", "Not identified.", " ".join(failures))
         if failures
-        else Verdict("good", "Identified.", "Each displaced sensor was detected and identified, and no other.")
+        else VerdictBanner("good", "Identified.", "Each displaced sensor was detected and identified, and no other.")
     )
     return Page("coec demo --rig", TITLE, (verdict, Text((ABOUT,))), (*sections, made.section()))
 
 
 def _alt(outcome: ActOutcome, snapshot: RigSnapshot) -> str:
-    states = ", ".join(f"{name} {state_words(sensor.state)}" for name, sensor in snapshot.sensors.items())
+    states = ", ".join(f"{name} {state_text(sensor.state)}" for name, sensor in snapshot.sensors.items())
     return f"The vehicle from above after {outcome.act.sensor} was turned: {states}"
 
 
@@ -276,7 +276,7 @@ def _toned(snapshot: RigSnapshot, order: Sequence[str]) -> list[Cell]:
 def _cells(snapshot: RigSnapshot, order: Sequence[str]) -> list[str]:
     seen = [snapshot.sensors[name] for name in order]
     return [
-        state_words(sensor.state) + ("" if sensor.probability < 0.005 else f", {percent(sensor.probability)}")
+        state_text(sensor.state) + ("" if sensor.probability < 0.005 else f", {percent(sensor.probability)}")
         for sensor in seen
     ]
 

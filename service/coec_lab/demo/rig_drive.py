@@ -15,16 +15,16 @@ from math import hypot
 
 from coec.adapters.zenoh.player import Player
 from coec.evaluation.rig_looks import ROWS, TURN_S
-from coec.reports.rig_plot import MOVED, EdgeSeen
+from coec.reports.rig_plot import MOVED, PlottedEdge
 from coec.schemas.replies import CheckReply
 from coec.schemas.rig_state import RigReply, SensorReply
-from coec.simulation.drawing import Drawers, drawing
-from coec.simulation.faults import SensorFault, Step
+from coec.simulation.drawing import FrameRenderers, frame_renderers
+from coec.simulation.faults import SensorFault, StepFault
 from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigConfig, RigDrive
+from coec.simulation.rig_drive import RigDrive, RigDriveConfig
 from coec.simulation.rig_instants import Instant, instants
 from coec.simulation.schedule import Arrival
-from coec.sources.recording import Message
+from coec.sources.recording import SensorMessage
 from coec_lab.demo.pair_drive import NS_PER_S, RENDERERS
 from coec_lab.demo.service import DemoError, RigService
 
@@ -88,14 +88,16 @@ class Scenario:
     longest_s: float = 76.0
     rest_s: float = 6.0
 
-    def drive_config(self, act: Act | None) -> RigConfig:
+    def drive_config(self, act: Act | None) -> RigDriveConfig:
         """Configuration of the drive of an act; None: no sensor is displaced."""
         faults: tuple[SensorFault, ...] = ()
         if act is not None:
             rx, ry, rz = act.turn_deg
-            faults = (SensorFault(act.sensor, Step(self.knock_s, float("inf"), rx=rx, ry=ry, rz=rz)),)
+            faults = (SensorFault(act.sensor, StepFault(self.knock_s, float("inf"), rx=rx, ry=ry, rz=rz)),)
         camera = f"fisheye{self.camera_px}"
-        return RigConfig(seed=self.seed, seconds=self.longest_s, camera=camera, ego_hz=20.0, faults=faults, rows=ROWS)
+        return RigDriveConfig(
+            seed=self.seed, seconds=self.longest_s, camera=camera, ego_hz=20.0, faults=faults, rows=ROWS
+        )
 
 
 SCENARIO = Scenario()
@@ -106,9 +108,9 @@ SCENARIO = Scenario()
 class InstantFrames:
     """Frames of one instant: a sweep, a picture by camera, and the motion around them."""
 
-    sweep: Message
-    pictures: Mapping[str, Message]
-    motions: tuple[Message, ...]
+    sweep: SensorMessage
+    pictures: Mapping[str, SensorMessage]
+    motions: tuple[SensorMessage, ...]
 
     @property
     def second(self) -> float:
@@ -120,12 +122,12 @@ class RigVehicle:
     """Drives the same street in every act. A frame of a sensor that did not move is the same in every act and is
     rendered once. Other processes render frames some instants ahead, while the service starts and while it checks."""
 
-    def __init__(self, drawers: Drawers, scenario: Scenario = SCENARIO) -> None:
+    def __init__(self, drawers: FrameRenderers, scenario: Scenario = SCENARIO) -> None:
         """Raises SourceError: the library that casts rays is not installed."""
         self.scenario = scenario
         self.as_built = RigDrive(scenario.drive_config(None))
         self._drawers = drawers
-        self._started: dict[tuple[int, Arrival], Future[Message]] = {}
+        self._started: dict[tuple[int, Arrival], Future[SensorMessage]] = {}
 
     @cached_property
     def plan(self) -> list[Instant]:
@@ -141,8 +143,8 @@ class RigVehicle:
         return self._in_order(waiting, started)
 
     def _in_order(
-        self, waiting: deque[tuple[Instant, Sequence[Future[Message]]]],
-        started: Iterator[tuple[Instant, Sequence[Future[Message]]]],
+        self, waiting: deque[tuple[Instant, Sequence[Future[SensorMessage]]]],
+        started: Iterator[tuple[Instant, Sequence[Future[SensorMessage]]]],
     ) -> Iterator[InstantFrames]:  # fmt: skip
         while waiting:
             instant, frames = waiting.popleft()
@@ -155,17 +157,17 @@ class RigVehicle:
         """Render the first instant in this process. What this compiles, once per machine, is reported to the waiting
         user, and every renderer has it compiled."""
         for entry in (self.plan[0].sweep, *self.plan[0].pictures.values()):
-            rendered: Future[Message] = Future()
+            rendered: Future[SensorMessage] = Future()
             rendered.set_result(self.as_built.message(entry))
             self._started[AS_BUILT, entry] = rendered
 
-    def _begin(self, act: Act, instant: Instant) -> Sequence[Future[Message]]:
+    def _begin(self, act: Act, instant: Instant) -> Sequence[Future[SensorMessage]]:
         """Begin to render the sweep and the pictures of an instant, unless an earlier act has."""
         entries = (instant.sweep, *instant.pictures.values())
         numbered = [(self._drive_of(act, entry), entry) for entry in entries]
         for drive, entry in numbered:
             if (drive, entry) not in self._started:
-                self._started[drive, entry] = self._drawers.draw(drive, entry)
+                self._started[drive, entry] = self._drawers.render(drive, entry)
         return [self._started[one] for one in numbered]
 
     def _drive_of(self, act: Act, entry: Arrival) -> int:
@@ -184,7 +186,7 @@ def driving(scenario: Scenario = SCENARIO) -> Iterator[RigVehicle]:
         SourceError: the library that casts rays is not installed.
     """
     configs = [scenario.drive_config(act) for act in (None, *scenario.acts)]
-    with drawing(configs, RENDERERS) as drawers:
+    with frame_renderers(configs, RENDERERS) as drawers:
         yield RigVehicle(drawers, scenario)
 
 
@@ -214,7 +216,7 @@ class RigSnapshot:
     second: float
     checked: str
     sensors: Mapping[str, SensorCondition]
-    edges: Mapping[str, EdgeSeen]
+    edges: Mapping[str, PlottedEdge]
 
     @property
     def named(self) -> frozenset[str]:
@@ -292,12 +294,12 @@ def _sensor(of: SensorReply) -> SensorCondition:
     return SensorCondition(of.name, of.kind, of.state, of.probability or 0.0, moved_deg, of.reasons[0].text)
 
 
-def _edge(camera: str, lidar: str, check: CheckReply) -> EdgeSeen:
+def _edge(camera: str, lidar: str, check: CheckReply) -> PlottedEdge:
     """How much the pair is turned. Its σ is such that the turn is as many σ as all three axes together."""
     pairs = zip(check.offset[:3], check.sigma[:3], strict=True)
     axes = [(turn, sigma) for turn, sigma in pairs if turn is not None and sigma is not None and sigma > 0.0]
     turn_deg, sigmas = hypot(*(turn for turn, _ in axes)), hypot(*(turn / sigma for turn, sigma in axes))
-    return EdgeSeen(camera, lidar, turn_deg, turn_deg / sigmas if sigmas > 0.0 else float("nan"))
+    return PlottedEdge(camera, lidar, turn_deg, turn_deg / sigmas if sigmas > 0.0 else float("nan"))
 
 
 @dataclass(frozen=True, slots=True)

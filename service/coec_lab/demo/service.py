@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 
 import coec
-from coec.adapters.files.output import write
-from coec.adapters.zenoh.client import ask, ask_one, connected
+from coec.adapters.files.output import write_output
+from coec.adapters.zenoh.client import connected, query_all, query_one
 from coec.adapters.zenoh.player import SensorKeys
 from coec.cli.rig_configuration import document_of
 from coec.config import Config, load_config
@@ -167,7 +167,7 @@ class RigService:
             DemoError: the service ends before, or it takes too long.
         """
         deadline_s = time.monotonic() + START_S
-        while not (ask(self.session, self._keys.status, QUERY_S) and self.status().state == "running"):
+        while not (query_all(self.session, self._keys.status, QUERY_S) and self.status().state == "running"):
             self._wait(deadline_s, "is not ready")
 
     def until_taken(self, pictures: int, most_held: int) -> None:
@@ -200,7 +200,7 @@ class RigService:
         time.sleep(POLL_S)
 
     def _query(self, key: str) -> bytes:
-        return ask_one(self.session, f"{key}?format=json", QUERY_S).payload
+        return query_one(self.session, f"{key}?format=json", QUERY_S).payload
 
 
 @contextmanager
@@ -222,7 +222,7 @@ def serving(drive: RigDrive, lidar: str) -> Iterator[RigService]:
             "zenoh": {"connect": [endpoint], "listen": [endpoint]},
             "state": {"directory": "state", "min_free_bytes": MIN_FREE_BYTES},
         }
-        path = write(folder / "coec.yaml", json.dumps(document).encode())  # which is YAML, too
+        path = write_output(folder / "coec.yaml", json.dumps(document).encode())  # which is YAML, too
         config = load_config(path)
         with running(path, folder / "coec.log") as daemon, connected(config.zenoh.connect, START_S) as session:
             service = RigService(session, config, daemon, SensorKeys(("ego", lidar, *drive.cameras)))

@@ -12,7 +12,7 @@ from coec.adapters.images.codec import encode_depth_png, encode_png, probe
 from coec.calibration.types import CameraFrame, DepthMap
 from coec.config import DepthConfig, LimitsConfig
 from coec.errors import DecodeError, ModelError
-from tiny_onnx import CARD, first_channel
+from tiny_onnx import MODEL_CARD, first_channel_network
 
 LIMITS = LimitsConfig()
 
@@ -55,8 +55,8 @@ def test_frame_without_map_is_refused_by_reason() -> None:
 
 def test_network_is_opened_by_its_path(tmp_path: Path) -> None:
     path = tmp_path / "net.onnx"
-    path.write_bytes(first_channel())
-    path.with_suffix(".yaml").write_text(CARD)
+    path.write_bytes(first_channel_network())
+    path.with_suffix(".yaml").write_text(MODEL_CARD)
     model = open_depth(DepthConfig(model=str(path)), LIMITS)
     np.testing.assert_array_equal(model.infer(_frame(5)).values, np.full((32, 32), 5))
 
@@ -64,7 +64,7 @@ def test_network_is_opened_by_its_path(tmp_path: Path) -> None:
 def test_network_is_opened_by_the_name_of_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     models_folder().mkdir(parents=True)
-    (models_folder() / "midas_small.onnx").write_bytes(first_channel())
+    (models_folder() / "midas_small.onnx").write_bytes(first_channel_network())
     model = open_depth(DepthConfig(model="midas_small"), LIMITS)
     assert model.infer(_frame(5)).values.shape == (256, 256)
 
@@ -100,7 +100,7 @@ def test_wrong_file_under_the_name_of_a_known_network_is_refused(
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     models_folder().mkdir(parents=True)
-    (models_folder() / "tcmonodepth_small.onnx").write_bytes(first_channel())
+    (models_folder() / "tcmonodepth_small.onnx").write_bytes(first_channel_network())
     with pytest.raises(ModelError, match="its card tcmonodepth_small is for 4caa795b"):
         open_depth(DepthConfig(model="tcmonodepth_small"), LIMITS)
 

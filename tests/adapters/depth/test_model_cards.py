@@ -7,7 +7,7 @@ import pytest
 
 from coec.adapters.depth.model_cards import FixedSize, KeepAspect, find_card, list_models, read_card
 from coec.errors import ModelError
-from tiny_onnx import CARD
+from tiny_onnx import MODEL_CARD
 
 SAMPLE_NETWORKS = (
     "tcsmallnet_dyn.onnx",
@@ -37,7 +37,7 @@ def test_sample_networks_are_recognised_by_sha256(name: str, sample_data: Path) 
 
 
 def test_whole_card_is_read(tmp_path: Path) -> None:
-    card = read_card(_card(tmp_path, CARD))
+    card = read_card(_card(tmp_path, MODEL_CARD))
     assert card.input.size == KeepAspect(side=32, multiple=16, fit="short")
     assert (card.input.colour_order, card.input.mean, card.input.std) == ("rgb", (0, 0, 0), (1, 1, 1))
 
@@ -53,13 +53,13 @@ def test_card_may_point_to_a_built_in_one(tmp_path: Path) -> None:
     [
         ("card: nonsense\n", "no built-in card 'nonsense'.*midas_small"),
         ("card: midas_small\nsource: mine\n", "source: there is no such key"),
-        (CARD + "colour: rgb\n", "colour: there is no such key"),
-        (CARD.replace("scale: 1.0", "scale: 0"), "input.scale"),
-        (CARD.replace("scale: 1.0", "scale: 1.0, std: [1, 0, 1]"), "std must be positive"),
-        (CARD.replace("kind: inverse_depth", "kind: metric_depth"), "unit_m"),
-        (CARD.replace("kind: inverse_depth", "kind: distance"), "output.kind"),
-        (CARD.replace("side: 32", "side: 100000"), "side"),
-        (CARD + "sha256: short\n", "sha256"),
+        (MODEL_CARD + "colour: rgb\n", "colour: there is no such key"),
+        (MODEL_CARD.replace("scale: 1.0", "scale: 0"), "input.scale"),
+        (MODEL_CARD.replace("scale: 1.0", "scale: 1.0, std: [1, 0, 1]"), "std must be positive"),
+        (MODEL_CARD.replace("kind: inverse_depth", "kind: metric_depth"), "unit_m"),
+        (MODEL_CARD.replace("kind: inverse_depth", "kind: distance"), "output.kind"),
+        (MODEL_CARD.replace("side: 32", "side: 100000"), "side"),
+        (MODEL_CARD + "sha256: short\n", "sha256"),
         ("- a list\n", "expected a mapping"),
         ("name: [unclosed\n", "not valid YAML"),
     ],
@@ -76,7 +76,7 @@ def test_unknown_network_without_card_says_what_to_write(tmp_path: Path) -> None
 
 @pytest.mark.fault("another network under the name of a known one", "it is refused by its sha256")
 def test_card_of_another_file_is_refused(tmp_path: Path) -> None:
-    _card(tmp_path, CARD + f"sha256: {'a' * 64}\n")
+    _card(tmp_path, MODEL_CARD + f"sha256: {'a' * 64}\n")
     with pytest.raises(ModelError, match=f"sha256 {'b' * 64}, but its card tiny is for {'a' * 64}"):
         find_card(tmp_path / "net.onnx", "b" * 64)
 

@@ -15,7 +15,7 @@ from coec.adapters.images.codec import encode_png, probe
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError, ModelError
-from tiny_onnx import CARD, DOUBLE, first_channel
+from tiny_onnx import DOUBLE, MODEL_CARD, first_channel_network
 
 LIMITS = LimitsConfig()
 
@@ -24,7 +24,9 @@ def _frame(bgr: NDArray[np.uint8]) -> CameraFrame:
     return CameraFrame(0, "camera", probe(encode_png(bgr), LIMITS))
 
 
-def _open(folder: Path, network: bytes, card: str = CARD, providers: tuple[Provider, ...] = ("cpu",)) -> OnnxDepth:
+def _open(
+    folder: Path, network: bytes, card: str = MODEL_CARD, providers: tuple[Provider, ...] = ("cpu",)
+) -> OnnxDepth:
     path = folder / "net.onnx"
     path.write_bytes(network)
     path.with_suffix(".yaml").write_text(card)
@@ -38,9 +40,9 @@ def _noise(height: int, width: int) -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize(("order", "channel"), [("rgb", 2), ("bgr", 0)])
 def test_pixels_are_fed_as_the_card_says(order: str, channel: int, tmp_path: Path) -> None:
-    card = CARD.replace("scale: 1.0", f"scale: 0.5, mean: [3, 5, 7], std: [2, 4, 8], colour_order: {order}")
+    card = MODEL_CARD.replace("scale: 1.0", f"scale: 0.5, mean: [3, 5, 7], std: [2, 4, 8], colour_order: {order}")
     image = _noise(32, 48)  # already the size that the card asks for
-    depth = _open(tmp_path, first_channel(), card).infer(_frame(image)).values
+    depth = _open(tmp_path, first_channel_network(), card).infer(_frame(image)).values
     assert depth.dtype == np.float32
     np.testing.assert_allclose(depth, (image[:, :, channel] * 0.5 - 3) / 2, rtol=1e-6)
 
@@ -76,42 +78,42 @@ def test_interpolation(interpolation: str, size: tuple[int, int], expected: int)
 
 
 def test_size_follows_each_image_where_the_network_is_free(tmp_path: Path) -> None:
-    model = _open(tmp_path, first_channel())
+    model = _open(tmp_path, first_channel_network())
     assert model.infer(_frame(_noise(64, 192))).values.shape == (32, 96)
     assert model.infer(_frame(_noise(100, 100))).values.shape == (32, 32)
 
 
 def test_fixed_network_decides_its_size_where_the_card_only_keeps_the_aspect(tmp_path: Path) -> None:
-    model = _open(tmp_path, first_channel((1, 3, 48, 64)))
+    model = _open(tmp_path, first_channel_network((1, 3, 48, 64)))
     assert model.infer(_frame(_noise(20, 200))).values.shape == (48, 64)
 
 
 def test_same_image_gives_same_bytes(tmp_path: Path) -> None:
     frame = _frame(_noise(50, 70))
-    first, second = (_open(tmp_path, first_channel(), CARD).infer(frame).values for _ in range(2))
+    first, second = (_open(tmp_path, first_channel_network(), MODEL_CARD).infer(frame).values for _ in range(2))
     assert first.tobytes() == second.tobytes()
 
 
 def test_values_that_are_not_finite_become_nan(tmp_path: Path) -> None:
     image = np.zeros((32, 32, 3), dtype=np.uint8)
     image[:16] = 200
-    depth = _open(tmp_path, first_channel(then="Reciprocal")).infer(_frame(image)).values
+    depth = _open(tmp_path, first_channel_network(then="Reciprocal")).infer(_frame(image)).values
     np.testing.assert_allclose(depth[:16], 1 / 200)
     assert np.isnan(depth[16:]).all()
 
 
 def test_constant_map_is_allowed(tmp_path: Path) -> None:
-    depth = _open(tmp_path, first_channel()).infer(_frame(np.full((32, 32, 3), 9, np.uint8))).values
+    depth = _open(tmp_path, first_channel_network()).infer(_frame(np.full((32, 32, 3), 9, np.uint8))).values
     np.testing.assert_array_equal(depth, 9)
 
 
 def test_identity_is_the_sha256_of_the_file(tmp_path: Path) -> None:
-    network = first_channel()
+    network = first_channel_network()
     assert _open(tmp_path, network).identity == hashlib.sha256(network).hexdigest()
 
 
 def test_external_weights_are_loaded_and_belong_to_the_identity(tmp_path: Path) -> None:
-    network = first_channel(weights_file="net.onnx.data")
+    network = first_channel_network(weights_file="net.onnx.data")
     (tmp_path / "net.onnx.data").write_bytes(bytes(8))
     frame = _frame(np.full((32, 32, 3), (10, 20, 30), np.uint8))
     red = _open(tmp_path, network)
@@ -127,16 +129,16 @@ def test_external_weights_are_loaded_and_belong_to_the_identity(tmp_path: Path) 
     [
         (b"", "cannot be loaded"),
         (b"<html>not found</html>", "cannot be loaded"),
-        (first_channel()[:-40], "cannot be loaded"),
-        (first_channel(weights_file="net.onnx.data"), "external weights missing"),
-        (first_channel(input_name="pixels"), r"has the inputs pixels; its card \(tiny\) names 'image'"),
-        (first_channel(output_name="range"), r"has the outputs range; its card \(tiny\) names 'depth'"),
-        (first_channel(element=DOUBLE), r"tensor\(double\).*expected tensor\(float\)"),
-        (first_channel((1, 4, "h", "w")), r"expected \[1, 3, height, width\]"),
-        (first_channel((2, 3, 32, 32)), r"expected \[1, 3, height, width\]"),
-        (first_channel((1, 3, 32)), r"expected \[1, 3, height, width\]"),
-        (first_channel((1, 3, 40, 48)), "does not fit the size in its card tiny"),
-        (first_channel(then="Shape"), "cannot be loaded"),
+        (first_channel_network()[:-40], "cannot be loaded"),
+        (first_channel_network(weights_file="net.onnx.data"), "external weights missing"),
+        (first_channel_network(input_name="pixels"), r"has the inputs pixels; its card \(tiny\) names 'image'"),
+        (first_channel_network(output_name="range"), r"has the outputs range; its card \(tiny\) names 'depth'"),
+        (first_channel_network(element=DOUBLE), r"tensor\(double\).*expected tensor\(float\)"),
+        (first_channel_network((1, 4, "h", "w")), r"expected \[1, 3, height, width\]"),
+        (first_channel_network((2, 3, 32, 32)), r"expected \[1, 3, height, width\]"),
+        (first_channel_network((1, 3, 32)), r"expected \[1, 3, height, width\]"),
+        (first_channel_network((1, 3, 40, 48)), "does not fit the size in its card tiny"),
+        (first_channel_network(then="Shape"), "cannot be loaded"),
     ],
 )
 def test_unfit_network_is_an_error_at_the_start(network: bytes, complaint: str, tmp_path: Path) -> None:
@@ -145,25 +147,25 @@ def test_unfit_network_is_an_error_at_the_start(network: bytes, complaint: str, 
 
 
 def test_fixed_size_of_card_and_network_must_agree(tmp_path: Path) -> None:
-    card = CARD.replace("side: 32, multiple: 16, fit: short", "height: 32, width: 64")
-    _open(tmp_path, first_channel((1, 3, 32, 64)), card)
+    card = MODEL_CARD.replace("side: 32, multiple: 16, fit: short", "height: 32, width: 64")
+    _open(tmp_path, first_channel_network((1, 3, 32, 64)), card)
     with pytest.raises(ModelError, match="does not fit the size in its card"):
-        _open(tmp_path, first_channel((1, 3, 64, 32)), card)
+        _open(tmp_path, first_channel_network((1, 3, 64, 32)), card)
 
 
 def test_network_without_any_finite_value_is_an_error_at_the_start(tmp_path: Path) -> None:
-    card = CARD.replace("scale: 1.0", "scale: 1.0, mean: [300, 300, 300]")  # root of negative numbers
+    card = MODEL_CARD.replace("scale: 1.0", "scale: 1.0, mean: [300, 300, 300]")  # root of negative numbers
     with pytest.raises(ModelError, match="no finite value for a test image"):
-        _open(tmp_path, first_channel(then="Sqrt"), card)
+        _open(tmp_path, first_channel_network(then="Sqrt"), card)
 
 
 def test_several_outputs_need_a_name(tmp_path: Path) -> None:
-    network = first_channel(second_output=True)
+    network = first_channel_network(second_output=True)
     assert _open(tmp_path, network).infer(_frame(_noise(32, 32))).values.shape == (32, 32)
     with pytest.raises(ModelError, match=r"depth, copy; its card \(tiny\) names none"):
-        _open(tmp_path, network, CARD.replace("name: depth, ", ""))
+        _open(tmp_path, network, MODEL_CARD.replace("name: depth, ", ""))
     with pytest.raises(ModelError, match=r"'copy' has shape \[1, 3, 32, 32\], expected one map"):
-        _open(tmp_path, network, CARD.replace("name: depth", "name: copy"))
+        _open(tmp_path, network, MODEL_CARD.replace("name: depth", "name: copy"))
 
 
 def test_missing_file_is_a_model_error(tmp_path: Path) -> None:
@@ -176,7 +178,7 @@ def test_absent_provider_is_left_out_with_a_line_in_the_log(
 ) -> None:
     monkeypatch.setattr("onnxruntime.get_available_providers", lambda: ["CPUExecutionProvider"])
     with caplog.at_level(logging.WARNING):
-        model = _open(tmp_path, first_channel(), providers=("cuda", "cpu", "tensorrt"))
+        model = _open(tmp_path, first_channel_network(), providers=("cuda", "cpu", "tensorrt"))
     assert [record.getMessage() for record in caplog.records] == [
         "onnxruntime on this machine has no cuda: left out",
         "onnxruntime on this machine has no tensorrt: left out",
@@ -187,14 +189,14 @@ def test_absent_provider_is_left_out_with_a_line_in_the_log(
 def test_broken_image_is_a_decode_error(tmp_path: Path) -> None:
     image = EncodedImage(ImageFormat.JPEG, 32, 32, b"\xff\xd8 no more")
     with pytest.raises(DecodeError):
-        _open(tmp_path, first_channel()).infer(CameraFrame(0, "camera", image))
+        _open(tmp_path, first_channel_network()).infer(CameraFrame(0, "camera", image))
 
 
 @pytest.mark.fault("an image of absurd aspect ratio, which makes the network's input huge", "it is refused")
 def test_image_of_absurd_aspect_is_refused(tmp_path: Path) -> None:
-    card = CARD.replace("side: 32", "side: 512")
+    card = MODEL_CARD.replace("side: 32", "side: 512")
     with pytest.raises(DecodeError) as caught:
-        _open(tmp_path, first_channel(), card).infer(_frame(np.zeros((2, 9000, 3), np.uint8)))
+        _open(tmp_path, first_channel_network(), card).infer(_frame(np.zeros((2, 9000, 3), np.uint8)))
     assert caught.value.reason == "image_too_large"
 
 

@@ -21,7 +21,7 @@ from ruamel.yaml import YAML
 from coec.adapters.exports import FORMATS
 from coec.adapters.exports.extrinsic import roll_pitch_yaw
 from coec.errors import OutputError
-from exported import extrinsic
+from exported import exported_extrinsic
 
 Matrix = NDArray[np.float64]
 
@@ -152,7 +152,7 @@ def test_every_format_has_a_reader_here() -> None:
 @pytest.mark.parametrize("name", FORMATS)
 @given(xi=TURNS)
 def test_what_is_read_is_what_was_written(name: str, xi: Matrix) -> None:
-    told = extrinsic(xi)
+    told = exported_extrinsic(xi)
     np.testing.assert_allclose(
         READERS[name](FORMATS[name].text(told, None)), told.T_child_parent, atol=TOLERANCE, rtol=0
     )
@@ -160,7 +160,7 @@ def test_what_is_read_is_what_was_written(name: str, xi: Matrix) -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_file_says_direction_spread_and_origin(name: str) -> None:
-    text = FORMATS[name].text(extrinsic(np.zeros(6)), None)
+    text = FORMATS[name].text(exported_extrinsic(np.zeros(6)), None)
     assert "front-12" in text
     assert "1e-07" in text  # the first variance
     assert any(word in text for word in ("pose", "maps", "p_camera"))
@@ -170,10 +170,10 @@ def test_every_file_says_direction_spread_and_origin(name: str) -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_what_was_forced_says_so(name: str) -> None:
-    text = FORMATS[name].text(extrinsic(np.zeros(6), ("The edges are faint.\n-- evil: <x>",)), None)
+    text = FORMATS[name].text(exported_extrinsic(np.zeros(6), ("The edges are faint.\n-- evil: <x>",)), None)
     assert "NOT ACCEPTED" in text or '"accepted": false' in text
     assert "The edges are faint." in text
-    np.testing.assert_allclose(READERS[name](text), extrinsic(np.zeros(6)).T_child_parent, atol=TOLERANCE)
+    np.testing.assert_allclose(READERS[name](text), exported_extrinsic(np.zeros(6)).T_child_parent, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2, math.pi / 2 - 1e-9])
@@ -198,7 +198,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_of_a_file_with_others_the_entry_alone_is_changed(name: str) -> None:
-    before, told = OTHERS[name], extrinsic(np.full(6, 0.1))
+    before, told = OTHERS[name], exported_extrinsic(np.full(6, 0.1))
     after = FORMATS[name].text(told, before)
     np.testing.assert_allclose(READERS[name](after), told.T_child_parent, atol=TOLERANCE)
     ours = ("cam0", "x: 9", "rostopic: /a", "rows: 1", "cols: 1", "dt: d", "data: [ 7. ]", "rows: 4", "cols: 4")
@@ -218,42 +218,42 @@ def test_of_a_file_with_others_the_entry_alone_is_changed(name: str) -> None:
     ],
 )
 def test_of_a_document_in_json_the_rest_is_kept(name: str, before: str, kept: str) -> None:
-    once = FORMATS[name].text(extrinsic(np.zeros(6)), before)
+    once = FORMATS[name].text(exported_extrinsic(np.zeros(6)), before)
     assert kept in once
-    assert FORMATS[name].text(extrinsic(np.zeros(6)), once) == once
-    assert FORMATS[name].text(extrinsic(np.full(6, 0.1)), once) != once
+    assert FORMATS[name].text(exported_extrinsic(np.zeros(6)), once) == once
+    assert FORMATS[name].text(exported_extrinsic(np.full(6, 0.1)), once) != once
 
 
 @pytest.mark.parametrize("name", ["autoware", "kalibr", "urdf", "nuscenes", "openlabel", "colmap", "opencv"])
 @pytest.mark.parametrize("existing", ["", "{", "7", "[1, 2]", "<a><b></a>", "\x00\xff"])
 def test_a_file_that_is_something_else_is_refused(name: str, existing: str) -> None:
     with pytest.raises(OutputError):
-        FORMATS[name].text(extrinsic(np.zeros(6)), existing)
+        FORMATS[name].text(exported_extrinsic(np.zeros(6)), existing)
 
 
 def test_colmap_means_poses_from_the_reference_of_a_rig() -> None:
-    ours = FORMATS["colmap"].text(extrinsic(np.zeros(6)), None)
-    rear = replace(extrinsic(np.full(6, 0.2)), child="cam1")
+    ours = FORMATS["colmap"].text(exported_extrinsic(np.zeros(6)), None)
+    rear = replace(exported_extrinsic(np.full(6, 0.2)), child="cam1")
     (rig,) = json.loads(FORMATS["colmap"].text(rear, ours))  # the same parent: the same rig
     assert [camera["image_prefix"] for camera in rig["cameras"]] == ["base_link/", "cam0/", "cam1/"]
     others = json.dumps([{"cameras": [{"image_prefix": "cam0/", "ref_sensor": True}]}])
     with pytest.raises(OutputError, match="in a rig whose reference is"):
-        FORMATS["colmap"].text(extrinsic(np.zeros(6)), others)
+        FORMATS["colmap"].text(exported_extrinsic(np.zeros(6)), others)
 
 
 def test_a_parent_that_holds_no_entries_is_refused() -> None:
     with pytest.raises(OutputError, match="`base_link` is no map of names"):
-        FORMATS["autoware"].text(extrinsic(np.zeros(6)), "base_link: 3\n")
+        FORMATS["autoware"].text(exported_extrinsic(np.zeros(6)), "base_link: 3\n")
 
 
 def test_entries_on_one_line_are_not_torn_apart() -> None:
     with pytest.raises(OutputError, match="cannot be changed alone"):
-        FORMATS["autoware"].text(extrinsic(np.zeros(6)), "base_link: {cam0: {x: 1}, cam1: {x: 2}}\n")
+        FORMATS["autoware"].text(exported_extrinsic(np.zeros(6)), "base_link: {cam0: {x: 1}, cam1: {x: 2}}\n")
 
 
 def test_kalibr_without_intrinsics_says_where_they_come_from() -> None:
     with pytest.raises(OutputError, match=r"export from a window, or give --config"):
-        FORMATS["kalibr"].text(extrinsic(np.zeros(6), camera=None), None)
+        FORMATS["kalibr"].text(exported_extrinsic(np.zeros(6), camera=None), None)
 
 
 def test_the_script_starts_every_publisher_and_stays(tmp_path: Path) -> None:
@@ -261,7 +261,7 @@ def test_the_script_starts_every_publisher_and_stays(tmp_path: Path) -> None:
     stub.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/called\n')
     stub.chmod(0o755)
     script = tmp_path / "publish.sh"
-    script.write_text(FORMATS["tf"].text(extrinsic(np.zeros(6)), OTHERS["tf"]))
+    script.write_text(FORMATS["tf"].text(exported_extrinsic(np.zeros(6)), OTHERS["tf"]))
     path = {"PATH": f"{tmp_path}:/usr/bin:/bin"}
     subprocess.run(["/bin/sh", script], check=True, env=path, timeout=30)
     children = sorted(line.split()[-1] for line in (tmp_path / "called").read_text().splitlines())

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from baselines import a_baseline
-from boards import LENSES, rig_with
+from boards import BOARD_LENSES, board_rig
 from coec.adapters.files.baseline_file import (
     baseline_from_json,
     baseline_hash,
-    baseline_of,
+    baseline_of_rig,
     baseline_to_json,
     load_baseline,
     save_baseline,
@@ -99,11 +99,11 @@ def test_a_scene_of_other_parts_than_the_monitor_looks_at_is_refused(part: str, 
 
 
 class TestOfModel:
-    rig = rig_with(LENSES["pinhole"])
+    rig = board_rig(BOARD_LENSES["pinhole"])
 
     def test_a_rig_that_is_not_commissioned_starts_from_its_model(self, tmp_path: Path) -> None:
         save_baseline(tmp_path / "model.json", a_baseline())
-        taken = baseline_of(self.rig, StateConfig(directory=tmp_path / "state", model=tmp_path / "model.json"))
+        taken = baseline_of_rig(self.rig, StateConfig(directory=tmp_path / "state", model=tmp_path / "model.json"))
         assert taken is not None
         assert taken.limits == a_baseline().limits
         np.testing.assert_array_equal(taken.T_camera_lidar, self.rig.T_camera_lidar_nominal)
@@ -112,14 +112,14 @@ class TestOfModel:
         save_baseline(tmp_path / "model.json", a_baseline())
         own = replace(a_baseline(), limits={"min_edge_contrast": 7.0})
         save_baseline(tmp_path / "rig.json", own)
-        taken = baseline_of(self.rig, StateConfig(directory=tmp_path, model=tmp_path / "model.json"))
+        taken = baseline_of_rig(self.rig, StateConfig(directory=tmp_path, model=tmp_path / "model.json"))
         assert taken is not None
         assert_same(taken, own)
 
     def test_there_is_none_where_none_is_named(self, tmp_path: Path) -> None:
-        assert baseline_of(self.rig, StateConfig(directory=tmp_path)) is None
+        assert baseline_of_rig(self.rig, StateConfig(directory=tmp_path)) is None
 
     def test_a_model_that_knows_nothing_of_the_pair_is_told(self, tmp_path: Path) -> None:
         save_baseline(tmp_path / "model.json", replace(a_baseline(), pair="rear"))
         with pytest.raises(StateError, match=r"state\.model.*no baseline of the pair front"):
-            baseline_of(self.rig, StateConfig(directory=tmp_path, model=tmp_path / "model.json"))
+            baseline_of_rig(self.rig, StateConfig(directory=tmp_path, model=tmp_path / "model.json"))

@@ -71,7 +71,7 @@ def estimate(seed: int = 0, **changes: Any) -> Estimate:
         uncertainty=Uncertainty(
             noise=np.pad(1e-6 * np.cov(rng.normal(size=(3, 9))), (0, 3), constant_values=NAN),
             systematic={name: 1e-3 * rng.normal(size=6) for name in ("stamps", "columns")},
-            looks=float(rng.uniform(1.0, 25.0)),
+            independent_samples=float(rng.uniform(1.0, 25.0)),
         ),
         solved=np.array([True, True, True, False, False, False]),
         unobservable=np.array([False, False, False, False, True, False]),

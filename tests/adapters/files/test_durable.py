@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from coec.adapters.files import durable
-from coec.adapters.files.durable import Log
-from disks import EVERYTHING, Disk
+from coec.adapters.files.durable import LineLog
+from disks import EVERY_OPERATION, Disk
 
 
-def log_of(path: Path, lines: list[bytes], limit: int = 100) -> Log:
-    return Log(path, limit, lambda: lines[-limit:])
+def log_of(path: Path, lines: list[bytes], limit: int = 100) -> LineLog:
+    return LineLog(path, limit, lambda: lines[-limit:])
 
 
 def names(folder: Path) -> list[str]:
@@ -92,7 +92,7 @@ def test_folders_are_made_and_removed(root: Path) -> None:
 # --- lines ----------------------------------------------------------------------------------------------------------
 
 
-def write(log: Log, lines: list[bytes], line: bytes) -> None:
+def write(log: LineLog, lines: list[bytes], line: bytes) -> None:
     lines.append(line)
     log.add(line)
     log.flush()
@@ -115,7 +115,7 @@ def test_a_full_disk_leaves_no_half_line_and_what_waits_follows_in_order(
     lines: list[bytes] = []
     log = log_of(root / "log", lines)
     write(log, lines, b"zero")
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     for line in (b"one", b"two"):
         with pytest.raises(OSError, match="No space"):
             write(log, lines, line)
@@ -188,7 +188,7 @@ def test_a_power_cut_takes_no_line_that_was_written(root: Path, monkeypatch: pyt
 )
 def test_a_disk_that_stays_full_gets_the_newest_in_the_end(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(root, monkeypatch)
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     lines: list[bytes] = []
     log = log_of(root / "log", lines, limit=3)
     for number in range(100):

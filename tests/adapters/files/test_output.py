@@ -26,7 +26,7 @@ def test_a_folder_that_was_tried_is_as_it_was(tmp_path: Path) -> None:
 def test_what_was_tried_can_be_written(tmp_path: Path) -> None:
     path = tmp_path / "one" / "two" / "result.json"
     output.try_file(path)
-    assert output.write(path, b"{}").read_bytes() == b"{}"
+    assert output.write_output(path, b"{}").read_bytes() == b"{}"
 
 
 def test_a_folder_below_a_file_is_refused_by_name(tmp_path: Path) -> None:
@@ -51,11 +51,11 @@ def files_of_at_most(size_bytes: int) -> Iterator[None]:
 @pytest.mark.fault("a disk that fills up while a picture is written", "said, and no half picture is left")
 def test_half_a_file_is_not_left(tmp_path: Path) -> None:
     with files_of_at_most(1000), pytest.raises(OutputError, match="cannot write"):
-        output.write(tmp_path / "picture.png", bytes(100_000))
+        output.write_output(tmp_path / "picture.png", bytes(100_000))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_device_that_is_full_stays() -> None:
     with pytest.raises(OutputError, match="No space left"):
-        output.write(Path("/dev/full"), b"picture")
+        output.write_output(Path("/dev/full"), b"picture")
     assert Path("/dev/full").exists()

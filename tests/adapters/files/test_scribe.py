@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from coec.adapters.files import scribe as scribe_module
-from coec.adapters.files.ledger import Ledger
-from coec.adapters.files.scribe import Scribe
+from coec.adapters.files.ledger import AppendLog
+from coec.adapters.files.scribe import DiskWriter
 from coec.errors import StateError
-from disks import EVERYTHING, Disk
+from disks import EVERY_OPERATION, Disk
 from fakes import wait_until
 
 
@@ -35,8 +35,8 @@ class Book:
 
 
 @contextmanager
-def writing(folder: Path) -> Iterator[Scribe]:
-    scribe = Scribe(folder)
+def writing(folder: Path) -> Iterator[DiskWriter]:
+    scribe = DiskWriter(folder)
     scribe.thread.start()
     try:
         yield scribe
@@ -53,7 +53,7 @@ def test_what_is_put_down_is_written_soon_and_the_last_before_the_end(tmp_path: 
         scribe.write(book)
         wait_until(scribe.has_written, "the book")
         assert book.written == 1
-        assert scribe.trouble is None
+        assert scribe.problem is None
         scribe.write(book)
     assert book.written == 2
 
@@ -64,15 +64,15 @@ def test_a_disk_that_refuses_is_named_and_tried_again(tmp_path: Path, monkeypatc
     broken.refuses = True
     with writing(tmp_path) as scribe:
         scribe.write(broken, well)
-        wait_until(lambda: scribe.trouble is not None, "the trouble")
-        assert scribe.trouble is not None
-        assert (scribe.trouble.code, "No space" in scribe.trouble.text) == ("disk_failing", True)
+        wait_until(lambda: scribe.problem is not None, "the trouble")
+        assert scribe.problem is not None
+        assert (scribe.problem.code, "No space" in scribe.problem.text) == ("disk_failing", True)
         assert not scribe.has_written()
         assert well.written == 1, "one book that cannot be written keeps no other waiting"
         broken.refuses = False
         wait_until(scribe.has_written, "the second attempt")
         assert broken.written == 1
-    assert scribe.trouble is None
+    assert scribe.problem is None
 
 
 def test_nobody_waits_for_a_disk_that_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,9 +82,9 @@ def test_nobody_waits_for_a_disk_that_hangs(tmp_path: Path, monkeypatch: pytest.
     book.let.clear()
     with writing(tmp_path) as scribe:
         scribe.write(book)
-        wait_until(lambda: scribe.trouble is not None, "the trouble")
-        assert scribe.trouble is not None
-        assert scribe.trouble.code == "disk_slow"
+        wait_until(lambda: scribe.problem is not None, "the trouble")
+        assert scribe.problem is not None
+        assert scribe.problem.code == "disk_slow"
         assert not scribe.has_written()
         scribe.write(book)
         book.let.set()
@@ -106,22 +106,22 @@ def test_a_disk_without_room_is_told_before_anything_is_refused(
     for name in names:
         setattr(found, name, changed.get(name, getattr(real, name)))
     monkeypatch.setattr(os, "statvfs", lambda _: found)
-    scribe = Scribe(tmp_path)
-    scribe.look()
-    assert scribe.trouble is not None
-    assert scribe.trouble.code == code
+    scribe = DiskWriter(tmp_path)
+    scribe.check_folder()
+    assert scribe.problem is not None
+    assert scribe.problem.code == code
     monkeypatch.undo()
-    scribe.look()
-    assert scribe.trouble is None
+    scribe.check_folder()
+    assert scribe.problem is None
 
 
 # --- ledgers ----------------------------------------------------------------------------------------------------------
 
 
-def ledger(path: Path, limit: int = 5) -> Ledger[bytes]:
-    made: Ledger[bytes] = Ledger(path, limit, lambda line: line)
+def ledger(path: Path, limit: int = 5) -> AppendLog[bytes]:
+    made: AppendLog[bytes] = AppendLog(path, limit, lambda line: line)
     for line in made.load():
-        made.found(line)
+        made.restored(line)
     return made
 
 
@@ -163,7 +163,7 @@ def test_what_is_added_while_the_disk_writes_comes_once(tmp_path: Path, monkeypa
 def test_a_disk_that_refuses_for_long_does_not_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(tmp_path, monkeypatch)
     kept = ledger(tmp_path / "l", limit=5)
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     for number in range(100):
         kept.add(lambda _, number=number: b"%d" % number)  # type: ignore[misc]
         with pytest.raises(OSError, match="No space"):

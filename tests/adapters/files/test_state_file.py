@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.files.durable import MAX_ASIDE
-from coec.adapters.files.state_file import BROKEN, MAX_BYTES, OLDER, StateFile
+from coec.adapters.files.durable import MAX_QUARANTINED
+from coec.adapters.files.state_file import BROKEN, MAX_STATE_BYTES, OLDER, StateFile
 from coec.errors import StateError
-from disks import EVERYTHING, Disk
+from disks import EVERY_OPERATION, Disk
 
 FIRST: dict[str, object] = {"pairs": {"front": {"matrix": [[1.0, 0.1], [1e-17, -0.0]], "name": "Ä"}}}
 SECOND: dict[str, object] = {"pairs": {"front": {"matrix": [[2.0, 0.30000000000000004], [3, None]]}}}
@@ -120,9 +120,9 @@ def test_a_copy_that_is_distrusted_twice_does_not_cost_the_other_copy(tmp_path: 
     unusable = path.read_bytes()
     file = StateFile(path)
     file.load()
-    file.distrust(OLDER)
-    file.distrust(BROKEN)
-    file.distrust(OLDER)
+    file.reject(OLDER)
+    file.reject(BROKEN)
+    file.reject(OLDER)
     file.save(FIRST)
     assert {entry.name for entry in tmp_path.iterdir()} == {"state.json", "state.json.previous", "state.json.broken"}
     assert (tmp_path / "state.json.broken").read_bytes() == unusable
@@ -130,15 +130,15 @@ def test_a_copy_that_is_distrusted_twice_does_not_cost_the_other_copy(tmp_path: 
 
 def test_what_is_kept_aside_is_bounded_and_the_first_ones_stay(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
-    for number in range(2 * MAX_ASIDE):
+    for number in range(2 * MAX_QUARANTINED):
         path.write_bytes(b"junk %d" % number)
         file = StateFile(path)
         assert file.load().damage
         file.save(FIRST)
     aside = {entry.name: entry.read_bytes() for entry in tmp_path.glob("*.broken*")}
-    assert len(aside) == MAX_ASIDE + 1
+    assert len(aside) == MAX_QUARANTINED + 1
     assert aside["state.json.broken"] == b"junk 0"
-    assert b"junk %d" % (2 * MAX_ASIDE - 1) in aside.values()
+    assert b"junk %d" % (2 * MAX_QUARANTINED - 1) in aside.values()
 
 
 def test_a_save_waits_until_what_cannot_be_used_is_kept_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,7 +147,7 @@ def test_a_save_waits_until_what_cannot_be_used_is_kept_aside(tmp_path: Path, mo
     path.write_bytes(b"junk")
     file = StateFile(path)
     file.load()
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     with pytest.raises(StateError):
         file.save(FIRST)
     assert path.read_bytes() == b"junk"
@@ -160,7 +160,7 @@ def test_a_save_waits_until_what_cannot_be_used_is_kept_aside(tmp_path: Path, mo
 def test_a_file_larger_than_any_state_is_not_read_whole(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
     with path.open("wb") as stream:
-        stream.truncate(MAX_BYTES + 1)
+        stream.truncate(MAX_STATE_BYTES + 1)
     assert "more than" in StateFile(path).load().damage[0]
 
 
@@ -230,7 +230,7 @@ def test_a_power_cut_at_any_byte_of_the_saves_leaves_what_was_saved_last_or_is_b
             disk.acknowledge(number)
     count = 0
     for count, cut in enumerate(disk.power_cuts()):
-        loaded = StateFile(cut.put(tmp_path / str(count)) / "state.json").load()
+        loaded = StateFile(cut.restore(tmp_path / str(count)) / "state.json").load()
         safe = len(cut.acknowledged)
         assert loaded.body in (None, *bodies)[safe : safe + 2]
         assert loaded.damage == ()

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from boards import LENSES
-from coec.adapters.foxglove.intrinsics import counterpart_of
+from boards import BOARD_LENSES
+from coec.adapters.foxglove.intrinsics import viewer_camera
 from coec.geometry.cameras import build
 from coec.geometry.projection import project
 
@@ -20,8 +20,8 @@ RATIONAL = build(
 
 @pytest.mark.parametrize("name", ["pinhole", "radtan", "rational", "kannala_brandt"])
 def test_the_counterpart_projects_as_the_camera_does(name: str) -> None:
-    camera = RATIONAL if name == "rational" else LENSES[name]
-    counterpart = counterpart_of(camera)
+    camera = RATIONAL if name == "rational" else BOARD_LENSES[name]
+    counterpart = viewer_camera(camera)
     assert counterpart is not None
     told = counterpart.camera
     K = np.array([[told.fx, 0, told.cx], [0, told.fy, told.cy], [0, 0, 1]])

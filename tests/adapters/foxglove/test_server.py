@@ -17,13 +17,13 @@ pytest.importorskip("foxglove", reason="needs the optional extra `foxglove`")
 
 from adapters.foxglove.test_shown import EXTRINSICS, places, projected
 from adapters.foxglove.test_timeline import FULL
-from boards import LENSES, MOVED, NOMINAL, pair_with, rig_with, sweep
+from boards import BOARD_LENSES, BOARD_MOVED, BOARD_NOMINAL, board_frame_pair, board_rig, board_sweep
 from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.intrinsics import counterpart_of
-from coec.adapters.foxglove.server import Screen
-from coec.adapters.foxglove.shown import Picture, picture_of
-from coec.adapters.foxglove.timeline import schema
-from coec.adapters.foxglove.topics import PICTURES, POINTS, TOPICS, Pose, topics_for
+from coec.adapters.foxglove.intrinsics import viewer_camera
+from coec.adapters.foxglove.server import ViewerServer
+from coec.adapters.foxglove.shown import PairPicture, picture_of
+from coec.adapters.foxglove.timeline import timeline_schema
+from coec.adapters.foxglove.topics import PICTURE_TOPICS, POINTS_TOPICS, TOPIC_DESCRIPTIONS, DisplayedPose, topics_for
 from coec.adapters.images.codec import encode_png, probe
 from coec.calibration.types import Rig
 from coec.config import LimitsConfig
@@ -46,39 +46,41 @@ and the kernel hold of them."""
 
 
 @pytest.fixture
-def screen() -> Iterator[Screen]:
-    screen = Screen(HOST, 0, "coec test", LENSES["kannala_brandt"])
+def screen() -> Iterator[ViewerServer]:
+    screen = ViewerServer(HOST, 0, "coec test", BOARD_LENSES["kannala_brandt"])
     yield screen
     screen.close()
 
 
-def picture(lens: str = "double_sphere") -> tuple[Picture, Rig]:
-    rig = rig_with(LENSES[lens])
-    pair = replace(pair_with(rig.camera), lidar=replace(sweep(), xyz_m=sweep().xyz_m[::16], ring=None))
-    return picture_of(pair, rig, EXTRINSICS, PICTURES, LimitsConfig(), compensated=True), rig
+def picture(lens: str = "double_sphere") -> tuple[PairPicture, Rig]:
+    rig = board_rig(BOARD_LENSES[lens])
+    pair = replace(
+        board_frame_pair(rig.camera), lidar=replace(board_sweep(), xyz_m=board_sweep().xyz_m[::16], ring=None)
+    )
+    return picture_of(pair, rig, EXTRINSICS, PICTURE_TOPICS, LimitsConfig(), compensated=True), rig
 
 
-def shown_to(viewer: Viewer, screen: Screen, picture: Picture, *wanted: str) -> None:
+def shown_to(viewer: Viewer, screen: ViewerServer, picture: PairPicture, *wanted: str) -> None:
     """Subscribe, and show it as soon as that is known."""
     viewer.subscribe(wanted)
-    wait_until(lambda: set(wanted) <= screen.wanted, f"subscriptions to {', '.join(wanted)}")
-    screen.show(picture)
+    wait_until(lambda: set(wanted) <= screen.requested_topics, f"subscriptions to {', '.join(wanted)}")
+    screen.send_picture(picture)
 
 
-def test_pixels_arrive_as_the_projection_puts_them(screen: Screen) -> None:
+def test_pixels_arrive_as_the_projection_puts_them(screen: ViewerServer) -> None:
     told, rig = picture()
     with Viewer(screen.url) as viewer:
-        shown_to(viewer, screen, told, *POINTS.values())
-        for pose, T_camera_lidar in ((Pose.SERVED, MOVED), (Pose.NOMINAL, NOMINAL)):
-            message = viewer.next_on(POINTS[pose])
-            assert viewer.channels[POINTS[pose]]["schemaName"] == "foxglove.ImageAnnotations"
+        shown_to(viewer, screen, told, *POINTS_TOPICS.values())
+        for pose, T_camera_lidar in ((DisplayedPose.SERVED, BOARD_MOVED), (DisplayedPose.NOMINAL, BOARD_NOMINAL)):
+            message = viewer.next_on(POINTS_TOPICS[pose])
+            assert viewer.channels[POINTS_TOPICS[pose]]["schemaName"] == "foxglove.ImageAnnotations"
             assert {band.type for band in message.points} == {1}, "points, not lines"
             assert {stamp_ns(band) for band in [message, *message.points, *message.texts]} == {told.stamp_ns}
             # Viewers count from the corner of the first pixel, which is not where its centre is.
             came = np.array([(point.x - 0.5, point.y - 0.5) for band in message.points for point in band.points])
-            assert places(came) == places(projected(rig.camera, T_camera_lidar, sweep().xyz_m[::16]))
+            assert places(came) == places(projected(rig.camera, T_camera_lidar, board_sweep().xyz_m[::16]))
             assert [text.text for text in message.texts] == [EXTRINSICS[pose].title]
-        nothing = viewer.next_on(POINTS[Pose.CANDIDATE])
+        nothing = viewer.next_on(POINTS_TOPICS[DisplayedPose.CANDIDATE])
         assert ([text.text for text in nothing.texts], len(nothing.points)) == (["none"], 0)
         assert stamp_ns(nothing.texts[0]) == told.stamp_ns, "who synchronises waits for it"
 
@@ -88,30 +90,38 @@ def stamp_ns(message: object) -> int:
     return int(timestamp.seconds * 10**9 + timestamp.nanos)
 
 
-def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: Screen) -> None:
+def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: ViewerServer) -> None:
     told, rig = picture("kannala_brandt")
     assert told.image is not None
     assert told.cloud is not None
     with Viewer(screen.url) as viewer:
-        shown_to(viewer, screen, told, topics.IMAGE, topics.CLOUD, topics.TRANSFORMS, topics.CALIBRATION)
-        image = viewer.next_on(topics.IMAGE)
+        shown_to(
+            viewer,
+            screen,
+            told,
+            topics.IMAGE_TOPIC,
+            topics.CLOUD_TOPIC,
+            topics.TRANSFORMS_TOPIC,
+            topics.CALIBRATION_TOPIC,
+        )
+        image = viewer.next_on(topics.IMAGE_TOPIC)
         assert (image.format, image.data, image.frame_id) == ("jpeg", told.image.data, "cam_served")
-        cloud = viewer.next_on(topics.CLOUD)
+        cloud = viewer.next_on(topics.CLOUD_TOPIC)
         assert [(field.name, field.offset, field.type) for field in cloud.fields] == [
             ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("range", 12, 7),
         ]  # fmt: skip
         assert (cloud.frame_id, cloud.point_stride) == ("velo", 16)
         np.testing.assert_array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 4), told.cloud)
-        transforms = viewer.next_on(topics.TRANSFORMS).transforms
+        transforms = viewer.next_on(topics.TRANSFORMS_TOPIC).transforms
         assert [(one.parent_frame_id, one.child_frame_id) for one in transforms] == [
             ("velo", "cam_served"), ("velo", "cam_nominal"),
         ]  # fmt: skip
-        for one, T_camera_lidar in zip(transforms, (MOVED, NOMINAL), strict=True):
+        for one, T_camera_lidar in zip(transforms, (BOARD_MOVED, BOARD_NOMINAL), strict=True):
             place, turn = one.translation, one.rotation
             R = se3.rotation_from_quaternion_xyzw(np.array([turn.x, turn.y, turn.z, turn.w]))
             T_lidar_camera = se3.transform_from(R, np.array([place.x, place.y, place.z]))
             np.testing.assert_allclose(T_lidar_camera @ T_camera_lidar, np.eye(4), atol=1e-12)
-        calibration = viewer.next_on(topics.CALIBRATION)
+        calibration = viewer.next_on(topics.CALIBRATION_TOPIC)
         camera = rig.camera
         assert (calibration.distortion_model, calibration.width, calibration.height) == ("kannala_brandt", 640, 400)
         assert list(calibration.K) == [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
@@ -121,11 +131,11 @@ def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: Screen) ->
 def test_intrinsics_of_a_lens_that_viewers_do_not_know_are_those_of_one_that_they_know() -> None:
     """To a hundredth of a pixel all over the image, in OpenCV's fisheye model, which `kannala_brandt` names."""
     told, rig = picture("double_sphere")
-    screen = Screen(HOST, 0, "coec test", rig.camera)
+    screen = ViewerServer(HOST, 0, "coec test", rig.camera)
     try:
         with Viewer(screen.url) as viewer:
-            shown_to(viewer, screen, told, topics.CALIBRATION)
-            calibration = viewer.next_on(topics.CALIBRATION)
+            shown_to(viewer, screen, told, topics.CALIBRATION_TOPIC)
+            calibration = viewer.next_on(topics.CALIBRATION_TOPIC)
     finally:
         screen.close()
     assert calibration.distortion_model == "kannala_brandt"
@@ -142,49 +152,49 @@ def test_intrinsics_that_viewers_cannot_have_are_no_topic() -> None:
     odd = build(
         "mei", width=640, height=400, fx=150.0, fy=150.0, cx=320.0, cy=200.0, xi=1.0, k1=4.0, k2=-9.0, p1=0.2, p2=0.0
     )
-    assert counterpart_of(odd) is None
-    screen = Screen(HOST, 0, "coec test", odd)
+    assert viewer_camera(odd) is None
+    screen = ViewerServer(HOST, 0, "coec test", odd)
     try:
         with Viewer(screen.url) as viewer:
-            shown_to(viewer, screen, replace(told, rig=replace(rig, camera=odd)), topics.IMAGE)
-            viewer.next_on(topics.IMAGE)
-            assert set(viewer.channels) == set(topics_for(odd)) == set(TOPICS) - {topics.CALIBRATION}
+            shown_to(viewer, screen, replace(told, rig=replace(rig, camera=odd)), topics.IMAGE_TOPIC)
+            viewer.next_on(topics.IMAGE_TOPIC)
+            assert set(viewer.channels) == set(topics_for(odd)) == set(TOPIC_DESCRIPTIONS) - {topics.CALIBRATION_TOPIC}
     finally:
         screen.close()
 
 
-def test_the_timeline_arrives_with_its_schema_and_remarks_with_their_level(screen: Screen) -> None:
+def test_the_timeline_arrives_with_its_schema_and_remarks_with_their_level(screen: ViewerServer) -> None:
     with Viewer(screen.url) as viewer:
-        viewer.subscribe([topics.HEALTH, topics.LOG])
-        wait_until(lambda: len(screen.wanted) == 2, "subscriptions")
-        screen.tell(FULL)
-        screen.remark(2, "It has moved.", "front")
-        assert viewer.next_on(topics.HEALTH) == FULL.document()
-        channel = viewer.channels[topics.HEALTH]
+        viewer.subscribe([topics.HEALTH_TOPIC, topics.LOG_TOPIC])
+        wait_until(lambda: len(screen.requested_topics) == 2, "subscriptions")
+        screen.send_entry(FULL)
+        screen.send_log(2, "It has moved.", "front")
+        assert viewer.next_on(topics.HEALTH_TOPIC) == FULL.document()
+        channel = viewer.channels[topics.HEALTH_TOPIC]
         assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
-        assert json.loads(channel["schema"]) == schema()
-        remark = viewer.next_on(topics.LOG)
+        assert json.loads(channel["schema"]) == timeline_schema()
+        remark = viewer.next_on(topics.LOG_TOPIC)
         assert (remark.message, remark.name, remark.level) == ("It has moved.", "front", 4)
-        assert set(viewer.channels) == set(TOPICS)
+        assert set(viewer.channels) == set(TOPIC_DESCRIPTIONS)
         assert viewer.info["capabilities"] == [], "viewers change nothing"
 
 
-def test_what_nobody_looks_at_is_known(screen: Screen) -> None:
-    assert screen.wanted == frozenset()
+def test_what_nobody_looks_at_is_known(screen: ViewerServer) -> None:
+    assert screen.requested_topics == frozenset()
     with Viewer(screen.url) as viewer:
-        viewer.subscribe([topics.IMAGE])
-        wait_until(lambda: screen.wanted == {topics.IMAGE}, "one subscription")
-    wait_until(lambda: screen.wanted == frozenset(), "its end with the viewer's")
+        viewer.subscribe([topics.IMAGE_TOPIC])
+        wait_until(lambda: screen.requested_topics == {topics.IMAGE_TOPIC}, "one subscription")
+    wait_until(lambda: screen.requested_topics == frozenset(), "its end with the viewer's")
 
 
-def test_a_port_that_is_taken_is_said_and_may_be_free_later(screen: Screen) -> None:
+def test_a_port_that_is_taken_is_said_and_may_be_free_later(screen: ViewerServer) -> None:
     port = int(screen.url.rpartition(":")[2])
     with pytest.raises(UnavailableError, match=f"{HOST}:{port}: Address already in use"):
-        Screen(HOST, port, "another", LENSES["pinhole"])
+        ViewerServer(HOST, port, "another", BOARD_LENSES["pinhole"])
 
 
 def test_an_address_of_the_sixth_version_is_written_in_brackets() -> None:
-    screen = Screen("::1", 0, "coec test", LENSES["pinhole"])
+    screen = ViewerServer("::1", 0, "coec test", BOARD_LENSES["pinhole"])
     try:
         assert screen.url.startswith("ws://[::1]:")
     finally:
@@ -195,7 +205,7 @@ def test_an_address_of_the_sixth_version_is_written_in_brackets() -> None:
     "a viewer who reads nothing",
     "others see everything at once; what is kept for that viewer is bounded",
 )
-def test_who_does_not_read_costs_nothing(screen: Screen, record_property: Record) -> None:
+def test_who_does_not_read_costs_nothing(screen: ViewerServer, record_property: Record) -> None:
     told, _ = picture()
     noise = np.frombuffer(np.random.default_rng(1).bytes(640 * 400 * 3), np.uint8).reshape(400, 640, 3)
     large = replace(told, image=probe(encode_png(noise), LimitsConfig()), marks={}, cloud=None)
@@ -203,14 +213,14 @@ def test_who_does_not_read_costs_nothing(screen: Screen, record_property: Record
     assert len(large.image.data) > NOISY_BYTES
     process = psutil.Process(os.getpid())
     with Viewer(screen.url) as deaf, Viewer(screen.url) as other:
-        deaf.subscribe([topics.IMAGE])
-        wait_until(lambda: topics.IMAGE in screen.wanted, "his subscription")
-        other.subscribe([topics.IMAGE, topics.HEALTH])
-        wait_until(lambda: topics.HEALTH in screen.wanted, "the other's")
+        deaf.subscribe([topics.IMAGE_TOPIC])
+        wait_until(lambda: topics.IMAGE_TOPIC in screen.requested_topics, "his subscription")
+        other.subscribe([topics.IMAGE_TOPIC, topics.HEALTH_TOPIC])
+        wait_until(lambda: topics.HEALTH_TOPIC in screen.requested_topics, "the other's")
         before = process.memory_info().rss
         for number in range(PICTURES_SENT):
-            screen.show(replace(large, stamp_ns=number))
-            assert stamp_ns(other.next_on(topics.IMAGE)) == number
+            screen.send_picture(replace(large, stamp_ns=number))
+            assert stamp_ns(other.next_on(topics.IMAGE_TOPIC)) == number
         grown_mb = (process.memory_info().rss - before) / 1e6
     assert grown_mb < KEPT_MB < PICTURES_SENT * NOISY_BYTES / 1e6
     record_property("figure", f"{grown_mb:.0f} MB of {PICTURES_SENT * len(large.image.data) / 1e6:.0f} MB shown")
@@ -227,14 +237,14 @@ NONSENSE = (
 
 @pytest.mark.fault("a viewer who talks nonsense", "others see everything, and nothing is changed or handed out")
 @pytest.mark.parametrize("code", [TEXT, BINARY])
-def test_nonsense_is_of_no_consequence(screen: Screen, code: int) -> None:
+def test_nonsense_is_of_no_consequence(screen: ViewerServer, code: int) -> None:
     told, _ = picture()
     with Viewer(screen.url) as other:
-        other.subscribe([topics.IMAGE])
+        other.subscribe([topics.IMAGE_TOPIC])
         for nonsense in NONSENSE:
             with Viewer(screen.url) as fool, suppress(OSError):
-                fool.say(nonsense, code)
-        wait_until(lambda: screen.wanted == {topics.IMAGE}, "the other's subscription")
-        screen.show(told)
-        assert stamp_ns(other.next_on(topics.IMAGE)) == told.stamp_ns
-        assert set(other.channels) == set(TOPICS)
+                fool.send(nonsense, code)
+        wait_until(lambda: screen.requested_topics == {topics.IMAGE_TOPIC}, "the other's subscription")
+        screen.send_picture(told)
+        assert stamp_ns(other.next_on(topics.IMAGE_TOPIC)) == told.stamp_ns
+        assert set(other.channels) == set(TOPIC_DESCRIPTIONS)

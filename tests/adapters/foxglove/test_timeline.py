@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from coec.adapters.foxglove.timeline import Ages, Axes, Figure, Missed, Moment, schema
+from coec.adapters.foxglove.timeline import (
+    MissedFrames,
+    PoseAxes,
+    StreamAges,
+    TimelineEntry,
+    TimelineFigure,
+    timeline_schema,
+)
 
-FULL = Moment(
+FULL = TimelineEntry(
     pair="front",
     state="suspect",
     level=1,
@@ -17,16 +24,16 @@ FULL = Moment(
     status="accepted",
     percent_complete=40.0,
     candidate=True,
-    ages=Ages(camera_s=0.1, lidar_s=0.1, ego_s=0.1, answer_s=0.5),
+    ages=StreamAges(camera_s=0.1, lidar_s=0.1, ego_s=0.1, answer_s=0.5),
     pair_rate_hz=10.0,
     sync_error_s=0.01,
-    correction=Axes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
-    sigma=Axes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
-    step=Axes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
-    figures=(Figure(name="mi", value=0.5, limit=0.1, passed=True),),
-    not_shown=(Missed(stream="camera", cause="frame_id", count=3),),
+    correction=PoseAxes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
+    sigma=PoseAxes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
+    step=PoseAxes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
+    figures=(TimelineFigure(name="mi", value=0.5, limit=0.1, passed=True),),
+    not_shown=(MissedFrames(stream="camera", cause="frame_id", count=3),),
 )
-BARE = Moment(pair="front", state="not_served", level=3, why="Nobody serves the pair.")
+BARE = TimelineEntry(pair="front", state="not_served", level=3, why="Nobody serves the pair.")
 
 
 def fits(value: Any, node: dict[str, Any]) -> bool:
@@ -48,13 +55,13 @@ def fits(value: Any, node: dict[str, Any]) -> bool:
 
 def test_what_is_told_fits_the_schema_that_is_advertised() -> None:
     told = FULL.document()
-    assert fits(told, schema())
-    assert set(told) == set(schema()["properties"]), "every field was tried"
-    assert not fits({**told, "state": None}, schema())
+    assert fits(told, timeline_schema())
+    assert set(told) == set(timeline_schema()["properties"]), "every field was tried"
+    assert not fits({**told, "state": None}, timeline_schema())
 
 
 def test_what_is_not_known_is_left_out() -> None:
     told = BARE.document()
-    assert fits(told, schema())
+    assert fits(told, timeline_schema())
     assert told["ages"] == {} == told["correction"]
     assert "provenance" not in told

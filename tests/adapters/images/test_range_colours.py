@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from coec.adapters.images.range_colours import WHOLE, RangeScale, kept_or, scale_of
+from coec.adapters.images.range_colours import WHOLE_SCALE, RangeScale, scale_of, stable_scale
 
 VISION = {
     "usual": np.eye(3),
@@ -25,7 +25,7 @@ VISION = {
 
 @pytest.mark.parametrize("kind", VISION)
 def test_ranges_a_quarter_of_the_scale_apart_differ_for_every_eye(kind: str) -> None:
-    rgb = WHOLE.colours_bgr(WHOLE.range_at(np.linspace(0.0, 1.0, 33)))[:, ::-1] / 255
+    rgb = WHOLE_SCALE.colours_bgr(WHOLE_SCALE.range_at(np.linspace(0.0, 1.0, 33)))[:, ::-1] / 255
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     seen = np.clip(linear @ VISION[kind].T, 0.0, 1.0)
     shown = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
@@ -49,17 +49,17 @@ def test_a_few_strays_and_the_vehicle_itself_move_no_end() -> None:
 def test_a_wall_is_no_rainbow_and_nothing_has_a_scale_too() -> None:
     wall = scale_of(np.random.default_rng(1).normal(7.0, 0.02, 1000))
     assert wall.furthest_m / wall.nearest_m >= 4.0
-    assert scale_of(np.zeros(0)) == scale_of(np.full(3, 0.5)) == WHOLE
+    assert scale_of(np.zeros(0)) == scale_of(np.full(3, 0.5)) == WHOLE_SCALE
 
 
 def test_a_stream_keeps_its_colours_until_the_scene_is_another() -> None:
     """About a limit between two steps the scale does not go to and fro."""
     scale, seen = None, set()
     for furthest_m in (49.0, 51.0, 49.5, 50.5, 48.0, 52.0):
-        scale = kept_or(scale, scale_of(np.linspace(5.5, furthest_m, 2000) / 0.98))
+        scale = stable_scale(scale, scale_of(np.linspace(5.5, furthest_m, 2000) / 0.98))
         seen.add(scale)
     assert len(seen) == 1
-    assert kept_or(scale, scale_of(np.linspace(2.4, 9.0, 500))) == RangeScale(2.0, 10.0)
+    assert stable_scale(scale, scale_of(np.linspace(2.4, 9.0, 500))) == RangeScale(2.0, 10.0)
 
 
 def test_beyond_the_ends_colours_are_those_of_the_ends() -> None:

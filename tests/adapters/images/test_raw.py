@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.adapters.images.codec import (
-    Compressed,
+    CompressingReducer,
     Inspector,
     decode_bgr,
     decode_grey_reduced,
@@ -174,7 +174,7 @@ def test_raw_pixels_become_grey_jpeg_of_the_same_size(form: ImageFormat) -> None
     flat = np.full(W * H * BYTES_PER_PIXEL[form], 90, np.uint8)
     some_depth = EncodedImage(ImageFormat.PNG, 1, 1, b"not looked at")
     frame = CameraFrame(7, "camera", raw_image(form, W, H, flat.tobytes(), LIMITS), 3, some_depth)
-    small = Compressed(LIMITS).reduced(frame)
+    small = CompressingReducer(LIMITS).reduced(frame)
     assert (small.stamp_ns, small.frame_id, small.sequence, small.depth) == (7, "camera", 3, None)
     assert small.image == probe(small.image.data, LIMITS)
     np.testing.assert_allclose(grey_of(small.image, LIMITS), grey_of(frame.image, LIMITS), atol=2)
@@ -182,10 +182,12 @@ def test_raw_pixels_become_grey_jpeg_of_the_same_size(form: ImageFormat) -> None
 
 def test_what_came_compressed_stays_to_the_byte() -> None:
     image = probe(encode_jpeg(colours()), LIMITS)
-    assert Compressed(LIMITS).reduced(CameraFrame(7, "camera", image, depth=image)) == CameraFrame(7, "camera", image)
+    assert CompressingReducer(LIMITS).reduced(CameraFrame(7, "camera", image, depth=image)) == CameraFrame(
+        7, "camera", image
+    )
 
 
 def test_raw_pixels_of_another_size_cannot_be_compressed() -> None:
     image = EncodedImage(ImageFormat.MONO8, W, H, bytes(W * H - 1))
     with pytest.raises(DecodeError, match="pixels are"):
-        Compressed(LIMITS).reduced(CameraFrame(7, "camera", image))
+        CompressingReducer(LIMITS).reduced(CameraFrame(7, "camera", image))

@@ -20,7 +20,7 @@ import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from coec.adapters.mcap.files import McapDamaged, read_records
+from coec.adapters.mcap.files import McapDamagedError, read_records
 from coec.adapters.mcap.windows import (
     PART_SUFFIX,
     RecordedWindow,
@@ -46,7 +46,7 @@ from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import RecordingError, WindowError
 from coec.geometry import cameras, se3
 from coec.schemas.replies import CalibrationResult, MetricReply, MovedWithin, Reason, Transform, Verdict
-from readers import opened
+from readers import read_recording
 
 WIDTH, HEIGHT = 64, 48
 START_NS = 1_600_000_000_123_456_789
@@ -235,7 +235,7 @@ def kept_window(path: Path, from_pair: int, points: int = 300) -> WindowWriter:
     for index in (2, 3):
         writer.add(a_pair(index, points=points))
     since_ns = a_pair(from_pair).stamp_ns
-    writer.note_kept(earlier.window_id, since_ns)
+    writer.note_carried_over(earlier.window_id, since_ns)
     for pair in pairs_since(earlier.path, since_ns):
         writer.add(pair)
     return writer
@@ -426,7 +426,7 @@ def test_every_channel_opens_in_rosbags_and_mcap_ros2(tmp_path: Path, raw: bool)
     a_window(path, pairs, packed=True)
     overlay = cv2.imencode(".jpg", np.zeros((HEIGHT, WIDTH, 3), np.uint8))[1].tobytes()
     write_result(path, a_result(), overlay)
-    window = opened(path)
+    window = read_recording(path)
     image = "/coec/front/camera/image" if raw else "/coec/front/camera/image/compressed"
     expected = {topic: kind for topic, kind in EXPECTED_TYPES.items() if "camera/image" not in topic}
     assert window.types == {**expected, image: f"sensor_msgs/msg/{'Image' if raw else 'CompressedImage'}"}
@@ -453,14 +453,14 @@ def test_clouds_and_raw_images_are_packed_where_it_is_asked_for_and_nothing_else
     flat = [replace(pair, lidar=replace(pair.lidar, xyz_m=np.ones((300, 3), np.float32))) for pair in (a_pair(0),)]
     plain = a_window(tmp_path / "plain.mcap", flat)
     packed = a_window(tmp_path / "packed.mcap", flat, packed=True)
-    assert opened(plain.path).packed == set()
-    assert opened(packed.path).packed == {"/coec/front/lidar/points"}
+    assert read_recording(plain.path).packed == set()
+    assert read_recording(packed.path).packed == {"/coec/front/lidar/points"}
     assert packed.bytes < plain.bytes
     assert_same_pair(read_window(packed.path)[0].pairs[0], flat[0])
     write_result(packed.path, a_result())
-    assert "/coec/front/lidar/points" in opened(packed.path).packed, "with its result it is packed as before"
+    assert "/coec/front/lidar/points" in read_recording(packed.path).packed, "with its result it is packed as before"
     raw = a_window(tmp_path / "raw.mcap", [replace(flat[0], camera=replace(flat[0].camera, image=BLACK))], packed=True)
-    assert opened(raw.path).packed == {"/coec/front/lidar/points", "/coec/front/camera/image"}
+    assert read_recording(raw.path).packed == {"/coec/front/lidar/points", "/coec/front/camera/image"}
 
 
 def test_the_picture_of_a_result_is_no_image_of_the_camera(tmp_path: Path) -> None:
@@ -471,7 +471,7 @@ def test_the_picture_of_a_result_is_no_image_of_the_camera(tmp_path: Path) -> No
     after, _ = read_window(path)
     for got, expected in zip(after.pairs, before.pairs, strict=True):
         assert_same_pair(got, expected)
-    assert opened(path).counts["/coec/front/overlay"] == 1
+    assert read_recording(path).counts["/coec/front/overlay"] == 1
 
 
 @pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.ZSTD, CompressionType.NONE])
@@ -620,7 +620,7 @@ def test_many_chunks_that_are_small_by_themselves_are_refused_together(tmp_path:
 def test_lengths_that_lie_are_refused(tmp_path: Path, record: bytes, complaint: str) -> None:
     path = tmp_path / "lie.mcap"
     path.write_bytes(mcap_of(record))
-    with path.open("rb") as stream, pytest.raises(McapDamaged, match=complaint):
+    with path.open("rb") as stream, pytest.raises(McapDamagedError, match=complaint):
         list(read_records(stream))
 
 

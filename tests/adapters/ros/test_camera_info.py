@@ -10,7 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.adapters.files.rig import camera_of
-from coec.adapters.ros.camera_info import MAX_INFO_BYTES, Info, decode_info, info_topic, is_rectified, lens_of
+from coec.adapters.ros.camera_info import (
+    MAX_INFO_BYTES,
+    CameraInfoContent,
+    decode_info,
+    info_topic,
+    intrinsics_of_info,
+    is_rectified,
+)
 from coec.errors import DecodeError, SourceError
 from coec.geometry import cameras
 from coec.geometry.projection import project
@@ -22,7 +29,7 @@ EYE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 RATIONAL = (0.5136, -2.6795, 0.000838, -0.000085, 1.5490, 0.3928, -2.5068, 1.4778)
 
 
-def info(**changes: Any) -> Info:
+def info(**changes: Any) -> CameraInfoContent:
     given: dict[str, Any] = {
         "frame_id": "optical",
         "size": (640, 480),
@@ -34,7 +41,7 @@ def info(**changes: Any) -> Info:
         "binning": (1, 1),
         "roi": (0, 0, 0, 0),
     }
-    return Info(**given | changes)
+    return CameraInfoContent(**given | changes)
 
 
 def packed(*, d: tuple[float, ...] = (), claimed: int | None = None, model: str = "plumb_bob", **of: Any) -> bytes:
@@ -44,8 +51,8 @@ def packed(*, d: tuple[float, ...] = (), claimed: int | None = None, model: str 
     return packer.put("I", *of.get("binning", (0, 0)), *of.get("roi", (0, 0, 0, 0))).put("?", False).done()
 
 
-def camera(told: Info, *, rectified: bool = False) -> cameras.Camera:
-    return camera_of(lens_of(told, rectified=rectified).intrinsics)
+def camera(told: CameraInfoContent, *, rectified: bool = False) -> cameras.Camera:
+    return camera_of(intrinsics_of_info(told, rectified=rectified).intrinsics)
 
 
 def rays() -> NDArray[np.float64]:
@@ -53,7 +60,7 @@ def rays() -> NDArray[np.float64]:
     return np.column_stack([rng.uniform(-0.5, 0.5, (200, 2)), np.ones(200)]) * rng.uniform(1.0, 30.0, (200, 1))
 
 
-def by_opencv(told: Info, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def by_opencv(told: CameraInfoContent, points: NDArray[np.float64]) -> NDArray[np.float64]:
     matrix, zero = np.reshape(told.k, (3, 3)), np.zeros(3)
     return np.asarray(cv2.projectPoints(points[:, None], zero, zero, matrix, np.array(told.d))[0][:, 0])
 
@@ -80,7 +87,7 @@ def test_a_message_is_read_as_it_was_packed() -> None:
 )
 def test_polynomials_project_as_opencv_does(model: str, d: tuple[float, ...], name: str) -> None:
     told = info(model=model, d=d)
-    assert lens_of(told, rectified=False).intrinsics.model == name
+    assert intrinsics_of_info(told, rectified=False).intrinsics.model == name
     uv_px, valid = project(camera(told), rays())
     assert valid.all()
     np.testing.assert_allclose(uv_px, by_opencv(told, rays()), rtol=0, atol=1e-9)
@@ -107,7 +114,7 @@ def test_a_rectified_image_has_no_distortion_whatever_the_lens() -> None:
     told = info(model="equidistant", d=(0.1, 0.2, 0.3, 0.4))
     expected = cameras.build("pinhole", width=640, height=480, fx=480.0, fy=481.0, cx=321.0, cy=238.0)
     assert camera(told, rectified=True) == expected
-    assert "rectified" in lens_of(told, rectified=True).told
+    assert "rectified" in intrinsics_of_info(told, rectified=True).source
 
 
 def test_a_region_is_cut_out_and_then_binned() -> None:
@@ -122,9 +129,9 @@ def test_a_region_is_cut_out_and_then_binned() -> None:
 
 def test_a_turn_that_is_not_applied_is_said() -> None:
     turned = cv2.Rodrigues(np.radians([0.0, 1.0, 0.0]))[0].reshape(-1).tolist()
-    assert "1.00 deg" in lens_of(info(r=tuple(turned)), rectified=False).told
-    assert "deg" not in lens_of(info(), rectified=False).told
-    assert "deg" not in lens_of(info(r=(0.0,) * 9), rectified=False).told
+    assert "1.00 deg" in intrinsics_of_info(info(r=tuple(turned)), rectified=False).source
+    assert "deg" not in intrinsics_of_info(info(), rectified=False).source
+    assert "deg" not in intrinsics_of_info(info(r=(0.0,) * 9), rectified=False).source
 
 
 @pytest.mark.parametrize(
@@ -149,7 +156,7 @@ def test_a_turn_that_is_not_applied_is_said() -> None:
 )
 def test_what_is_no_calibration_is_refused_by_name(changes: dict[str, Any], rectified: bool, complaint: str) -> None:
     with pytest.raises(SourceError, match=complaint):
-        lens_of(info(**changes), rectified=rectified)
+        intrinsics_of_info(info(**changes), rectified=rectified)
 
 
 @pytest.mark.fault("a CameraInfo with a million coefficients, cut off or of strange names", "refused with a cause")

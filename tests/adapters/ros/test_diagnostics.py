@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from coec.adapters.ros.diagnostics import (
     MAX_MESSAGE,
     SENSOR_LEVELS,
-    Level,
-    Service,
+    DiagnosticLevel,
+    ServicePhase,
     level_of,
-    of_health,
-    of_sensor,
+    status_of_health,
+    status_of_sensor,
 )
 from coec.schemas.replies import (
-    STUCK,
+    SERVICE_STUCK,
     Axes,
     AxisReply,
     DataQuality,
@@ -28,12 +28,12 @@ from coec.schemas.replies import (
     Reason,
 )
 from coec.schemas.rig_state import SensorState
-from rig_replies import moved_lidar, sensor
+from rig_replies import moved_lidar_sensor, sensor_reply
 
 STATES = st.sampled_from(get_args(HealthState))
-SERVICES: st.SearchStrategy[Service] = st.sampled_from(get_args(Service))
+SERVICES: st.SearchStrategy[ServicePhase] = st.sampled_from(get_args(ServicePhase))
 REASONS = st.lists(
-    st.builds(Reason, code=st.sampled_from([STUCK, "thread_died", "mount_moved"]), text=st.text(max_size=600)),
+    st.builds(Reason, code=st.sampled_from([SERVICE_STUCK, "thread_died", "mount_moved"]), text=st.text(max_size=600)),
     max_size=3,
 ).map(tuple)
 AXIS = AxisReply(status="accepted", sigma=0.02, correction=-0.5, unit="deg")
@@ -65,38 +65,38 @@ def health(state: HealthState, reasons: tuple[Reason, ...] = ()) -> HealthReply:
 @pytest.mark.parametrize(
     ("state", "level"),
     [
-        ("healthy", Level.OK),
-        ("suspect", Level.WARN),
-        ("degraded", Level.WARN),
-        ("miscalibrated", Level.ERROR),
-        ("unknown", Level.STALE),
-        ("stale", Level.STALE),
+        ("healthy", DiagnosticLevel.OK),
+        ("suspect", DiagnosticLevel.WARN),
+        ("degraded", DiagnosticLevel.WARN),
+        ("miscalibrated", DiagnosticLevel.ERROR),
+        ("unknown", DiagnosticLevel.STALE),
+        ("stale", DiagnosticLevel.STALE),
     ],
 )
-def test_a_running_service_says_the_level_of_the_state(state: HealthState, level: Level) -> None:
+def test_a_running_service_says_the_level_of_the_state(state: HealthState, level: DiagnosticLevel) -> None:
     assert level_of(health(state), "running") is level
 
 
 @given(state=STATES, service=SERVICES, reasons=REASONS)
 def test_ok_is_said_of_nothing_but_what_was_looked_at(
-    state: HealthState, service: Service, reasons: tuple[Reason, ...]
+    state: HealthState, service: ServicePhase, reasons: tuple[Reason, ...]
 ) -> None:
     told = health(state, reasons)
     level = level_of(told, service)
-    renewed = all(reason.code != STUCK for reason in reasons)
+    renewed = all(reason.code != SERVICE_STUCK for reason in reasons)
 
-    assert (level is Level.OK) == (state == "healthy" and renewed and service in ("starting", "running"))
+    assert (level is DiagnosticLevel.OK) == (state == "healthy" and renewed and service in ("starting", "running"))
     if service == "stopping" or not renewed:
-        assert level is Level.STALE
+        assert level is DiagnosticLevel.STALE
     elif service == "failing":
-        assert level >= Level.ERROR
+        assert level >= DiagnosticLevel.ERROR
 
 
 @given(state=STATES, service=SERVICES, reasons=REASONS)
 def test_the_sentence_is_short_and_begins_with_the_state(
-    state: HealthState, service: Service, reasons: tuple[Reason, ...]
+    state: HealthState, service: ServicePhase, reasons: tuple[Reason, ...]
 ) -> None:
-    status = of_health(health(state, reasons), service, None, {})
+    status = status_of_health(health(state, reasons), service, None, {})
     assert status.message.startswith(state)
     assert len(status.message) <= MAX_MESSAGE
     assert (service in status.message) or service in ("starting", "running")
@@ -104,7 +104,7 @@ def test_the_sentence_is_short_and_begins_with_the_state(
 
 def test_every_figure_is_told_with_its_limit() -> None:
     moved = Reason(code="mount_moved", text="The mount has moved.")
-    status = of_health(health("miscalibrated", (moved,)), "running", "SN-12", {"tf": "not published: nominal"})
+    status = status_of_health(health("miscalibrated", (moved,)), "running", "SN-12", {"tf": "not published: nominal"})
 
     assert (status.name, status.hardware_id) == ("coec: front_calibration", "SN-12")
     assert status.message == "miscalibrated: The mount has moved."
@@ -130,21 +130,23 @@ def test_every_figure_is_told_with_its_limit() -> None:
 
 
 def test_without_a_serial_number_the_hardware_is_the_pair_of_the_vehicle() -> None:
-    assert of_health(health("healthy"), "running", None, {}).hardware_id == "shuttle-7/front"
+    assert status_of_health(health("healthy"), "running", None, {}).hardware_id == "shuttle-7/front"
 
 
 @pytest.mark.parametrize("state", get_args(SensorState))
 def test_a_sensor_is_ok_only_where_it_was_looked_at_and_fits(state: SensorState) -> None:
-    told = of_sensor(sensor("roof", "lidar", state), "shuttle-7", "running")
-    assert (told.level is Level.OK) == (state == "calibrated")
-    assert (told.level is Level.ERROR) == state.endswith("_moved")
+    told = status_of_sensor(sensor_reply("roof", "lidar", state), "shuttle-7", "running")
+    assert (told.level is DiagnosticLevel.OK) == (state == "calibrated")
+    assert (told.level is DiagnosticLevel.ERROR) == state.endswith("_moved")
     assert told.level is SENSOR_LEVELS[state]
-    assert of_sensor(sensor("roof", "lidar", state), "shuttle-7", "stopping").level is Level.STALE
+    assert (
+        status_of_sensor(sensor_reply("roof", "lidar", state), "shuttle-7", "stopping").level is DiagnosticLevel.STALE
+    )
     assert told.hardware_id == "shuttle-7/roof"
 
 
 def test_a_sensor_that_moved_says_by_how_much_and_in_which_pairs() -> None:
-    told = of_sensor(moved_lidar(), "shuttle-7", "running")
+    told = status_of_sensor(moved_lidar_sensor(), "shuttle-7", "running")
     assert told.message == "lidar_moved: It moved by 1.00°: seen by front, left; all else fits (99.8 %)."
     assert told.values["pairs"] == "front, left"
     assert told.values["probability of a move"] == "0.998"
@@ -153,11 +155,16 @@ def test_a_sensor_that_moved_says_by_how_much_and_in_which_pairs() -> None:
 
 
 def test_of_a_sensor_that_nobody_looked_at_nothing_is_made_up() -> None:
-    told = of_sensor(sensor("roof", "lidar", "unknown", probability=None, since_ns=None), "shuttle-7", "running")
+    told = status_of_sensor(
+        sensor_reply("roof", "lidar", "unknown", probability=None, since_ns=None), "shuttle-7", "running"
+    )
     assert {"probability of a move", "since_ns", "moved"}.isdisjoint(told.values)
 
 
 @given(text=st.text(max_size=4000))
 def test_a_long_reason_of_a_sensor_stays_within_what_a_message_may_have(text: str) -> None:
     why = (Reason(code="moved", text=text),)
-    assert len(of_sensor(sensor("roof", "lidar", "undecided", reasons=why), "v", "running").message) <= MAX_MESSAGE
+    assert (
+        len(status_of_sensor(sensor_reply("roof", "lidar", "undecided", reasons=why), "v", "running").message)
+        <= MAX_MESSAGE
+    )

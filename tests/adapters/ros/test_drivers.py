@@ -11,9 +11,9 @@ import pytest
 from coec.adapters.ros import incoming, messages
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig
-from ros_messages import CODES, NSEC, SEC, STAMP, cloud
+from ros_messages import CODES, STAMP_NS, STAMP_REST_NS, STAMP_S, cloud
 
-BEGIN_S = SEC + NSEC * 1e-9
+BEGIN_S = STAMP_S + STAMP_REST_NS * 1e-9
 STEPS = np.linspace(0.0, 1.0, 12)
 SWEEP_S = 0.0996
 
@@ -80,7 +80,7 @@ DRIVERS = {
     "livox": Driver(
         (*F4_XYZ, ("intensity", "<f4", 12), ("tag", "u1", 16), ("line", "u1", 17), ("timestamp", "<f8", 18)),
         26,
-        ("timestamp", float(STAMP), STAMP + SWEEP_S * 1e9),
+        ("timestamp", float(STAMP_NS), STAMP_NS + SWEEP_S * 1e9),
         ring="line",
     ),
     # Livox's CustomMsg as several converters make a cloud of it.

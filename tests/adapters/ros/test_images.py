@@ -11,7 +11,7 @@ from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
 from coec.schemas import frames
-from ros_messages import JPEG, compressed, image
+from ros_messages import JPEG, compressed_image, raw_image
 
 LIMITS = LimitsConfig()
 WIDTH, HEIGHT = 6, 4
@@ -34,7 +34,7 @@ def test_every_encoding_with_any_step_in_either_byte_order(encoding: str, paddin
     sent = pixels.view(np.uint16).byteswap().view(np.uint8) if big and deep else pixels
     data = b"".join(line.tobytes() + b"\xaa" * padding for line in sent)
 
-    got = decoded(messages.IMAGE, image(encoding, WIDTH, HEIGHT, row + padding, data, big=big))
+    got = decoded(messages.IMAGE, raw_image(encoding, WIDTH, HEIGHT, row + padding, data, big=big))
 
     assert got == EncodedImage(form, WIDTH, HEIGHT, pixels.tobytes())
     frame = CameraFrame(0, "camera", got)
@@ -44,7 +44,7 @@ def test_every_encoding_with_any_step_in_either_byte_order(encoding: str, paddin
 @pytest.mark.parametrize("encoding", ["32FC1", "rgb16", "nv21", "RGB8", "", "x" * 4000])
 def test_other_encodings_are_refused_and_told_what_is_read(encoding: str) -> None:
     with pytest.raises(DecodeError, match="must be one of mono8, ") as refused:
-        decoded(messages.IMAGE, image(encoding, 2, 2, 8, bytes(16)))
+        decoded(messages.IMAGE, raw_image(encoding, 2, 2, 8, bytes(16)))
 
     assert refused.value.reason == "image_unknown_format"
     assert len(encoding) < 100 or encoding not in str(refused.value)
@@ -55,14 +55,16 @@ def test_other_encodings_are_refused_and_told_what_is_read(encoding: str) -> Non
     ["jpeg", "", "rgb8; jpeg compressed bgr8", "bgr8; jpeg compressed ", "mono8; jpeg compressed mono8", "JPEG", "png"],
 )
 def test_a_jpeg_is_one_whatever_it_is_called(form: str) -> None:
-    assert decoded(messages.COMPRESSED_IMAGE, compressed(form=form)) == EncodedImage(ImageFormat.JPEG, 64, 48, JPEG)
+    assert decoded(messages.COMPRESSED_IMAGE, compressed_image(form=form)) == EncodedImage(
+        ImageFormat.JPEG, 64, 48, JPEG
+    )
 
 
 @pytest.mark.parametrize("form", ["rgb8; png compressed bgr8", "png", "mono16; png compressed "])
 def test_a_png_is_one_whatever_it_is_called(form: str) -> None:
     data = encode_png(np.zeros((5, 7), np.uint8))
 
-    assert decoded(messages.COMPRESSED_IMAGE, compressed(data, form)) == EncodedImage(ImageFormat.PNG, 7, 5, data)
+    assert decoded(messages.COMPRESSED_IMAGE, compressed_image(data, form)) == EncodedImage(ImageFormat.PNG, 7, 5, data)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +79,7 @@ def test_a_png_is_one_whatever_it_is_called(form: str) -> None:
 )
 def test_what_is_no_picture_is_refused_by_name(data: bytes, form: str, named: str) -> None:
     with pytest.raises(DecodeError, match=named) as refused:
-        decoded(messages.COMPRESSED_IMAGE, compressed(data, form))
+        decoded(messages.COMPRESSED_IMAGE, compressed_image(data, form))
 
     assert refused.value.reason == "image_unknown_format"
 

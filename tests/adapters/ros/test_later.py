@@ -18,10 +18,10 @@ from coec.adapters.ros.topics import TopicMessage
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from ros_messages import SEC, STAMP, packed
+from ros_messages import STAMP_NS, STAMP_S, packed_cloud
 
 LATER_NS = 86_400 * 10**9 + 900_000_000
-LATER_S, LATER_NSEC = divmod(STAMP + LATER_NS, 10**9)
+LATER_S, LATER_NSEC = divmod(STAMP_NS + LATER_NS, 10**9)
 XYZ = [("x", "<f4", [1.0, 2.0]), ("y", "<f4", [0.0, 0.0]), ("z", "<f4", [0.0, 0.0])]
 
 
@@ -33,7 +33,11 @@ def later(type_name: str, data: bytes, shift_ns: int = LATER_NS) -> bytes:
 
 @pytest.mark.parametrize(
     ("type_name", "data"),
-    [(COMPRESSED_IMAGE, ros_messages.compressed()), (ODOMETRY, ros_messages.odometry()), (POINT_CLOUD, packed(XYZ))],
+    [
+        (COMPRESSED_IMAGE, ros_messages.compressed_image()),
+        (ODOMETRY, ros_messages.odometry()),
+        (POINT_CLOUD, packed_cloud(XYZ)),
+    ],
 )
 def test_of_a_message_with_a_header_eight_bytes_change(type_name: str, data: bytes) -> None:
     assert later(type_name, data) == data[:4] + struct.pack("<iI", LATER_S, LATER_NSEC) + data[12:]
@@ -41,8 +45,8 @@ def test_of_a_message_with_a_header_eight_bytes_change(type_name: str, data: byt
 
 
 def test_the_order_of_the_bytes_stays() -> None:
-    data = b"\x00\x00\x00\x00" + struct.pack(">iI", SEC, 5) + b"rest"
-    assert later(COMPRESSED_IMAGE, data, 10**9) == b"\x00\x00\x00\x00" + struct.pack(">iI", SEC + 1, 5) + b"rest"
+    data = b"\x00\x00\x00\x00" + struct.pack(">iI", STAMP_S, 5) + b"rest"
+    assert later(COMPRESSED_IMAGE, data, 10**9) == b"\x00\x00\x00\x00" + struct.pack(">iI", STAMP_S + 1, 5) + b"rest"
 
 
 def test_every_transform_is_later() -> None:
@@ -54,23 +58,23 @@ def test_every_transform_is_later() -> None:
 
 @pytest.mark.parametrize("unit_s", [1.0, 1e-9])
 def test_points_that_carry_a_clocks_time_move_with_their_stamp(unit_s: float) -> None:
-    times = [(STAMP * 1e-9 + 0.01) / unit_s, (STAMP * 1e-9 + 0.05) / unit_s]
-    data = packed([*XYZ, ("timestamp", "<f8", times)])
+    times = [(STAMP_NS * 1e-9 + 0.01) / unit_s, (STAMP_NS * 1e-9 + 0.05) / unit_s]
+    data = packed_cloud([*XYZ, ("timestamp", "<f8", times)])
     frame = decode(POINT_CLOUD, later(POINT_CLOUD, data), LimitsConfig())
     assert isinstance(frame, LidarFrame)
-    assert frame.stamp_ns == STAMP + LATER_NS
+    assert frame.stamp_ns == STAMP_NS + LATER_NS
     assert frame.time_offset_s is not None
     np.testing.assert_allclose(frame.time_offset_s, [0.01, 0.05], atol=1e-5)
 
 
 @pytest.mark.parametrize("unit_s", [1.0, 1e-9])
 def test_points_whose_cloud_has_no_stamp_move_alone(unit_s: float) -> None:
-    times = [(STAMP * 1e-9) / unit_s, (STAMP * 1e-9 + 0.04) / unit_s]
-    data = later(POINT_CLOUD, packed([*XYZ, ("timestamp", "<f8", times)], sec=0, nsec=0))
+    times = [(STAMP_NS * 1e-9) / unit_s, (STAMP_NS * 1e-9 + 0.04) / unit_s]
+    data = later(POINT_CLOUD, packed_cloud([*XYZ, ("timestamp", "<f8", times)], sec=0, nsec=0))
     assert data[4:12] == bytes(8)
     frame = decode(POINT_CLOUD, data, LimitsConfig())
     assert isinstance(frame, LidarFrame)
-    assert frame.stamp_ns == pytest.approx(STAMP + LATER_NS, abs=1000)
+    assert frame.stamp_ns == pytest.approx(STAMP_NS + LATER_NS, abs=1000)
 
 
 def test_a_header_without_a_stamp_stays_without() -> None:
@@ -79,7 +83,7 @@ def test_a_header_without_a_stamp_stays_without() -> None:
 
 
 def test_times_since_the_stamp_stay() -> None:
-    data = packed([*XYZ, ("time", "<f8", [0.0, 0.1])])
+    data = packed_cloud([*XYZ, ("time", "<f8", [0.0, 0.1])])
     assert later(POINT_CLOUD, data)[12:] == data[12:]
 
 
@@ -105,7 +109,7 @@ def test_a_message_that_is_none_is_refused(type_name: str, data: bytes) -> None:
         later(type_name, data)
 
 
-@pytest.mark.parametrize("shift_ns", [-STAMP - 1, 2**31 * 10**9])
+@pytest.mark.parametrize("shift_ns", [-STAMP_NS - 1, 2**31 * 10**9])
 def test_no_stamp_leaves_what_ros_can_say(shift_ns: int) -> None:
     with pytest.raises(DecodeError, match="1970"):
         later(ODOMETRY, ros_messages.odometry(), shift_ns)

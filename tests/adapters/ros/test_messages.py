@@ -14,7 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import encode_depth_png, probe
 from coec.adapters.ros import incoming, messages, outgoing
-from coec.adapters.ros.diagnostics import Level, Status
+from coec.adapters.ros.diagnostics import DiagnosticLevel, DiagnosticStatus
 from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.config import LimitsConfig
@@ -22,16 +22,16 @@ from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, build
 from ros_messages import (
     JPEG,
-    NSEC,
-    SEC,
-    STAMP,
+    STAMP_NS,
+    STAMP_REST_NS,
+    STAMP_S,
     Columns,
     cloud,
-    compressed,
-    image,
+    compressed_image,
     imu,
     odometry,
-    packed,
+    packed_cloud,
+    raw_image,
     twist,
     twist_with_covariance,
 )
@@ -43,9 +43,9 @@ NAN = math.nan
 XYZ: Columns = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
 REASONS_OR_NONE = {None, *Refusal}
 MESSAGES = [
-    (messages.COMPRESSED_IMAGE, compressed()),
-    (messages.IMAGE, image("rgb8", 2, 2, 8, bytes(16))),
-    (messages.POINT_CLOUD, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 99_000_000])])),
+    (messages.COMPRESSED_IMAGE, compressed_image()),
+    (messages.IMAGE, raw_image("rgb8", 2, 2, 8, bytes(16))),
+    (messages.POINT_CLOUD, packed_cloud([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 99_000_000])])),
     (messages.ODOMETRY, odometry()),
     (messages.TWIST, twist()),
     (messages.TWIST_WITH_COVARIANCE, twist_with_covariance()),
@@ -80,15 +80,15 @@ def refusal_or_none(type_name: str, payload: bytes) -> str | None:
 
 @pytest.mark.parametrize("form", ["jpeg", "", "bgr8; jpeg compressed bgr8", "rgb8; png compressed "])
 def test_a_compressed_image_is_known_by_its_bytes(form: str) -> None:
-    frame = incoming.decode(messages.COMPRESSED_IMAGE, compressed(form=form), LIMITS)
+    frame = incoming.decode(messages.COMPRESSED_IMAGE, compressed_image(form=form), LIMITS)
 
-    assert frame == CameraFrame(STAMP, "camera", EncodedImage(ImageFormat.JPEG, 64, 48, JPEG))
+    assert frame == CameraFrame(STAMP_NS, "camera", EncodedImage(ImageFormat.JPEG, 64, 48, JPEG))
 
 
 def test_the_padding_of_rows_is_removed() -> None:
     data = bytes(range(6)) + b"\xaa\xaa" + bytes(range(6, 12)) + b"\xaa\xaa"
     for sent in (data, data[:-2]):  # some drivers leave out the padding of the last row
-        frame = incoming.decode(messages.IMAGE, image("bgr8", 2, 2, 8, sent), LIMITS)
+        frame = incoming.decode(messages.IMAGE, raw_image("bgr8", 2, 2, 8, sent), LIMITS)
 
         assert isinstance(frame, CameraFrame)
         assert frame.image == EncodedImage(ImageFormat.BGR8, 2, 2, bytes(range(12)))
@@ -97,16 +97,16 @@ def test_the_padding_of_rows_is_removed() -> None:
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (image("32FC1", 2, 2, 8, bytes(16)), "image_unknown_format"),
-        (image("yuv422", 3, 2, 6, bytes(12)), "image_size_mismatch"),
-        (image("bayer_rggb8", 2, 2, 2, bytes(4)), "image_size_mismatch"),
-        (image("mono16", 4, 2, 4, bytes(16)), "image_size_mismatch"),
-        (image("jpeg", 2, 2, 2, bytes(4)), "image_unknown_format"),
-        (image("mono8", 4, 2, 3, bytes(8)), "image_size_mismatch"),
-        (image("mono8", 4, 2, 4, bytes(7)), "image_size_mismatch"),
-        (image("mono8", 2**32 - 1, 2**32 - 1, 2**32 - 1, bytes(8)), "image_size_mismatch"),
-        (image("mono8", 0, 2, 0, b""), "image_corrupt"),
-        (image("mono8", 4, 0, 4, b""), "image_corrupt"),
+        (raw_image("32FC1", 2, 2, 8, bytes(16)), "image_unknown_format"),
+        (raw_image("yuv422", 3, 2, 6, bytes(12)), "image_size_mismatch"),
+        (raw_image("bayer_rggb8", 2, 2, 2, bytes(4)), "image_size_mismatch"),
+        (raw_image("mono16", 4, 2, 4, bytes(16)), "image_size_mismatch"),
+        (raw_image("jpeg", 2, 2, 2, bytes(4)), "image_unknown_format"),
+        (raw_image("mono8", 4, 2, 3, bytes(8)), "image_size_mismatch"),
+        (raw_image("mono8", 4, 2, 4, bytes(7)), "image_size_mismatch"),
+        (raw_image("mono8", 2**32 - 1, 2**32 - 1, 2**32 - 1, bytes(8)), "image_size_mismatch"),
+        (raw_image("mono8", 0, 2, 0, b""), "image_corrupt"),
+        (raw_image("mono8", 4, 0, 4, b""), "image_corrupt"),
     ],
 )
 def test_a_wrong_raw_image_is_refused_by_reason(payload: bytes, reason: str) -> None:
@@ -114,7 +114,7 @@ def test_a_wrong_raw_image_is_refused_by_reason(payload: bytes, reason: str) -> 
 
 
 def test_a_truncated_jpeg_is_refused() -> None:
-    assert reason_of(messages.COMPRESSED_IMAGE, compressed(JPEG[:-9])) == "image_truncated"
+    assert reason_of(messages.COMPRESSED_IMAGE, compressed_image(JPEG[:-9])) == "image_truncated"
 
 
 # --- clouds -------------------------------------------------------------------------------------------------
@@ -133,7 +133,7 @@ def test_fields_in_any_order_with_padding_between_and_rows_apart() -> None:
 
     frame = sweep(cloud(fields, bytes(data), 2, 24, height=2, row_step=56))
 
-    assert (frame.stamp_ns, frame.frame_id) == (STAMP, "lidar")
+    assert (frame.stamp_ns, frame.frame_id) == (STAMP_NS, "lidar")
     assert frame.xyz_m.tolist() == [[1 + i, -1 - i, 10.5 + i] for i in range(4)]
     assert frame.ring is not None
     assert frame.ring.tolist() == [0, 1, 2, 3]
@@ -143,7 +143,7 @@ def test_fields_in_any_order_with_padding_between_and_rows_apart() -> None:
 
 @pytest.mark.parametrize("form", ["<f4", "<f8", "u1", "<u2"])
 def test_intensity_of_any_type(form: str) -> None:
-    frame = sweep(packed([*XYZ, ("intensity", form, [7, 200])]))
+    frame = sweep(packed_cloud([*XYZ, ("intensity", form, [7, 200])]))
 
     assert frame.intensity is not None
     assert frame.intensity.dtype == np.float32
@@ -152,7 +152,7 @@ def test_intensity_of_any_type(form: str) -> None:
 
 @pytest.mark.parametrize(("name", "form"), [("ring", "u1"), ("ring", "<u2"), ("ring", "<u4"), ("channel", "<u2")])
 def test_ring_of_any_unsigned_type(name: str, form: str) -> None:
-    frame = sweep(packed([*XYZ, (name, form, [7, 63])]))
+    frame = sweep(packed_cloud([*XYZ, (name, form, [7, 63])]))
 
     assert frame.ring is not None
     assert frame.ring.dtype == np.uint16
@@ -160,13 +160,13 @@ def test_ring_of_any_unsigned_type(name: str, form: str) -> None:
 
 
 def test_points_that_are_none_go_with_their_row_whatever_their_other_columns_hold() -> None:
-    payload = packed(
+    payload = packed_cloud(
         [
             ("x", "<f8", [NAN, 1, 1e300, 4]),
             ("y", "<f4", [0, 2, 0, 5]),
             ("z", "<f4", [0, 3, 0, 6]),
             ("ring", "<u2", [0, 1, 2, 3]),
-            ("timestamp", "<f8", [0.0, SEC + NSEC * 1e-9, NAN, SEC + NSEC * 1e-9 + 0.1]),
+            ("timestamp", "<f8", [0.0, STAMP_S + STAMP_REST_NS * 1e-9, NAN, STAMP_S + STAMP_REST_NS * 1e-9 + 0.1]),
         ]
     )
 
@@ -186,12 +186,12 @@ MAX = 2**32 - 1
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (packed([("x", "<f4", [NAN]), ("y", "<f4", [0]), ("z", "<f4", [0])]), "cloud_empty"),
+        (packed_cloud([("x", "<f4", [NAN]), ("y", "<f4", [0]), ("z", "<f4", [0])]), "cloud_empty"),
         (cloud(SHORT, b"", 0, 12), "cloud_empty"),
         (cloud(SHORT, b"", 5, 12, height=0), "cloud_empty"),
-        (packed(XYZ[:2]), "cloud_fields"),
-        (packed([("x", "<i4", [1]), ("y", "<f4", [1]), ("z", "<f4", [1])]), "cloud_fields"),
-        (packed([*XYZ, ("ring", "<u4", [1, 70_000])]), "cloud_fields"),
+        (packed_cloud(XYZ[:2]), "cloud_fields"),
+        (packed_cloud([("x", "<i4", [1]), ("y", "<f4", [1]), ("z", "<f4", [1])]), "cloud_fields"),
+        (packed_cloud([*XYZ, ("ring", "<u4", [1, 70_000])]), "cloud_fields"),
         (cloud([*SHORT, ("q", 0, 99)], bytes(12), 1, 12), ""),
         (cloud([("x", 9, 7), *SHORT[1:]], bytes(12), 1, 12), "cloud_shape"),
         (cloud([("x", 4, 7), ("y", 8, 7), ("z", 12, 7)], bytes(12), 1, 12), "cloud_shape"),
@@ -231,13 +231,13 @@ def test_a_wrong_cloud_is_refused_by_reason(payload: bytes, reason: str) -> None
     ],
 )
 def test_ego_motion(type_name: str, payload: bytes, frame_id: str) -> None:
-    motion = EgoMotion(STAMP, frame_id, (1.5, 0.0, -0.25), (0.0, 0.5, 0.125))
+    motion = EgoMotion(STAMP_NS, frame_id, (1.5, 0.0, -0.25), (0.0, 0.5, 0.125))
 
     assert incoming.decode(type_name, payload, LIMITS) == motion
 
 
 def test_an_imu_tells_rotation_only() -> None:
-    assert incoming.decode(messages.IMU, imu(), LIMITS) == EgoMotion(STAMP, "imu_link", None, (0.0, 0.5, 0.125))
+    assert incoming.decode(messages.IMU, imu(), LIMITS) == EgoMotion(STAMP_NS, "imu_link", None, (0.0, 0.5, 0.125))
 
 
 def test_an_imu_that_has_no_turn_rates_says_so_and_is_refused() -> None:
@@ -267,7 +267,7 @@ def test_a_message_of_motion_with_a_name_of_a_megabyte_is_not_even_looked_at() -
     ],
 )
 def test_a_wrong_header_is_refused_by_reason(header: dict[str, Any], reason: str) -> None:
-    assert reason_of(messages.COMPRESSED_IMAGE, compressed(**header)) == reason
+    assert reason_of(messages.COMPRESSED_IMAGE, compressed_image(**header)) == reason
 
 
 def test_a_type_that_is_not_read_is_refused() -> None:
@@ -391,7 +391,7 @@ def read_by_others(type_name: str, payload: bytes) -> Any:
     ],
 )
 def test_an_image_there_and_back(encoded: EncodedImage) -> None:
-    frame = CameraFrame(STAMP, "camera", encoded)
+    frame = CameraFrame(STAMP_NS, "camera", encoded)
 
     type_name, payload = outgoing.encode_image(frame)
 
@@ -402,7 +402,7 @@ def test_an_image_there_and_back(encoded: EncodedImage) -> None:
 def test_a_depth_map_there_and_back() -> None:
     depth = probe(encode_depth_png(np.full((12, 16), 7, np.uint16)), LIMITS)
 
-    payload = outgoing.encode_depth(STAMP, "camera", depth)
+    payload = outgoing.encode_depth(STAMP_NS, "camera", depth)
 
     frame = incoming.decode(messages.COMPRESSED_IMAGE, payload, LIMITS)
     assert isinstance(frame, CameraFrame)
@@ -419,12 +419,12 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
         "time_offset_s": rng.uniform(-5, 5, 500).astype(np.float32),
     }
     xyz_m = rng.normal(size=(500, 3)).astype(np.float32)
-    frame = LidarFrame(STAMP, "lidar", xyz_m, **{name: columns[name] for name in names})
+    frame = LidarFrame(STAMP_NS, "lidar", xyz_m, **{name: columns[name] for name in names})
 
     back = incoming.decode(messages.POINT_CLOUD, outgoing.encode_cloud(frame), LIMITS, point_time=WRITTEN_TIME)
 
     assert isinstance(back, LidarFrame)
-    assert (back.stamp_ns, back.frame_id) == (STAMP, "lidar")
+    assert (back.stamp_ns, back.frame_id) == (STAMP_NS, "lidar")
     assert back.xyz_m.tobytes() == xyz_m.tobytes()
     for name, values in columns.items():
         column = getattr(back, name)
@@ -432,7 +432,7 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
 
 
 def test_an_odometry_there_and_back() -> None:
-    motion = EgoMotion(STAMP, "base_link", (1 / 3, 0.0, -2.0), (1e-9, 0.5, 3.0))
+    motion = EgoMotion(STAMP_NS, "base_link", (1 / 3, 0.0, -2.0), (1e-9, 0.5, 3.0))
 
     type_name, payload = outgoing.encode_motion(motion)
 
@@ -442,7 +442,7 @@ def test_an_odometry_there_and_back() -> None:
 
 
 def test_a_rotation_there_and_back() -> None:
-    motion = EgoMotion(STAMP, "imu_link", None, (1e-9, 0.5, -3.0))
+    motion = EgoMotion(STAMP_NS, "imu_link", None, (1e-9, 0.5, -3.0))
 
     type_name, payload = outgoing.encode_motion(motion)
 
@@ -457,9 +457,9 @@ def test_a_rotation_there_and_back() -> None:
 def test_camera_info(model: str) -> None:
     camera, distortion_model, d = CAMERAS[model]
 
-    message = read_by_others(messages.CAMERA_INFO, outgoing.encode_camera_info(rig(camera), STAMP))
+    message = read_by_others(messages.CAMERA_INFO, outgoing.encode_camera_info(rig(camera), STAMP_NS))
 
-    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (SEC, NSEC)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (STAMP_S, STAMP_REST_NS)
     assert (message.width, message.height, message.header.frame_id) == (640, 480, "camera")
     assert message.distortion_model == distortion_model
     assert list(message.d) == d
@@ -475,7 +475,7 @@ def test_every_camera_model_has_a_distortion_model() -> None:
 
 
 def test_tf_maps_the_child_to_the_parent() -> None:
-    payload = outgoing.encode_tf_static(rig(CAMERAS["pinhole"][0]), T_CAMERA_LIDAR, STAMP)
+    payload = outgoing.encode_tf_static(rig(CAMERAS["pinhole"][0]), T_CAMERA_LIDAR, STAMP_NS)
 
     (transform,) = read_by_others(messages.TF, payload).transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("camera", "lidar")
@@ -486,23 +486,25 @@ def test_tf_maps_the_child_to_the_parent() -> None:
 
 def test_several_frames_lie_in_one_message() -> None:
     lidar, radar = np.eye(4), T_CAMERA_LIDAR
-    frames = [outgoing.Placed("base", "lidar", lidar), outgoing.Placed("lidar", "camera_calibrated", radar)]
+    frames = [outgoing.PlacedFrame("base", "lidar", lidar), outgoing.PlacedFrame("lidar", "camera_calibrated", radar)]
 
-    told = read_by_others(messages.TF, outgoing.encode_transforms(frames, STAMP)).transforms
+    told = read_by_others(messages.TF, outgoing.encode_transforms(frames, STAMP_NS)).transforms
 
     assert [(one.header.frame_id, one.child_frame_id) for one in told] == [
         ("base", "lidar"),
         ("lidar", "camera_calibrated"),
     ]
-    assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in told} == {(SEC, NSEC)}
+    assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in told} == {(STAMP_S, STAMP_REST_NS)}
     assert told[1].transform.translation.z == 0.3
 
 
 def test_diagnostics() -> None:
-    stale = Status(Level.STALE, "coec: front_calibration", "not looked yet", "truck-7", {"mi": "0.5"})
-    fine = Status(Level.OK, "coec: rear_calibration", "healthy", "truck-7/rear", {})
+    stale = DiagnosticStatus(
+        DiagnosticLevel.STALE, "coec: front_calibration", "not looked yet", "truck-7", {"mi": "0.5"}
+    )
+    fine = DiagnosticStatus(DiagnosticLevel.OK, "coec: rear_calibration", "healthy", "truck-7/rear", {})
 
-    statuses = read_by_others(messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP, [stale, fine])).status
+    statuses = read_by_others(messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP_NS, [stale, fine])).status
 
     assert [(one.name, one.message, one.hardware_id) for one in statuses] == [
         ("coec: front_calibration", "not looked yet", "truck-7"),
@@ -515,16 +517,16 @@ def test_diagnostics() -> None:
 @pytest.mark.parametrize("model", ["pinhole", "radtan", "kannala_brandt"])
 def test_what_ros_knows_is_said_as_it_is(model: str) -> None:
     camera = CAMERAS[model][0]
-    assert outgoing.sayable(camera) == (camera, 0.0)
+    assert outgoing.ros_camera(camera) == (camera, 0.0)
 
 
 def test_a_double_sphere_is_said_as_equidistant() -> None:
     camera = build("double_sphere", width=640, height=480, fx=300.0, fy=310.0, cx=320.0, cy=235.0, xi=-0.2, alpha=0.59)
 
-    said, residual_px = outgoing.sayable(camera)
+    said, residual_px = outgoing.ros_camera(camera)
 
     assert 0.0 < residual_px < 0.01
-    info = read_by_others(messages.CAMERA_INFO, outgoing.encode_camera_info(rig(said), STAMP))
+    info = read_by_others(messages.CAMERA_INFO, outgoing.encode_camera_info(rig(said), STAMP_NS))
     assert info.distortion_model == "equidistant"
     assert len(info.d) == 4
     assert info.k[0] == said.fx != 300.0
@@ -534,5 +536,5 @@ def test_a_lens_that_ros_has_no_word_for_is_not_said() -> None:
     size = {"width": 640, "height": 480, "fx": 700.0, "fy": 700.0, "cx": 320.0, "cy": 235.0}
     camera = build("mei", **size, xi=2.2, k1=0.0168, k2=1.6549, p1=0.05, p2=0.0004)
 
-    with pytest.raises(outgoing.UnsayableCameraError, match=r"more than 0\.5 px"):
-        outgoing.sayable(camera)
+    with pytest.raises(outgoing.UnsupportedCameraError, match=r"more than 0\.5 px"):
+        outgoing.ros_camera(camera)

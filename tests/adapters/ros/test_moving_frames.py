@@ -12,7 +12,7 @@ from coec.adapters.ros.transforms import MAX_TRANSFORMS
 from coec.calibration.types import EgoMotion
 from coec.errors import DecodeError
 from coec.geometry import se3
-from ros_messages import Pose, transforms
+from ros_messages import PoseValues, transforms
 
 START = 1_700_000_000 * 10**9
 MS = 10**6
@@ -26,17 +26,17 @@ AT = se3.transform_from(se3.rotation_exp(np.array([0.0, 0.1, 2.5])), np.array([3
 """Far from the origin of the map, as in UTM."""
 
 
-def pose(T: NDArray[np.float64]) -> Pose:
+def pose(T: NDArray[np.float64]) -> PoseValues:
     x, y, z = T[:3, 3]
     i, j, k, w = se3.quaternion_xyzw_from_rotation(T[:3, :3])
     return (float(x), float(y), float(z), float(i), float(j), float(k), float(w))
 
 
-def there(ms: float, twist: NDArray[np.float64] = TWIST) -> Pose:
+def there(ms: float, twist: NDArray[np.float64] = TWIST) -> PoseValues:
     return pose(AT @ se3.exp(twist * ms * 1e-3))
 
 
-def at(ms: float, *, parent: str = "odom", child: str = "base_link", where: Pose | None = None) -> bytes:
+def at(ms: float, *, parent: str = "odom", child: str = "base_link", where: PoseValues | None = None) -> bytes:
     return transforms((parent, child, START + round(ms * MS), where or there(ms)))
 
 
@@ -123,7 +123,7 @@ def test_nothing_is_said_across_a_gap_or_a_step_back(later_ms: float) -> None:
         ((5e8, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "motion_invalid"),  # a filter was reset
     ],
 )
-def test_a_pose_that_is_none_is_refused(broken: Pose, reason: str) -> None:
+def test_a_pose_that_is_none_is_refused(broken: PoseValues, reason: str) -> None:
     moving = MovingFrame("odom", "base_link")
     taken(at(0), at(20), frame=moving)
     with pytest.raises(DecodeError) as refused:

@@ -11,7 +11,7 @@ from coec.adapters.ros import incoming, messages
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig, TimeUnit
 from coec.errors import DecodeError
-from ros_messages import NSEC, SEC, STAMP, Columns, packed
+from ros_messages import STAMP_NS, STAMP_REST_NS, STAMP_S, Columns, packed_cloud
 
 LIMITS = LimitsConfig()
 POINTS = 5
@@ -19,10 +19,10 @@ SWEEP_S = np.linspace(0.0, 0.0999, POINTS)
 TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 
 
-def cloud_timed(name: str, form: str, values: list[float], *, stamp_ns: int = STAMP, big: bool = False) -> bytes:
+def cloud_timed(name: str, form: str, values: list[float], *, stamp_ns: int = STAMP_NS, big: bool = False) -> bytes:
     xyz: Columns = [(axis, "<f4", [float(k + 1) for k in range(len(values))]) for axis in "xyz"]
     sec, nsec = divmod(stamp_ns, 10**9)
-    return packed([*xyz, (name, form, values)], big=big, sec=sec, nsec=nsec)
+    return packed_cloud([*xyz, (name, form, values)], big=big, sec=sec, nsec=nsec)
 
 
 def sweep(payload: bytes, said: PointTimeConfig | None = None) -> LidarFrame:
@@ -67,7 +67,7 @@ def test_whole_numbers_are_micro_or_nanoseconds(form: str, unit: str, begin_s: f
 
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 @pytest.mark.parametrize("begin_s", [0.0, -0.0999, -0.15])
-@pytest.mark.parametrize("stamp_ns", [STAMP, 345 * 10**9 + 6_789_000])
+@pytest.mark.parametrize("stamp_ns", [STAMP_NS, 345 * 10**9 + 6_789_000])
 def test_a_time_of_day_or_since_the_start_counts_from_the_stamp(unit: str, begin_s: float, stamp_ns: int) -> None:
     """`timestamp` is on the clock that the stamp is of, whatever that counts from."""
     values = ((SWEEP_S + begin_s + stamp_ns * 1e-9) * TICKS[unit]).tolist()
@@ -86,7 +86,7 @@ def test_a_time_of_day_or_since_the_start_counts_from_the_stamp(unit: str, begin
         (
             "timestamp",
             "<f8",
-            [SEC + NSEC * 1e-9 - 0.05, SEC + NSEC * 1e-9 + 0.05],
+            [STAMP_S + STAMP_REST_NS * 1e-9 - 0.05, STAMP_S + STAMP_REST_NS * 1e-9 + 0.05],
             "timestamp: float64, s on the stamp's clock; -50.0 to 50.0 ms from the stamp, stamped in its middle",
         ),
         ("time_stamp", "<u4", [150_000, 200_000], "time_stamp: uint32, µs since the stamp; 150.0 to 200.0 ms"),
@@ -103,10 +103,10 @@ def test_what_was_recognised_is_said(name: str, form: str, values: list[float], 
         # A simulation that began a moment ago: since the stamp, or since the begin?
         ("timestamp", "<f8", [0.5, 0.6], 500_000_000, ["s since the stamp", "s on the stamp's clock"]),
         # A slow scanner's seconds, or a fast one's milliseconds.
-        ("time", "<f4", [0.0, 5.0], STAMP, ["s since the stamp", "ms since the stamp"]),
+        ("time", "<f4", [0.0, 5.0], STAMP_NS, ["s since the stamp", "ms since the stamp"]),
         # Whole milliseconds, or a flash.
-        ("t", "<u4", [0, 99], STAMP, ["ms since the stamp", "ns since the stamp"]),
-        ("t", "<u4", [50_000, 50_000], STAMP, ["ns since the stamp", "µs since the stamp"]),
+        ("t", "<u4", [0, 99], STAMP_NS, ["ms since the stamp", "ns since the stamp"]),
+        ("t", "<u4", [50_000, 50_000], STAMP_NS, ["ns since the stamp", "µs since the stamp"]),
     ],
 )
 @pytest.mark.fault("point times that can be read in two ways", "the sweep is refused, and the candidates are named")
@@ -130,7 +130,7 @@ def test_what_the_configuration_says_is_taken_as_said(unit: TimeUnit, scale: flo
 
 
 def test_the_configuration_names_a_field_that_nobody_knows() -> None:
-    payload = cloud_timed("fired_at", "<f8", [STAMP * 1e-3, STAMP * 1e-3 + 1e5])
+    payload = cloud_timed("fired_at", "<f8", [STAMP_NS * 1e-3, STAMP_NS * 1e-3 + 1e5])
 
     assert sweep(payload).time_offset_s is None
     said = PointTimeConfig(field="fired_at", unit="us", base="clock")
@@ -140,7 +140,7 @@ def test_the_configuration_names_a_field_that_nobody_knows() -> None:
 @pytest.mark.fault("points timed by another clock than their sweep", "the sweep is refused with its reason")
 @pytest.mark.parametrize("ago_s", [3600.0, -3600.0, 2.0])
 def test_a_time_of_another_clock_is_refused(ago_s: float) -> None:
-    error = refused(cloud_timed("timestamp", "<f8", [SEC - ago_s, SEC - ago_s + 0.1]))
+    error = refused(cloud_timed("timestamp", "<f8", [STAMP_S - ago_s, STAMP_S - ago_s + 0.1]))
 
     assert error.reason == "cloud_time"
 
@@ -152,12 +152,12 @@ def test_a_name_that_speaks_of_the_time_since_the_stamp_is_believed() -> None:
 
 def test_points_that_are_none_do_not_count_whatever_their_time() -> None:
     nan = math.nan
-    payload = packed(
+    payload = packed_cloud(
         [
             ("x", "<f4", [nan, 1.0, 2.0, 3.0]),
             ("y", "<f4", [1.0] * 4),
             ("z", "<f4", [1.0] * 4),
-            ("timestamp", "<f8", [0.0, SEC + NSEC * 1e-9, nan, SEC + NSEC * 1e-9 + 0.1]),
+            ("timestamp", "<f8", [0.0, STAMP_S + STAMP_REST_NS * 1e-9, nan, STAMP_S + STAMP_REST_NS * 1e-9 + 0.1]),
         ]
     )
 
@@ -168,7 +168,7 @@ def test_points_that_are_none_do_not_count_whatever_their_time() -> None:
 
 
 def test_a_cloud_without_a_time_has_none_and_says_nothing() -> None:
-    frame = sweep(packed([(axis, "<f4", [1.0, 2.0]) for axis in "xyz"]))
+    frame = sweep(packed_cloud([(axis, "<f4", [1.0, 2.0]) for axis in "xyz"]))
 
     assert (frame.time_offset_s, frame.timed_by) == (None, "")
 
@@ -193,7 +193,7 @@ def test_no_usual_sweep_is_read_in_another_way_than_it_was_written(
     assert offsets_s(frame) == pytest.approx([begin_s, begin_s + lasts_s], abs=2e-6)
 
 
-BEGIN_S = SEC + NSEC * 1e-9
+BEGIN_S = STAMP_S + STAMP_REST_NS * 1e-9
 
 
 @pytest.mark.fault(
@@ -205,7 +205,7 @@ BEGIN_S = SEC + NSEC * 1e-9
 def test_without_a_stamp_the_first_point_tells_it(unit: str, name: str) -> None:
     frame = sweep(cloud_timed(name, "<f8", ((SWEEP_S + BEGIN_S) * TICKS[unit]).tolist(), stamp_ns=0))
 
-    assert frame.stamp_ns == pytest.approx(STAMP, abs=1000)  # neighbouring doubles are 0.2 us apart
+    assert frame.stamp_ns == pytest.approx(STAMP_NS, abs=1000)  # neighbouring doubles are 0.2 us apart
     assert offsets_s(frame) == pytest.approx(SWEEP_S, abs=2e-6)
     assert frame.timed_by.endswith("stamped at its begin; without a stamp, that of the first point is taken")
 
@@ -213,7 +213,7 @@ def test_without_a_stamp_the_first_point_tells_it(unit: str, name: str) -> None:
 def test_points_that_are_none_do_not_stamp_a_cloud() -> None:
     columns: Columns = [(axis, "<f4", [math.nan, 1.0, 2.0]) for axis in "xyz"]
     times: Columns = [("timestamp", "<f8", [0.0, BEGIN_S, BEGIN_S + 0.1])]
-    assert sweep(packed([*columns, *times], sec=0, nsec=0)).stamp_ns == pytest.approx(STAMP, abs=1000)
+    assert sweep(packed_cloud([*columns, *times], sec=0, nsec=0)).stamp_ns == pytest.approx(STAMP_NS, abs=1000)
 
 
 @pytest.mark.parametrize(
@@ -233,7 +233,7 @@ def test_without_a_stamp_a_time_since_the_stamp_leaves_it_open(name: str, form: 
     ("form", "values"),
     [
         ("<f4", [BEGIN_S, BEGIN_S]),  # two minutes between neighbouring values
-        ("<u4", [float(SEC), float(SEC)]),  # whole seconds
+        ("<u4", [float(STAMP_S), float(STAMP_S)]),  # whole seconds
         ("<f8", [345e9, 345.1e9]),  # since the sensor was switched on
         ("<f8", [2.0**31, 2.0**31 + 0.1]),
     ],

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from coec.adapters.ros.static_transforms import (
-    MAX_JOINTS,
-    Joint,
+    MAX_STATIC_TRANSFORMS,
+    StaticTransform,
     StaticTransforms,
-    decode_joints,
+    decode_static_transforms,
 )
 from coec.adapters.ros.transforms import MAX_MESSAGE_BYTES
 from coec.errors import DecodeError
@@ -33,13 +33,13 @@ def packed(*joints: tuple[str, str, tuple[float, ...], tuple[float, ...]], claim
 
 def tree(*joints: tuple[str, str, NDArray[np.float64]]) -> StaticTransforms:
     transforms = StaticTransforms()
-    transforms.take(tuple(Joint(parent, child, T_parent_child) for parent, child, T_parent_child in joints))
+    transforms.add(tuple(StaticTransform(parent, child, T_parent_child) for parent, child, T_parent_child in joints))
     return transforms
 
 
 def test_a_transform_is_the_pose_of_the_child_in_its_parent() -> None:
     half = np.sqrt(0.5)
-    (joint,) = decode_joints(packed(("/base", "camera", (1.0, 2.0, 3.0), (0.0, 0.0, half, half))))
+    (joint,) = decode_static_transforms(packed(("/base", "camera", (1.0, 2.0, 3.0), (0.0, 0.0, half, half))))
     assert (joint.parent, joint.child) == ("base", "camera")
     np.testing.assert_allclose(joint.T_parent_child @ [1.0, 0.0, 0.0, 1.0], [1.0, 3.0, 3.0, 1.0], atol=1e-15)
 
@@ -71,9 +71,9 @@ def test_frames_that_nothing_connects() -> None:
 
 def test_what_was_said_last_holds_and_that_it_changed_is_known() -> None:
     transforms = tree(("base", "lidar", np.eye(4)))
-    transforms.take((Joint("base", "lidar", np.eye(4)),))
+    transforms.add((StaticTransform("base", "lidar", np.eye(4)),))
     assert transforms.replaced == 0
-    transforms.take((Joint("base", "lidar", T),))
+    transforms.add((StaticTransform("base", "lidar", T),))
     assert transforms.replaced == 1
     found = transforms.transform("base", "lidar")
     assert found is not None
@@ -117,16 +117,16 @@ UNIT, ZERO = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 )
 def test_what_is_no_transform_is_refused(payload: bytes, cause: str) -> None:
     with pytest.raises(DecodeError) as refused:
-        decode_joints(payload)
+        decode_static_transforms(payload)
     assert refused.value.reason == cause
 
 
 def test_a_flood_of_frames_ends_and_leaves_what_was_known() -> None:
     transforms = tree(("base", "lidar", T))
-    many = tuple(Joint("base", f"f{index}", T) for index in range(MAX_JOINTS))
+    many = tuple(StaticTransform("base", f"f{index}", T) for index in range(MAX_STATIC_TRANSFORMS))
     with pytest.raises(DecodeError, match="more than 2048"):
-        transforms.take(many)
+        transforms.add(many)
     assert transforms.frames == ("base", "lidar")
-    transforms.take(many[1:])
-    transforms.take(many[1:])
-    assert len(transforms.frames) == MAX_JOINTS + 1
+    transforms.add(many[1:])
+    transforms.add(many[1:])
+    assert len(transforms.frames) == MAX_STATIC_TRANSFORMS + 1

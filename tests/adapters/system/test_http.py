@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from coec.adapters.system import http as served
-from coec.adapters.system.http import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpServer, Page, Request
+from coec.adapters.system.http import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpRequest, HttpResponse, HttpServer
 from coec.errors import UnavailableError
 from fakes import wait_until
 from ports import free_port
@@ -26,11 +26,11 @@ ENDLESS = b"x" * 32_000_000
 PATIENCE_S = 20.0
 
 
-def find(request: Request) -> Page | None:
+def find(request: HttpRequest) -> HttpResponse | None:
     if request.path == "/broken":
         raise RuntimeError("of the test")
     body = {"/page": BODY, "/endless": ENDLESS, "/accept": request.accept.encode()}.get(request.path)
-    return None if body is None else Page(200, body, "text/plain")
+    return None if body is None else HttpResponse(200, body, "text/plain")
 
 
 @pytest.fixture

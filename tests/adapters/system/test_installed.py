@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.installed import NativeLibrary, bsd_of, installed, pinned_hashes
+from coec.adapters.system.installed import NativeLibrary, bsd_licence, installed_packages, pinned_hashes
 from coec.errors import NotFoundError
 
 BSD = "Redistribution and use in source\nand binary forms, with or without modification, are permitted"
@@ -40,7 +40,7 @@ def test_what_is_needed_is_found_by_its_conditions(site: Path) -> None:
     package(site, "top", "Requires-Dist: mid[more]", 'Requires-Dist: old; python_version < "3"')
     package(site, "mid", 'Requires-Dist: leaf_one; extra == "more"', 'Requires-Dist: other; extra == "rest"')
     package(site, "leaf.One", "Requires-Dist: top")
-    found = installed("top")
+    found = installed_packages("top")
     assert list(found) == ["leaf-one", "mid", "top"]
     assert found["mid"].requires == ("leaf-one",)
     assert found["leaf-one"].requires == ("top",), "a circle ends"
@@ -49,7 +49,7 @@ def test_what_is_needed_is_found_by_its_conditions(site: Path) -> None:
 def test_what_is_needed_and_absent_is_named(site: Path) -> None:
     package(site, "top", "Requires-Dist: nowhere-to-be-found")
     with pytest.raises(NotFoundError, match="nowhere-to-be-found"):
-        installed("top")
+        installed_packages("top")
 
 
 @pytest.mark.parametrize(
@@ -72,14 +72,14 @@ def test_what_is_needed_and_absent_is_named(site: Path) -> None:
 )
 def test_the_most_precise_word_on_the_licence_counts(site: Path, headers: tuple[str, ...], licence: str | None) -> None:
     package(site, "top", *headers, texts={"TEXT": f"{BSD} {NAMES}"})
-    assert installed("top")["top"].licence == licence
+    assert installed_packages("top")["top"].licence == licence
 
 
 @pytest.mark.parametrize(
     ("text", "known"), [(f"{BSD} {NAMES}", "BSD-3-Clause"), (BSD, "BSD-2-Clause"), ("Permission is granted", None)]
 )
 def test_licences_of_the_bsd_family_differ_by_a_clause(text: str, known: str | None) -> None:
-    assert bsd_of(text) == known
+    assert bsd_licence(text) == known
 
 
 def test_libraries_packed_in_are_named_with_their_digests(site: Path) -> None:
@@ -87,7 +87,7 @@ def test_libraries_packed_in_are_named_with_their_digests(site: Path) -> None:
     told = base64.urlsafe_b64encode(digest).decode().rstrip("=")
     files = f"top.libs/libav-0011aabb.so.62.28,sha256={told},9\ntop/_own.so,sha256={told},9\n"
     package(site, "top", files=files)
-    (library,) = installed("top")["top"].native
+    (library,) = installed_packages("top")["top"].native
     assert library == NativeLibrary("libav-0011aabb.so.62.28", digest.hex())
     assert library.name == "libav"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.listening import addresses_of_port
+from coec.adapters.system.listening import listening_addresses
 
 HEAD = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode\n"
 
@@ -32,9 +32,9 @@ def test_a_socket_that_waits_is_found(family: int, kind: int, protocol: str, add
         if kind == socket.SOCK_STREAM:
             one.listen()
         port = one.getsockname()[1]
-        found = addresses_of_port("udp" if protocol == "udp" else "tcp", port)
+        found = listening_addresses("udp" if protocol == "udp" else "tcp", port)
         assert found == {ipaddress.ip_address(address)}
-    assert addresses_of_port("udp" if protocol == "udp" else "tcp", port) == set()
+    assert listening_addresses("udp" if protocol == "udp" else "tcp", port) == set()
 
 
 def test_a_connection_is_nobody_who_waits(tmp_path: Path) -> None:
@@ -43,7 +43,7 @@ def test_a_connection_is_nobody_who_waits(tmp_path: Path) -> None:
         + "   0: 0100007F:1D17 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1 1 0 100 0 0\n"
         + "   1: 0501A8C0:1D17 0601A8C0:9C40 01 00000000:00000000 00:00000000 00000000     0        0 2 1 0 100 0 0\n"
     )
-    assert addresses_of_port("tcp", 7447, tmp_path) == {ipaddress.ip_address("127.0.0.1")}
+    assert listening_addresses("tcp", 7447, tmp_path) == {ipaddress.ip_address("127.0.0.1")}
 
 
 def test_an_address_of_ipv4_on_a_socket_of_ipv6_is_one_of_ipv4() -> None:
@@ -54,9 +54,9 @@ def test_an_address_of_ipv4_on_a_socket_of_ipv6_is_one_of_ipv4() -> None:
         except OSError:
             pytest.skip("this computer has no IPv6")
         one.listen()
-        assert addresses_of_port("tcp", one.getsockname()[1]) == {ipaddress.ip_address("127.0.0.1")}
+        assert listening_addresses("tcp", one.getsockname()[1]) == {ipaddress.ip_address("127.0.0.1")}
 
 
 def test_a_system_without_tables_says_so(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="tcp"):
-        addresses_of_port("tcp", 7447, tmp_path)
+        listening_addresses("tcp", 7447, tmp_path)

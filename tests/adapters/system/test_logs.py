@@ -14,7 +14,7 @@ import pytest
 
 from coec.adapters.system import logs
 from coec.adapters.system.logs import Form
-from hostile import HOSTILE, obeyed
+from hostile import HOSTILE, obeyed_characters
 
 NASTY = "two\nlines \x1b[31mred\x1b[0m\r and a \u202ebackwards"
 
@@ -60,7 +60,7 @@ def test_no_form_of_the_log_steers_a_terminal(form: Form) -> None:
         raise ValueError(HOSTILE)
     except ValueError:
         logging.getLogger(HOSTILE).exception("frame %s", HOSTILE, extra={"fields": {HOSTILE: HOSTILE}})
-    assert obeyed(stream.getvalue()) == ""
+    assert obeyed_characters(stream.getvalue()) == ""
     line, *traceback = stream.getvalue().splitlines()
     assert r"\u202e" in repr(line)
     if form == "json":

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.notify import Notifier
+from coec.adapters.system.notify import ServiceManagerNotifier
 
 
 def test_the_manager_is_told_by_datagrams(tmp_path: Path) -> None:
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(address)
-        notifier = Notifier.from_environment({"NOTIFY_SOCKET": address})
+        notifier = ServiceManagerNotifier.from_environment({"NOTIFY_SOCKET": address})
         notifier.starting(20.0)
         notifier.ready()
         notifier.watchdog()
@@ -31,9 +31,9 @@ def test_the_manager_is_told_by_datagrams(tmp_path: Path) -> None:
 
 @pytest.mark.fault("the service manager's socket vanishes", "no harm is done")
 def test_no_manager_and_a_vanished_one_do_no_harm(tmp_path: Path) -> None:
-    Notifier.from_environment({}).ready()
-    Notifier(str(tmp_path / "gone")).ready()
-    Notifier("@coec-test-nobody-listens").ready()
+    ServiceManagerNotifier.from_environment({}).ready()
+    ServiceManagerNotifier(str(tmp_path / "gone")).ready()
+    ServiceManagerNotifier("@coec-test-nobody-listens").ready()
 
 
 @pytest.mark.parametrize(
@@ -48,13 +48,13 @@ def test_no_manager_and_a_vanished_one_do_no_harm(tmp_path: Path) -> None:
 )
 def test_the_heartbeat_says_where_pages_are_served(tmp_path: Path, http: tuple[str, int] | None, line: str) -> None:
     file = tmp_path / "heartbeat"
-    Notifier.from_environment({"COEC_HEARTBEAT_FILE": str(file)}).watchdog(http)
+    ServiceManagerNotifier.from_environment({"COEC_HEARTBEAT_FILE": str(file)}).watchdog(http)
     assert file.read_text() == line
 
 
 def test_the_heartbeat_is_renewed_follows_a_reload_and_goes_with_the_service(tmp_path: Path) -> None:
     file = tmp_path / "heartbeat"
-    notifier = Notifier(None, file)
+    notifier = ServiceManagerNotifier(None, file)
     assert not file.exists(), "nothing has made progress"
     notifier.watchdog()
     os.utime(file, (0, 0))
@@ -71,7 +71,7 @@ def test_the_heartbeat_is_renewed_follows_a_reload_and_goes_with_the_service(tmp
 
 @pytest.mark.fault("a folder for the heartbeat that is absent or read-only", "no harm is done to the service")
 def test_a_heartbeat_that_cannot_be_written_does_no_harm(tmp_path: Path) -> None:
-    notifier = Notifier(None, tmp_path / "absent" / "heartbeat")
+    notifier = ServiceManagerNotifier(None, tmp_path / "absent" / "heartbeat")
     notifier.watchdog()
     notifier.stopping()
 
@@ -80,6 +80,6 @@ def test_a_link_in_the_place_of_the_heartbeat_is_not_followed(tmp_path: Path) ->
     other = tmp_path / "other"
     other.write_text("untouched")
     (tmp_path / "heartbeat").symlink_to(other)
-    Notifier(None, tmp_path / "heartbeat").watchdog()
+    ServiceManagerNotifier(None, tmp_path / "heartbeat").watchdog()
     assert other.read_text() == "untouched"
     assert (tmp_path / "heartbeat").read_text() == "-\n"

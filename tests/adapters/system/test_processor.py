@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from coec.adapters.system.processor import processor_s
+from coec.adapters.system.processor import processor_time_s
 
 
 def test_processor_time_is_that_of_the_process_with_all_its_threads() -> None:
@@ -25,12 +25,12 @@ def test_processor_time_is_that_of_the_process_with_all_its_threads() -> None:
     with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         own_s = float(process.stdout.readline())
-        told_s = processor_s(process.pid)
+        told_s = processor_time_s(process.pid)
         assert own_s >= 0.2
         assert told_s == pytest.approx(own_s, abs=0.05)
         before_s = time.process_time()
-        assert processor_s(process.pid) == pytest.approx(told_s, abs=0.01), "one that waits takes none"
+        assert processor_time_s(process.pid) == pytest.approx(told_s, abs=0.01), "one that waits takes none"
         assert time.process_time() - before_s < 0.05
         process.communicate(b"\n")
     with pytest.raises(OSError, match="Invalid argument"):
-        processor_s(process.pid)
+        processor_time_s(process.pid)

@@ -12,14 +12,14 @@ import pytest
 from certificates import TestAuthority, make_authority
 from coec.adapters.tls import conversation
 from coec.adapters.tls.conversation import (
-    CONVERSATIONS,
-    LEFT_S,
-    WAITED_S,
+    MAX_HANDSHAKES,
+    MIN_HANDSHAKE_AGE_S,
+    SECOND_QUERY_S,
+    AuthenticatedCommand,
+    CommandListener,
+    CommandSender,
     Credentials,
-    CrowdedError,
-    Heard,
-    Listener,
-    Speaker,
+    TooManyHandshakesError,
 )
 from coec.errors import ConfigError, NotProvenError
 
@@ -34,31 +34,33 @@ class Clock:
 
 
 @pytest.fixture
-def listener(authority: TestAuthority) -> Listener:
-    return Listener(authority.credentials("vehicle"))
+def listener(authority: TestAuthority) -> CommandListener:
+    return CommandListener(authority.credentials("vehicle"))
 
 
-def flight(answer: bytes | Heard) -> bytes:
+def flight(answer: bytes | AuthenticatedCommand) -> bytes:
     assert isinstance(answer, bytes)
     return answer
 
 
-def end(answer: bytes | Heard) -> Heard:
-    assert isinstance(answer, Heard)
+def end(answer: bytes | AuthenticatedCommand) -> AuthenticatedCommand:
+    assert isinstance(answer, AuthenticatedCommand)
     return answer
 
 
-def said(listener: Listener, credentials: Credentials, to: str = "vehicle") -> tuple[Heard, Speaker]:
+def said(
+    listener: CommandListener, credentials: Credentials, to: str = "vehicle"
+) -> tuple[AuthenticatedCommand, CommandSender]:
     """A whole conversation."""
-    speaker = Speaker(credentials, to)
-    last = speaker.say(flight(listener.hear("1", speaker.hello())), TEXT)
-    return end(listener.hear("1", last)), speaker
+    speaker = CommandSender(credentials, to)
+    last = speaker.send(flight(listener.receive("1", speaker.first_flight())), TEXT)
+    return end(listener.receive("1", last)), speaker
 
 
-def test_each_knows_the_other_and_what_was_said(authority: TestAuthority, listener: Listener) -> None:
+def test_each_knows_the_other_and_what_was_said(authority: TestAuthority, listener: CommandListener) -> None:
     heard, speaker = said(listener, authority.credentials("operator"))
-    assert (heard.name, heard.said) == ("operator", TEXT)
-    assert speaker.answer(heard.sealed(b"held")) == b"held"
+    assert (heard.sender, heard.payload) == ("operator", TEXT)
+    assert speaker.reply(heard.seal(b"held")) == b"held"
 
 
 @pytest.fixture
@@ -71,7 +73,7 @@ def foreign(tmp_path: Path) -> TestAuthority:
     "a command with a certificate that has expired, is foreign, is for servers only, or none", "it is not proven"
 )
 def test_a_certificate_that_is_not_to_be_trusted_proves_nothing(
-    authority: TestAuthority, listener: Listener, foreign: TestAuthority
+    authority: TestAuthority, listener: CommandListener, foreign: TestAuthority
 ) -> None:
     expired = authority.credentials(authority.sign("operator", "expired", days=-1))
     servers = authority.credentials(authority.sign("operator", "servers", uses="extendedKeyUsage=serverAuth\n"))
@@ -83,17 +85,17 @@ def test_a_certificate_that_is_not_to_be_trusted_proves_nothing(
 
 
 def test_without_a_certificate_nothing_is_proven(
-    authority: TestAuthority, listener: Listener, monkeypatch: pytest.MonkeyPatch
+    authority: TestAuthority, listener: CommandListener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(ssl.SSLContext, "load_cert_chain", lambda *_, **__: None)
-        speaker = Speaker(authority.credentials("operator"), "vehicle")
-    last = speaker.say(flight(listener.hear("1", speaker.hello())), TEXT)
+        speaker = CommandSender(authority.credentials("operator"), "vehicle")
+    last = speaker.send(flight(listener.receive("1", speaker.first_flight())), TEXT)
     with pytest.raises(NotProvenError, match="did not return a certificate"):
-        listener.hear("1", last)
+        listener.receive("1", last)
 
 
-def test_a_certificate_with_two_names_is_nobodys(authority: TestAuthority, listener: Listener) -> None:
+def test_a_certificate_with_two_names_is_nobodys(authority: TestAuthority, listener: CommandListener) -> None:
     both = authority.credentials(authority.sign("operator/CN=viewer", "both", uses="extendedKeyUsage=clientAuth\n"))
     with pytest.raises(NotProvenError, match="2 common names"):
         said(listener, both)
@@ -104,14 +106,14 @@ def test_a_certificate_with_two_names_is_nobodys(authority: TestAuthority, liste
 )
 def test_who_is_not_the_service_learns_nothing(authority: TestAuthority, foreign: TestAuthority) -> None:
     for pretender, why in (
-        (Listener(authority.credentials("router")), "certificate of 'router', not that of 'vehicle'"),
-        (Listener(authority.credentials("viewer")), "purpose"),
-        (Listener(foreign.credentials("vehicle")), "issuer|self-signed"),
+        (CommandListener(authority.credentials("router")), "certificate of 'router', not that of 'vehicle'"),
+        (CommandListener(authority.credentials("viewer")), "purpose"),
+        (CommandListener(foreign.credentials("vehicle")), "issuer|self-signed"),
     ):
-        speaker = Speaker(authority.credentials("operator"), "vehicle")
-        answer = flight(pretender.hear("1", speaker.hello()))
+        speaker = CommandSender(authority.credentials("operator"), "vehicle")
+        answer = flight(pretender.receive("1", speaker.first_flight()))
         with pytest.raises(NotProvenError, match=why):
-            speaker.say(answer, TEXT)
+            speaker.send(answer, TEXT)
 
 
 @pytest.mark.fault("a proven command that is changed, cut or repeated on its way", "the command is not heard")
@@ -119,58 +121,60 @@ def test_what_was_changed_cut_or_repeated_is_not_heard(authority: TestAuthority)
     chance = random.Random(0)
     heard = 0
     for trial in range(60):
-        listener = Listener(authority.credentials("vehicle"))
-        speaker = Speaker(authority.credentials("operator"), "vehicle")
-        last = bytearray(speaker.say(flight(listener.hear("1", speaker.hello())), TEXT))
+        listener = CommandListener(authority.credentials("vehicle"))
+        speaker = CommandSender(authority.credentials("operator"), "vehicle")
+        last = bytearray(speaker.send(flight(listener.receive("1", speaker.first_flight())), TEXT))
         if trial % 3 == 0:
             del last[chance.randrange(len(last)) :]
         else:
             last[chance.randrange(len(last))] ^= 1 << chance.randrange(8)
         try:
-            heard += end(listener.hear("1", bytes(last))).said != TEXT
+            heard += end(listener.receive("1", bytes(last))).payload != TEXT
         except NotProvenError:
             continue
         heard += 1
     assert heard == 0
 
 
-def test_a_conversation_that_was_recorded_cannot_be_played_again(authority: TestAuthority, listener: Listener) -> None:
-    speaker = Speaker(authority.credentials("operator"), "vehicle")
-    hello = speaker.hello()
-    last = speaker.say(flight(listener.hear("1", hello)), TEXT)
-    assert end(listener.hear("1", last)).said == TEXT
+def test_a_conversation_that_was_recorded_cannot_be_played_again(
+    authority: TestAuthority, listener: CommandListener
+) -> None:
+    speaker = CommandSender(authority.credentials("operator"), "vehicle")
+    hello = speaker.first_flight()
+    last = speaker.send(flight(listener.receive("1", hello)), TEXT)
+    assert end(listener.receive("1", last)).payload == TEXT
     for recorded in (last, hello + last):
         with pytest.raises(NotProvenError):
-            end(listener.hear("1", recorded))
-    flight(listener.hear("2", hello))
+            end(listener.receive("1", recorded))
+    flight(listener.receive("2", hello))
     with pytest.raises(NotProvenError):
-        listener.hear("2", last)
+        listener.receive("2", last)
 
 
-def test_an_answer_that_is_not_the_services_is_not_taken(authority: TestAuthority, listener: Listener) -> None:
+def test_an_answer_that_is_not_the_services_is_not_taken(authority: TestAuthority, listener: CommandListener) -> None:
     heard, speaker = said(listener, authority.credentials("operator"))
-    sealed = bytearray(heard.sealed(b"held"))
+    sealed = bytearray(heard.seal(b"held"))
     sealed[-1] ^= 1
     with pytest.raises(NotProvenError):
-        speaker.answer(bytes(sealed))
+        speaker.reply(bytes(sealed))
 
 
-def test_rubbish_is_no_conversation(listener: Listener) -> None:
+def test_rubbish_is_no_conversation(listener: CommandListener) -> None:
     chance = random.Random(1)
     for size in (0, 1, 5, 300, 20_000):
         for head in (b"", b"\x16\x03\x01", b"\x16\x03\x01\x00\x05\x01\x00"):
             with pytest.raises(NotProvenError):
-                listener.hear("1", head + chance.randbytes(size))
+                listener.receive("1", head + chance.randbytes(size))
 
 
 def test_what_takes_too_long_is_not_heard(authority: TestAuthority) -> None:
     clock = Clock()
-    listener = Listener(authority.credentials("vehicle"), clock)
-    speaker = Speaker(authority.credentials("operator"), "vehicle")
-    last = speaker.say(flight(listener.hear("1", speaker.hello())), TEXT)
-    clock.now_s = WAITED_S + 0.1
+    listener = CommandListener(authority.credentials("vehicle"), clock)
+    speaker = CommandSender(authority.credentials("operator"), "vehicle")
+    last = speaker.send(flight(listener.receive("1", speaker.first_flight())), TEXT)
+    clock.now_s = SECOND_QUERY_S + 0.1
     with pytest.raises(NotProvenError):
-        listener.hear("1", last)
+        listener.receive("1", last)
 
 
 @pytest.mark.fault(
@@ -179,22 +183,22 @@ def test_what_takes_too_long_is_not_heard(authority: TestAuthority) -> None:
 )
 def test_conversations_that_never_end_keep_nobody_out(authority: TestAuthority) -> None:
     credentials = authority.credentials("operator")
-    hello = Speaker(credentials, "vehicle").hello()
+    hello = CommandSender(credentials, "vehicle").first_flight()
     clock = Clock()
-    listener = Listener(authority.credentials("vehicle"), clock)
-    let_in = Speaker(credentials, "vehicle")
-    answer = flight(listener.hear("let in", let_in.hello()))
-    for number in range(CONVERSATIONS - 1):
-        flight(listener.hear(f"flood {number}", hello))
-    with pytest.raises(CrowdedError):
-        listener.hear("one more", hello)
-    heard = listener.hear("let in", let_in.say(answer, TEXT))
-    assert isinstance(heard, Heard)
-    assert heard.said == TEXT
-    clock.now_s = LEFT_S + 0.1
+    listener = CommandListener(authority.credentials("vehicle"), clock)
+    let_in = CommandSender(credentials, "vehicle")
+    answer = flight(listener.receive("let in", let_in.first_flight()))
+    for number in range(MAX_HANDSHAKES - 1):
+        flight(listener.receive(f"flood {number}", hello))
+    with pytest.raises(TooManyHandshakesError):
+        listener.receive("one more", hello)
+    heard = listener.receive("let in", let_in.send(answer, TEXT))
+    assert isinstance(heard, AuthenticatedCommand)
+    assert heard.payload == TEXT
+    clock.now_s = MIN_HANDSHAKE_AGE_S + 0.1
     for number in range(10):
-        flight(listener.hear(f"later {number}", hello))
-    assert len(listener._begun) == CONVERSATIONS
+        flight(listener.receive(f"later {number}", hello))
+    assert len(listener._pending) == MAX_HANDSHAKES
 
 
 def test_files_that_cannot_be_used_are_named_and_not_shown(authority: TestAuthority, tmp_path: Path) -> None:
@@ -212,7 +216,7 @@ def test_files_that_cannot_be_used_are_named_and_not_shown(authority: TestAuthor
         (Credentials(own.certificate, own.private_key, absent), "No such file"),
     ):
         with pytest.raises(ConfigError) as refused:
-            Listener(wrong)
+            CommandListener(wrong)
         assert named in str(refused.value)
         assert "c2VjcmV0" not in str(refused.value)
 
@@ -222,27 +226,27 @@ def test_files_that_cannot_be_used_are_named_and_not_shown(authority: TestAuthor
     "it ends as it began; later ones use the new certificates",
 )
 def test_certificates_are_renewed_while_a_conversation_is_under_way(
-    authority: TestAuthority, listener: Listener, foreign: TestAuthority
+    authority: TestAuthority, listener: CommandListener, foreign: TestAuthority
 ) -> None:
-    speaker = Speaker(authority.credentials("operator"), "vehicle")
-    last = speaker.say(flight(listener.hear("before", speaker.hello())), TEXT)
+    speaker = CommandSender(authority.credentials("operator"), "vehicle")
+    last = speaker.send(flight(listener.receive("before", speaker.first_flight())), TEXT)
     renewed = listener.renewed(foreign.credentials("vehicle"))
-    assert end(renewed.hear("before", last)).name == "operator"
-    assert said(renewed, foreign.credentials("operator"))[0].name == "operator"
+    assert end(renewed.receive("before", last)).sender == "operator"
+    assert said(renewed, foreign.credentials("operator"))[0].sender == "operator"
     with pytest.raises(NotProvenError):
         said(renewed, authority.credentials("operator"))
-    assert renewed.digest != listener.digest == Listener(authority.credentials("vehicle")).digest
+    assert renewed.digest != listener.digest == CommandListener(authority.credentials("vehicle")).digest
 
 
-def test_certificates_that_cannot_be_used_renew_nothing(authority: TestAuthority, listener: Listener) -> None:
+def test_certificates_that_cannot_be_used_renew_nothing(authority: TestAuthority, listener: CommandListener) -> None:
     absent = Credentials(authority.folder / "absent.pem", authority.folder / "absent.pem", authority.root)
     with pytest.raises(ConfigError, match=r"absent\.pem"):
         listener.renewed(absent)
-    assert said(listener, authority.credentials("operator"))[0].name == "operator"
+    assert said(listener, authority.credentials("operator"))[0].sender == "operator"
 
 
-def test_more_than_one_record_is_not_said(authority: TestAuthority, listener: Listener) -> None:
-    speaker = Speaker(authority.credentials("operator"), "vehicle")
-    came = flight(listener.hear("1", speaker.hello()))
+def test_more_than_one_record_is_not_said(authority: TestAuthority, listener: CommandListener) -> None:
+    speaker = CommandSender(authority.credentials("operator"), "vehicle")
+    came = flight(listener.receive("1", speaker.first_flight()))
     with pytest.raises(NotProvenError, match="more than 16384 bytes"):
-        speaker.say(came, bytes(conversation.MAX_SAID + 1))
+        speaker.send(came, bytes(conversation.MAX_PAYLOAD_BYTES + 1))

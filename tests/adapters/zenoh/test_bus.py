@@ -17,8 +17,8 @@ import psutil
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.bus import JSON, MSGPACK, WAITING, Answer, Bus, Lane, Request, Route, open_session
-from coec.adapters.zenoh.inputs import Sample, on_key
+from coec.adapters.zenoh.bus import JSON, MSGPACK, WAITING, Answer, Bus, QueryLane, Request, Route, open_session
+from coec.adapters.zenoh.inputs import InputSample, on_key
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError, UnavailableError
 from fakes import wait_until
@@ -76,7 +76,7 @@ def ask_error(client: zenoh.Session, selector: str, payload: bytes | None = None
 
 
 def serve_value(bus: Bus, key: str, value: bytes) -> None:
-    route = Route(key, lambda _: Answer(value, MSGPACK), Lane.AT_ONCE)
+    route = Route(key, lambda _: Answer(value, MSGPACK), QueryLane.AT_ONCE)
     bus.serve(key, lambda _: [route])
 
 
@@ -91,9 +91,9 @@ def test_a_query_is_answered_with_encoding_and_timestamp(bus: Bus, client: zenoh
 def test_errors_are_replies_in_the_format_asked_for(bus: Bus, client: zenoh.Session) -> None:
     def find(key: str) -> Sequence[Route]:
         if key.endswith("good"):
-            return [Route(key, lambda _: Answer(b"", MSGPACK), Lane.AT_ONCE)]
+            return [Route(key, lambda _: Answer(b"", MSGPACK), QueryLane.AT_ONCE)]
         if key.endswith("fault"):
-            return [Route(key, fail, Lane.AT_ONCE)]
+            return [Route(key, fail, QueryLane.AT_ONCE)]
         raise NotFoundError("no such thing")
 
     def fail(_: Request) -> Answer:
@@ -124,19 +124,19 @@ def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: B
         return Answer(request.parameters.encode(), MSGPACK)
 
     serve_value(bus, "test/quick", b"q")
-    bus.serve("test/slow", lambda key: [Route(key, slow, Lane.FILES)])
+    bus.serve("test/slow", lambda key: [Route(key, slow, QueryLane.FILES)])
     ask_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow?n=0", replies.put, timeout=DEADLINE_S)
     assert entered.wait(DEADLINE_S)
-    for number in range(1, WAITING[Lane.FILES] + 2):
+    for number in range(1, WAITING[QueryLane.FILES] + 2):
         client.get(f"test/slow?n={number}", replies.put, timeout=DEADLINE_S)
     refused = replies.get(timeout=DEADLINE_S)
     assert refused.err is not None
     assert msgpack.unpackb(refused.err.payload.to_bytes())["code"] == "busy"
     assert ask_ok(client, "test/quick").payload.to_bytes() == b"q"
     release.set()
-    for _ in range(WAITING[Lane.FILES] + 1):
+    for _ in range(WAITING[QueryLane.FILES] + 1):
         assert replies.get(timeout=DEADLINE_S).ok is not None
 
 
@@ -197,7 +197,7 @@ def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Sessi
         thread.request_stop()
         assert thread.join(DEADLINE_S)
     serve_value(bus, "test/quick", b"q")
-    bus.serve("test/slow", lambda key: [Route(key, lambda _: Answer(b"", MSGPACK), Lane.FILES)])
+    bus.serve("test/slow", lambda key: [Route(key, lambda _: Answer(b"", MSGPACK), QueryLane.FILES)])
     ask_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow", replies.put, timeout=DEADLINE_S)
@@ -212,7 +212,7 @@ def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Sessi
 def test_samples_arrive_with_their_encoding_and_a_failing_reader_does_no_harm(bus: Bus, client: zenoh.Session) -> None:
     got: queue.SimpleQueue[tuple[bytes, str]] = queue.SimpleQueue()
 
-    def receive(sample: Sample) -> None:
+    def receive(sample: InputSample) -> None:
         if sample.payload == b"bad":
             raise ValueError
         got.put((sample.payload, sample.encoding))
@@ -282,7 +282,7 @@ def test_the_attachment_of_a_query_is_handed_on(bus: Bus, client: zenoh.Session)
         seen.put(request.attachment)
         return Answer(b"", MSGPACK)
 
-    bus.serve("test/who", lambda _: [Route("test/who", answer, Lane.FILES)])
+    bus.serve("test/who", lambda _: [Route("test/who", answer, QueryLane.FILES)])
     ask_ok(client, "test/who")
     assert seen.get(timeout=DEADLINE_S) is None
     list(client.get("test/who", attachment=b"me", timeout=DEADLINE_S))
@@ -297,8 +297,8 @@ def test_a_picture_that_takes_long_keeps_no_other_query_waiting(bus: Bus, client
         drawn.wait(DEADLINE_S)
         return Answer(b"jpeg", "image/jpeg")
 
-    bus.serve("test/overlay", lambda _: [Route("test/overlay", draw, Lane.DRAWING)])
-    bus.serve("test/list", lambda _: [Route("test/list", lambda _: Answer(b"list", MSGPACK), Lane.FILES)])
+    bus.serve("test/overlay", lambda _: [Route("test/overlay", draw, QueryLane.DRAWING)])
+    bus.serve("test/list", lambda _: [Route("test/list", lambda _: Answer(b"list", MSGPACK), QueryLane.FILES)])
     assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
     waiting = client.get("test/overlay", timeout=DEADLINE_S)
     assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
@@ -319,8 +319,8 @@ def test_a_file_that_takes_long_keeps_no_command_waiting(
         assert read.wait(DEADLINE_S)
         return Answer(b"window", MSGPACK)
 
-    bus.serve("test/window", lambda _: [Route("test/window", reading, Lane.FILES)])
-    bus.serve("test/hold", lambda _: [Route("test/hold", lambda _: Answer(b"held", MSGPACK), Lane.COMMANDS)])
+    bus.serve("test/window", lambda _: [Route("test/window", reading, QueryLane.FILES)])
+    bus.serve("test/hold", lambda _: [Route("test/hold", lambda _: Answer(b"held", MSGPACK), QueryLane.COMMANDS)])
     assert ask_ok(client, "test/hold").payload.to_bytes() == b"held"
     waiting = client.get("test/window", timeout=DEADLINE_S)
     assert entered.wait(DEADLINE_S)
@@ -343,7 +343,7 @@ def test_when_a_query_came_is_known_however_long_it_waited(bus: Bus, client: zen
         return Answer(b"", MSGPACK)
 
     serve_value(bus, "test/quick", b"q")
-    bus.serve("test/slow", lambda key: [Route(key, slow, Lane.FILES)])
+    bus.serve("test/slow", lambda key: [Route(key, slow, QueryLane.FILES)])
     ask_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow", replies.put, timeout=DEADLINE_S)

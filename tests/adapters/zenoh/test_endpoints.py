@@ -35,7 +35,7 @@ KEY = "tls/vehicle:7448#connect_private_key_base64=c2VjcmV0;enable_mtls=true"
 )
 def test_whom_it_lets_in(text: str, certificates_asked: bool, open_to_all: bool) -> None:
     endpoint = Endpoint.parse(text)
-    assert endpoint.lets_in_whoever_comes(certificates_asked=certificates_asked) is open_to_all
+    assert endpoint.admits_anyone(certificates_required=certificates_asked) is open_to_all
 
 
 @pytest.mark.parametrize("text", ["", "localhost", "tcp/127.0.0.1", "tcp/127.0.0.1:abc", "tcp/h:65536", "foo/h:1"])

@@ -10,7 +10,7 @@ import zenoh
 
 from coec.adapters.ros.wire.rmw_zenoh import TopicKey
 from coec.adapters.zenoh.bus import Bus, open_session
-from coec.adapters.zenoh.inputs import Sample, input_of
+from coec.adapters.zenoh.inputs import InputSample, input_of
 from coec.config import Config, LimitsConfig, ZenohConfig
 from coec.errors import UsageError
 from ports import free_port
@@ -43,7 +43,7 @@ def session() -> Iterator[zenoh.Session]:
         yield opened
 
 
-Heard = Callable[[Config], "queue.SimpleQueue[Sample]"]
+Heard = Callable[[Config], "queue.SimpleQueue[InputSample]"]
 
 
 @pytest.fixture
@@ -51,8 +51,8 @@ def heard(session: zenoh.Session) -> Iterator[Heard]:
     """Whatever the service hears of the camera, put by the same session: it comes before `put` returns."""
     bus = Bus(session)
 
-    def listen(config: Config) -> queue.SimpleQueue[Sample]:
-        got: queue.SimpleQueue[Sample] = queue.SimpleQueue()
+    def listen(config: Config) -> queue.SimpleQueue[InputSample]:
+        got: queue.SimpleQueue[InputSample] = queue.SimpleQueue()
         bus.subscribe(input_of(config.every_pair[0].camera, config), got.put)
         return got
 
@@ -65,7 +65,7 @@ def test_the_type_comes_from_the_key_and_the_number_from_beside_the_message(
 ) -> None:
     got = heard(configured("rmw_zenoh", "/front/image_raw"))
     session.put(IMAGE, b"\0\1\0\0", attachment=ATTACHMENT)
-    assert got.get(timeout=DEADLINE_S) == Sample(b"\0\1\0\0", "application/cdr;sensor_msgs/msg/Image", ATTACHMENT)
+    assert got.get(timeout=DEADLINE_S) == InputSample(b"\0\1\0\0", "application/cdr;sensor_msgs/msg/Image", ATTACHMENT)
 
 
 def test_lyricals_large_messages_come_in_and_those_for_others_do_not(session: zenoh.Session, heard: Heard) -> None:
@@ -117,13 +117,17 @@ def test_a_key_without_a_type_still_comes_in_to_be_counted(session: zenoh.Sessio
 def test_a_bridge_puts_a_topic_on_its_name(session: zenoh.Session, heard: Heard, namespace: str, key: str) -> None:
     got = heard(configured("ros2dds", "/front/image_raw", namespace=namespace))
     session.put(key, b"\0\1\0\0")
-    assert got.get(timeout=DEADLINE_S) == Sample(b"\0\1\0\0", "zenoh/bytes", None, origin=str(session.zid()).encode())
+    assert got.get(timeout=DEADLINE_S) == InputSample(
+        b"\0\1\0\0", "zenoh/bytes", None, origin=str(session.zid()).encode()
+    )
 
 
 def test_keys_stay_keys_beside_topics(session: zenoh.Session, heard: Heard) -> None:
     got = heard(configured("rmw_zenoh", {"key": "front/camera"}))
     session.put("front/camera", b"x", encoding="application/msgpack", attachment=b"of the sender's own")
-    assert got.get(timeout=DEADLINE_S) == Sample(b"x", "application/msgpack", None, origin=str(session.zid()).encode())
+    assert got.get(timeout=DEADLINE_S) == InputSample(
+        b"x", "application/msgpack", None, origin=str(session.zid()).encode()
+    )
 
 
 def test_keys_are_read_and_written_alike() -> None:

@@ -14,7 +14,7 @@ import zenoh
 
 import rmw_zenoh_defaults
 from coec.adapters.ros.wire.qos import Qos
-from coec.adapters.zenoh.bus import MSGPACK, Answer, Bus, Lane, Route, is_connected, open_session
+from coec.adapters.zenoh.bus import MSGPACK, Answer, Bus, QueryLane, Route, is_connected, open_session
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.ros_publisher import RosPublishers
 from coec.adapters.zenoh.ros_side import RosSide
@@ -23,7 +23,7 @@ from coec.schemas.ros_names import TF_STATIC
 from conftest import REPOSITORY
 from fakes import wait_until
 from ports import free_port
-from ros_nodes import Driver
+from ros_nodes import RosDriver
 
 LIMITS = LimitsConfig()
 PATIENCE_S = 30.0
@@ -65,7 +65,7 @@ def plain(endpoint: str) -> Iterator[zenoh.Session]:
 
 
 ROUTERS: dict[str, Opened] = {
-    "rmw_zenoh's": rmw_zenoh_defaults.router,
+    "rmw_zenoh's": rmw_zenoh_defaults.rmw_router,
     "shipped": shipped,
     "embedded": embedded,
     "plain": plain,
@@ -85,14 +85,14 @@ def endpoint() -> str:
 def test_default_nodes_and_the_service_reach_each_other(kind: str, endpoint: str) -> None:
     with ExitStack() as stack:
         stack.enter_context(ROUTERS[kind](endpoint))
-        node = stack.enter_context(rmw_zenoh_defaults.node(endpoint))
+        node = stack.enter_context(rmw_zenoh_defaults.rmw_node(endpoint))
         service = stack.enter_context(open_session(ZenohConfig(connect=(endpoint,)), LIMITS))
         side = RosSide(service, ROS)
         stack.callback(side.close)
         bus = Bus(service)
         images: list[bytes] = []
         bus.subscribe(side.input_of(ROS.awaited[0].camera), lambda sample: images.append(sample.payload))
-        driver = Driver(node, TOPIC, "CompressedImage", 1)
+        driver = RosDriver(node, TOPIC, "CompressedImage", 1)
         stack.callback(driver.close)
         wait_until(lambda: bool(images) or driver.sends(b"frame"), "the service gets the node's images", PATIENCE_S)
         wait_until(lambda: bool(side.topics().of(TOPIC)), "the service sees the publisher", PATIENCE_S)
@@ -124,14 +124,14 @@ def test_default_nodes_and_the_service_reach_each_other(kind: str, endpoint: str
 def test_default_nodes_reach_each_other(kind: str, endpoint: str) -> None:
     with ExitStack() as stack:
         stack.enter_context(ROUTERS[kind](endpoint))
-        one, other = (stack.enter_context(rmw_zenoh_defaults.node(endpoint)) for _ in range(2))
+        one, other = (stack.enter_context(rmw_zenoh_defaults.rmw_node(endpoint)) for _ in range(2))
         got: list[bytes] = []
 
         def take(sample: zenoh.Sample) -> None:
             got.append(sample.payload.to_bytes())
 
         one.declare_subscriber(f"0{TOPIC}/*/*", zenoh.handlers.Callback(take, indirect=False))
-        driver = Driver(other, TOPIC, "CompressedImage", 1)
+        driver = RosDriver(other, TOPIC, "CompressedImage", 1)
         wait_until(lambda: bool(got) or driver.sends(b"frame"), "one node gets what the other sends", PATIENCE_S)
         driver.close()
 
@@ -148,11 +148,13 @@ def test_a_session_waits_for_its_router_and_finds_it_again(endpoint: str) -> Non
         samples: list[bytes] = []
         bus.subscribe(RosSide(service, ROS).input_of(ROS.awaited[0].camera), lambda one: samples.append(one.payload))
         bus.declare_alive("test/alive")
-        bus.serve("test/value", lambda _: [Route("test/value", lambda __: Answer(b"value", MSGPACK), Lane.AT_ONCE)])
+        bus.serve(
+            "test/value", lambda _: [Route("test/value", lambda __: Answer(b"value", MSGPACK), QueryLane.AT_ONCE)]
+        )
         bus.publish("test/lost", Answer(b"", MSGPACK))  # to nobody, and at once
         for at in (endpoint, endpoint, second):
-            with rmw_zenoh_defaults.router(at), connected((at,), PATIENCE_S) as client:
-                driver = Driver(client, TOPIC, "CompressedImage", 1)
+            with rmw_zenoh_defaults.rmw_router(at), connected((at,), PATIENCE_S) as client:
+                driver = RosDriver(client, TOPIC, "CompressedImage", 1)
                 wait_until(lambda: bool(list(client.get("test/value", timeout=1.0))), "the answer", PATIENCE_S)
                 wait_until(lambda: bool(list(client.liveliness().get("test/alive"))), "the token", PATIENCE_S)
                 wait_until(partial(_arrives, samples, driver), "the samples", PATIENCE_S)
@@ -163,7 +165,7 @@ def test_a_session_waits_for_its_router_and_finds_it_again(endpoint: str) -> Non
         bus.undeclare_queryables()
 
 
-def _arrives(samples: list[bytes], driver: Driver) -> bool:
+def _arrives(samples: list[bytes], driver: RosDriver) -> bool:
     return bool(samples) or driver.sends(b"frame")
 
 

@@ -14,14 +14,14 @@ import zenoh
 
 from coec.adapters.zenoh import presence
 from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.presence import Presence, next_step, outranking
+from coec.adapters.zenoh.presence import SingletonGuard, next_step, outranking
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import UnavailableError
 from coec.schemas.base import to_json
 from coec.schemas.keys import Claim, Keys
 from fakes import wait_until
 from ports import free_port
-from statuses import a_status
+from statuses import status_reply
 
 KEYS = Keys("coec", "vehicle")
 LIMITS = LimitsConfig()
@@ -29,7 +29,7 @@ STARTED_NS = 1_700_000_000 * 10**9
 DEADLINE_S = 20.0
 ROUNDS = 20
 
-Made = Callable[..., Presence]
+Made = Callable[..., SingletonGuard]
 
 
 @pytest.fixture(scope="module")
@@ -57,15 +57,15 @@ def daemon(endpoint: str) -> Iterator[Made]:
     """Makes one of a vehicle, which is closed at the end of the test."""
     with ExitStack() as stack:
 
-        def make(session: zenoh.Session, keys: Keys = KEYS) -> Presence:
-            one = Presence(session, ZenohConfig(connect=(endpoint,)), LIMITS, keys, STARTED_NS)
+        def make(session: zenoh.Session, keys: Keys = KEYS) -> SingletonGuard:
+            one = SingletonGuard(session, ZenohConfig(connect=(endpoint,)), LIMITS, keys, STARTED_NS)
             stack.callback(lambda: one.close(DEADLINE_S))
             return one
 
         yield make
 
 
-def serves(one: Presence) -> bool:
+def serves(one: SingletonGuard) -> bool:
     try:
         one.claim(threading.Event())
     except UnavailableError:
@@ -136,7 +136,7 @@ def held(session: zenoh.Session, *keys: str) -> Iterator[None]:
 @contextmanager
 def answering_status(session: zenoh.Session, started_ns: int) -> Iterator[None]:
     """What a service of an earlier version answers."""
-    payload = to_json(a_status(vehicle=KEYS.vehicle, started_ns=started_ns))
+    payload = to_json(status_reply(vehicle=KEYS.vehicle, started_ns=started_ns))
 
     def answer(query: zenoh.Query) -> None:
         with query:
@@ -230,7 +230,7 @@ def test_where_queries_are_forbidden_tokens_count(monkeypatch: pytest.MonkeyPatc
     with open_session(ZenohConfig(file=file), LIMITS), open_session(config, LIMITS) as here:
         wait_until(lambda: bool(list(here.info.routers_zid())), "the router is there")
         for key, said in ((FAKED, "by another daemon"), (KEYS.alive("front"), "somebody holds the token")):
-            one = Presence(here, config, LIMITS, KEYS, STARTED_NS)
+            one = SingletonGuard(here, config, LIMITS, KEYS, STARTED_NS)
             with held(here, key), pytest.raises(UnavailableError, match=said):
                 one.claim(threading.Event())
             assert one.close(DEADLINE_S)
@@ -253,7 +253,7 @@ def test_two_that_started_before_their_router_see_each_other_when_it_is_there(
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = ZenohConfig(connect=(endpoint,))
     with open_session(config, LIMITS) as here, open_session(config, LIMITS) as there:
-        both = [Presence(session, config, LIMITS, KEYS, STARTED_NS) for session in (here, there)]
+        both = [SingletonGuard(session, config, LIMITS, KEYS, STARTED_NS) for session in (here, there)]
         assert [serves(one) for one in both] == [True, True]
         with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LIMITS):
             for one in both:
@@ -302,7 +302,7 @@ def test_tokens_that_a_router_hides_are_told_of(
         rules = stack.enter_context(ExitStack())
         rules.enter_context(open_session(ZenohConfig(file=file), LIMITS))
         session = stack.enter_context(open_session(config, LIMITS))
-        one = Presence(session, config, LIMITS, KEYS, STARTED_NS)
+        one = SingletonGuard(session, config, LIMITS, KEYS, STARTED_NS)
         wait_until(lambda: bool(list(session.info.routers_zid())), "the router is there")
         assert serves(one)
         assert one.hidden

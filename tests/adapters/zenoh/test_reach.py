@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.listening import Address, Transport
+from coec.adapters.system.listening import IpAddress, Transport
 from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.settings import settings_of
 from coec.config import LimitsConfig, ZenohConfig
@@ -19,10 +19,10 @@ LIMITS = LimitsConfig()
 def outside(config: ZenohConfig, *waiting: tuple[Transport, int, str]) -> str | None:
     """Why others reach a session, on a computer where these wait at ports."""
 
-    def addresses(protocol: Transport, port: int) -> set[Address]:
+    def addresses(protocol: Transport, port: int) -> set[IpAddress]:
         return {ipaddress.ip_address(address) for kind, at, address in waiting if (kind, at) == (protocol, port)}
 
-    return Reach(settings_of(config, LIMITS), addresses).outside()
+    return Reach(settings_of(config, LIMITS), addresses).exposure()
 
 
 def to(*endpoints: str) -> ZenohConfig:
@@ -80,8 +80,8 @@ def test_a_peer_that_gossips_may_connect_to_anybody(tmp_path: Path, said: str, f
 
 
 def test_what_cannot_be_told_is_not_this_computers_alone() -> None:
-    def untold(_: Transport, __: int) -> set[Address]:
+    def untold(_: Transport, __: int) -> set[IpAddress]:
         raise FileNotFoundError
 
     reach = Reach(settings_of(to("tcp/127.0.0.1:7447"), LIMITS), untold)
-    assert reach.outside() == "this system does not show where its router listens"
+    assert reach.exposure() == "this system does not show where its router listens"

@@ -13,18 +13,18 @@ import pytest
 import zenoh
 
 from coec.adapters.zenoh import client
-from coec.adapters.zenoh.client import JSON, Bounds, Replies, ask, ask_one, connected
-from coec.adapters.zenoh.words import WAITING_BYTES, Words
+from coec.adapters.zenoh.client import JSON, Replies, ReplyBounds, connected, query_all, query_one
+from coec.adapters.zenoh.words import MAX_WAITING_BYTES, HeartbeatReceiver
 from coec.errors import NotFoundError, RemoteError
 from coec.schemas.base import to_json
 from coec.schemas.keys import Keys
-from coec.schemas.last_word import MAX_BYTES
+from coec.schemas.last_word import MAX_HEARTBEAT_BYTES
 from coec.schemas.replies import ErrorReply
 from e2e.processes import Router
 from fakes import wait_until
 
 PATIENCE_S = 20.0
-SMALL = Bounds(replies=5, total_bytes=1000, reply_bytes=400)
+SMALL = ReplyBounds(replies=5, total_bytes=1000, reply_bytes=400)
 NUMBERS = itertools.count()
 
 
@@ -135,7 +135,7 @@ def test_a_flood_of_replies_ends_the_query(router: Router, monkeypatch: pytest.M
     with answering(router, f"{key}/*", flood), connected([router.endpoint], 5.0) as session:
         try:
             with pytest.raises(RemoteError, match="more than 5 replies"):
-                ask(session, f"{key}/*", 600.0)
+                query_all(session, f"{key}/*", 600.0)
         finally:
             over.set()
 
@@ -149,21 +149,23 @@ def test_an_answer_larger_than_a_message_is_no_answer(router: Router) -> None:
         connected([router.endpoint], 5.0) as session,
         pytest.raises(NotFoundError),
     ):
-        ask_one(session, key, 5.0)
-    assert str(client.MAX_MESSAGE_BYTES) in str(client.nobody(key, service_is_there=True))
+        query_one(session, key, 5.0)
+    assert str(client.MAX_MESSAGE_BYTES) in str(client.no_reply_error(key, service_is_there=True))
 
 
 @pytest.mark.fault("words of the largest size, faster than they are read", "those beyond 64 MiB are counted as lost")
 def test_words_that_wait_are_bounded_in_bytes() -> None:
     nowhere = cast(Any, None)
-    words = Words(nowhere, nowhere, Keys("coec", "*"), 1.0)
-    said = SimpleNamespace(kind=zenoh.SampleKind.PUT, key_expr="coec/@v1/a/last/b", payload=Payload(MAX_BYTES))
-    count = WAITING_BYTES // MAX_BYTES
+    words = HeartbeatReceiver(nowhere, nowhere, Keys("coec", "*"), 1.0)
+    said = SimpleNamespace(
+        kind=zenoh.SampleKind.PUT, key_expr="coec/@v1/a/last/b", payload=Payload(MAX_HEARTBEAT_BYTES)
+    )
+    count = MAX_WAITING_BYTES // MAX_HEARTBEAT_BYTES
     for _ in range(count + 3):
-        words._said(cast(zenoh.Sample, said))
+        words._on_published(cast(zenoh.Sample, said))
     assert words.refused() == {"too_many_at_once": 3}
-    assert sum(1 for _ in words.take()) == count
-    words._said(cast(zenoh.Sample, said))
+    assert sum(1 for _ in words.pending()) == count
+    words._on_published(cast(zenoh.Sample, said))
     assert words.refused() == {}, "there is room again"
 
 

@@ -15,13 +15,13 @@ from coec.adapters.ros.dialects import dialect_of
 from coec.adapters.ros.messages import TF
 from coec.adapters.ros.wire.dialect import Dialect
 from coec.adapters.ros.wire.qos import STATIC, Qos
-from coec.adapters.ros.wire.rmw_zenoh import Attachment, Node, RmwZenoh, gid_of
+from coec.adapters.ros.wire.rmw_zenoh import MessageAttachment, Node, RmwZenoh, gid_of
 from coec.adapters.ros.wire.ros2dds import Ros2dds
 from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
 from coec.config import LimitsConfig, RosConfig, ZenohConfig
 from fakes import wait_until
-from pair_bench import configuration
+from pair_bench import pair_configuration
 from ports import free_port
 
 TIMEOUT_S = 20.0
@@ -77,7 +77,7 @@ def test_messages_are_numbered_from_one_and_name_the_publisher_by_its_token(
     publishers = publishers_of(session, rmw_of(session))
     publisher = publishers.publisher("/chatter", STRING, RELIABLE)
     subscriber = client.declare_subscriber(KEY, queued())
-    wait_until(lambda: publisher.is_heard, "somebody who listens", TIMEOUT_S)
+    wait_until(lambda: publisher.has_subscribers, "somebody who listens", TIMEOUT_S)
 
     for index in range(3):
         publisher.put(b"\0\1\0\0" + bytes([index]), 1_000 + index)
@@ -85,10 +85,10 @@ def test_messages_are_numbered_from_one_and_name_the_publisher_by_its_token(
     samples = [received(subscriber) for _ in range(3)]
     token = f"@ros2_lv/0/{session.info.zid()}/0/1/MP/%/%shuttle/coec/%chatter/std_msgs::msg::dds_::String_/RIHS01_00"
     gid = gid_of(f"{token}/::,10:,:,:,,")
-    assert [Attachment.parse(s.attachment.to_bytes()) for s in samples if s.attachment is not None] == [
-        Attachment(1, 1000, gid),
-        Attachment(2, 1001, gid),
-        Attachment(3, 1002, gid),
+    assert [MessageAttachment.parse(s.attachment.to_bytes()) for s in samples if s.attachment is not None] == [
+        MessageAttachment(1, 1000, gid),
+        MessageAttachment(2, 1001, gid),
+        MessageAttachment(3, 1002, gid),
     ]
     assert {str(sample.encoding) for sample in samples} == {"zenoh/bytes"}
     assert [sample.payload.to_bytes()[-1] for sample in samples] == [0, 1, 2]
@@ -136,7 +136,7 @@ def test_whoever_comes_later_gets_the_last_message_of_a_latched_topic(
     sample = samples.get(timeout=TIMEOUT_S)
     assert sample.payload.to_bytes() == b"second"
     assert sample.attachment is not None
-    assert (told := Attachment.parse(sample.attachment.to_bytes())) is not None
+    assert (told := MessageAttachment.parse(sample.attachment.to_bytes())) is not None
     assert told.sequence == 2
     late.undeclare()
 
@@ -144,15 +144,15 @@ def test_whoever_comes_later_gets_the_last_message_of_a_latched_topic(
 def test_nobody_listens_to_a_topic_that_nobody_subscribes_to(session: zenoh.Session) -> None:
     publishers = publishers_of(session, rmw_of(session))
 
-    assert not publishers.publisher("/chatter", STRING, RELIABLE).is_heard
-    assert publishers.publisher("/tf_static", STRING, STATIC).is_heard
+    assert not publishers.publisher("/chatter", STRING, RELIABLE).has_subscribers
+    assert publishers.publisher("/tf_static", STRING, STATIC).has_subscribers
 
 
 def test_beside_a_bridge_messages_go_bare_on_plain_keys(session: zenoh.Session, client: zenoh.Session) -> None:
     publishers = publishers_of(session, Ros2dds(str(session.info.zid()), ""))
     publisher = publishers.publisher("/chatter", STRING, RELIABLE)
     subscriber = client.declare_subscriber("chatter", queued())
-    wait_until(lambda: publisher.is_heard, "somebody who listens", TIMEOUT_S)
+    wait_until(lambda: publisher.has_subscribers, "somebody who listens", TIMEOUT_S)
 
     publisher.put(b"hello", 1)
 
@@ -194,7 +194,7 @@ def test_a_service_publishes_as_its_configuration_says(
     key: str,
     token: str,
 ) -> None:
-    native = configuration(Path("state"), vehicle="shuttle-7")
+    native = pair_configuration(Path("state"), vehicle="shuttle-7")
     config = native.model_copy(update={"middleware": middleware, "ros": ros})
     dialect = dialect_of(config, str(session.info.zid()))
     assert dialect is not None

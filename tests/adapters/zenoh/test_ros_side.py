@@ -12,7 +12,7 @@ import zenoh
 from coec.adapters.zenoh import ros_topics
 from coec.adapters.zenoh.bus import Bus, open_session
 from coec.adapters.zenoh.ros_side import RosSide
-from coec.adapters.zenoh.ros_topics import Topics, listed
+from coec.adapters.zenoh.ros_topics import RosTopicList, listed
 from coec.config import Config, LimitsConfig, ZenohConfig
 from coec.schemas.ros_names import ros_name
 from fakes import wait_until
@@ -110,7 +110,7 @@ def test_elsewhere_subscribing_is_enough(session: zenoh.Session, stack: ExitStac
     side = RosSide(session, config.model_copy(update={"middleware": middleware}))
     stack.callback(side.close)
     assert [side.input_of(stream).token for stream in config.every_pair[0].streams.values()] == [None] * 3
-    assert side.topics() == Topics()
+    assert side.topics() == RosTopicList()
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_publishers_are_seen_with_type_and_node_while_they_are_there(
         late.close()
         for token in tokens:
             token.undeclare()
-        wait_until(lambda: side.topics() == Topics(), "they are gone")
+        wait_until(lambda: side.topics() == RosTopicList(), "they are gone")
 
 
 def test_a_bridges_publishers_are_seen_in_its_namespace(session: zenoh.Session, stack: ExitStack) -> None:
@@ -168,7 +168,7 @@ def test_a_bridges_publishers_are_seen_in_its_namespace(session: zenoh.Session, 
 def test_a_token_that_tells_of_no_publisher_is_counted(session: zenoh.Session, side: RosSide, token: str) -> None:
     declared = session.liveliness().declare_token(token)
     wait_until(lambda: bool(side.topics().left_out), "it is seen")
-    assert side.topics() == Topics((), Counter(malformed=1))
+    assert side.topics() == RosTopicList((), Counter(malformed=1))
     declared.undeclare()
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.matching import is_heard
+from coec.adapters.zenoh.matching import has_subscribers
 from e2e.processes import environment
 from fakes import wait_until
 from ports import free_port
@@ -75,7 +75,7 @@ def test_no_memory_of_routers_that_are_gone_is_kept(record_property: Any) -> Non
                 zenoh.open(settings("client", endpoint, shares_memory=False)) as session,
             ):
                 sender = session.declare_publisher("in/camera", congestion_control=zenoh.CongestionControl.BLOCK)
-                wait_until(partial(is_heard, sender), "the receiver")
+                wait_until(partial(has_subscribers, sender), "the receiver")
                 for _ in range(MESSAGES):
                     sender.put(PAYLOAD)
                 told = [receiver.stdout.readline() for _ in range(MESSAGES)]

@@ -26,19 +26,19 @@ from zenoh.ext import (
 )
 
 from certificates import TestAuthority, make_authority
-from coec.adapters.tls.conversation import Speaker
+from coec.adapters.tls.conversation import CommandSender
 from coec.adapters.zenoh.bus import JSON, open_session
-from coec.adapters.zenoh.client import Way, connected_by, is_alive
+from coec.adapters.zenoh.client import RouterAddress, connected_by, is_alive
 from coec.adapters.zenoh.inputs import on_key
-from coec.adapters.zenoh.presence import Presence
-from coec.adapters.zenoh.proven import give
+from coec.adapters.zenoh.presence import SingletonGuard
+from coec.adapters.zenoh.proven import send_authenticated
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.config import IDENTITY, Config, SenderConfig, ZenohConfig
 from coec.errors import ConnectionFailedError, UnavailableError
-from doors import Door, opened
+from doors import ShippedRouter, shipped_router
 from fakes import wait_until
-from ros_nodes import Driver, described
-from vehicles import KEYS, LIMITS, PAIR, Vehicle, serving
+from ros_nodes import RosDriver, type_chunks
+from vehicles import KEYS, PAIR, VEHICLE_LIMITS, ServingVehicle, serving
 
 PATIENCE_S = 20.0
 REFUSED_S = 0.5
@@ -88,8 +88,8 @@ NOT_READABLE = (f"{KEYS.root}/**", "coec/@v1/**", "coec/**", "**", "@/**", "@/*/
 
 
 @pytest.fixture(scope="module")
-def door(authority: TestAuthority, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
-    with opened(authority, tmp_path_factory.mktemp("router")) as made:
+def door(authority: TestAuthority, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ShippedRouter]:
+    with shipped_router(authority, tmp_path_factory.mktemp("router")) as made:
         yield made
 
 
@@ -97,7 +97,7 @@ def door(authority: TestAuthority, tmp_path_factory: pytest.TempPathFactory) -> 
 class Town:
     """A vehicle, and one session of everybody."""
 
-    vehicle: Vehicle
+    vehicle: ServingVehicle
     vehicle_session: zenoh.Session
     sensors: zenoh.Session
     operator: zenoh.Session
@@ -114,7 +114,9 @@ class Town:
 
 
 @pytest.fixture(scope="module", params=["on the router's computer", "on another computer"])
-def town(request: pytest.FixtureRequest, door: Door, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
+def town(
+    request: pytest.FixtureRequest, door: ShippedRouter, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Town]:
     away = request.param == "on another computer"
     file = door.authority.session("vehicle", door.certified) if away else None
     config = ZenohConfig(connect=(door.loopback,), file=file)
@@ -129,7 +131,7 @@ def town(request: pytest.FixtureRequest, door: Door, tmp_path_factory: pytest.Te
         camera = side.input_of(ROS_VEHICLE.every_pair[0].camera)
         vehicle.bus.subscribe(camera, lambda sample: images.append(sample.payload))
         sessions = {
-            name: stack.enter_context(connected_by(door.way(name), PATIENCE_S))
+            name: stack.enter_context(connected_by(door.connection(name), PATIENCE_S))
             for name in ("sensors", "operator", "viewer", "ros")
         }
         made = Town(vehicle, vehicle.bus._session, side=side, frames=frames, images=images, **sessions)
@@ -176,9 +178,9 @@ def test_what_includes_more_than_is_allowed_is_not_answered(town: Town, name: st
     assert answers(town.of(name), key) == []
 
 
-def test_the_operator_commands(town: Town, door: Door) -> None:
-    speaker = Speaker(door.authority.credentials("operator"), "vehicle")
-    told = give(town.operator, f"{COMMAND}?format=json", None, PATIENCE_S, speaker, JSON)
+def test_the_operator_commands(town: Town, door: ShippedRouter) -> None:
+    speaker = CommandSender(door.authority.credentials("operator"), "vehicle")
+    told = send_authenticated(town.operator, f"{COMMAND}?format=json", None, PATIENCE_S, speaker, JSON)
     assert json.loads(told.payload)["code"] == "held"
 
 
@@ -272,14 +274,14 @@ def test_nobody_is_alive_for_the_vehicle(town: Town, name: str) -> None:
 
 
 @pytest.fixture
-def driver(town: Town) -> Iterator[Driver]:
+def driver(town: Town) -> Iterator[RosDriver]:
     """A node that publishes the vehicle's images."""
-    made = Driver(town.ros, IMAGE_TOPIC, "CompressedImage", 10)
+    made = RosDriver(town.ros, IMAGE_TOPIC, "CompressedImage", 10)
     yield made
     made.close()
 
 
-def test_nodes_and_the_service_see_each_other(town: Town, driver: Driver) -> None:
+def test_nodes_and_the_service_see_each_other(town: Town, driver: RosDriver) -> None:
     del driver
     wait_until(lambda: bool(town.side.topics().of(IMAGE_TOPIC)), "the service sees the driver")
     assert town.side.topics().of(IMAGE_TOPIC)[0].node == "/driver"
@@ -292,7 +294,7 @@ def test_nodes_and_the_service_see_each_other(town: Town, driver: Driver) -> Non
 
 
 @pytest.mark.fault("messages forged on a sensor's topic with any certificate but a node's", "the vehicle gets none")
-def test_topics_come_from_nodes_only(town: Town, driver: Driver) -> None:
+def test_topics_come_from_nodes_only(town: Town, driver: RosDriver) -> None:
     town.images.clear()
     for name in ("operator", "viewer", "sensors"):
         town.of(name).put(str(driver.publisher.key_expr), name.encode())
@@ -303,7 +305,7 @@ def test_topics_come_from_nodes_only(town: Town, driver: Driver) -> None:
 
 @pytest.mark.fault("a topic subscribed to, or nodes listed, with another certificate than a node's", "nothing comes")
 @pytest.mark.parametrize("name", ["operator", "viewer", "sensors"])
-def test_topics_go_to_nodes_and_the_vehicle_only(town: Town, driver: Driver, name: str) -> None:
+def test_topics_go_to_nodes_and_the_vehicle_only(town: Town, driver: RosDriver, name: str) -> None:
     got: list[str] = []
 
     def receive(sample: zenoh.Sample) -> None:
@@ -346,7 +348,7 @@ def test_who_comes_late_gets_the_static_transforms(town: Town) -> None:
         publisher.undeclare()
 
 
-def test_the_service_speaks_to_ros_but_is_no_driver(town: Town, door: Door) -> None:
+def test_the_service_speaks_to_ros_but_is_no_driver(town: Town, door: ShippedRouter) -> None:
     by_certificate = door.authority.session("vehicle", door.certified)
     got: list[str] = []
 
@@ -354,8 +356,8 @@ def test_the_service_speaks_to_ros_but_is_no_driver(town: Town, door: Door) -> N
         got.append(str(sample.key_expr))
 
     subscriber = town.ros.declare_subscriber("0/**", zenoh.handlers.Callback(hear, indirect=False))
-    forged = f"0{IMAGE_TOPIC}/{described('CompressedImage')}"
-    with connected_by(Way((door.certified,), by_certificate), PATIENCE_S) as session:
+    forged = f"0{IMAGE_TOPIC}/{type_chunks('CompressedImage')}"
+    with connected_by(RouterAddress((door.certified,), by_certificate), PATIENCE_S) as session:
         wait_until(lambda: bool(got or session.put("0/diagnostics/a/b", b"x")), "what the service says")
         session.put(forged, b"forged")
         session.put("0/coec/front/overlay/a/b", b"x")
@@ -366,7 +368,7 @@ def test_the_service_speaks_to_ros_but_is_no_driver(town: Town, door: Door) -> N
 
 @pytest.mark.fault("a session with a certificate that has expired, is foreign, or none", "it is not opened")
 @pytest.mark.parametrize("kind", ["expired", "foreign", "none", "plain tcp"])
-def test_who_shows_no_good_certificate_gets_no_session(door: Door, tmp_path: Path, kind: str) -> None:
+def test_who_shows_no_good_certificate_gets_no_session(door: ShippedRouter, tmp_path: Path, kind: str) -> None:
     file: Path | None = None
     endpoint = door.certified
     if kind == "expired":
@@ -381,7 +383,7 @@ def test_who_shows_no_good_certificate_gets_no_session(door: Door, tmp_path: Pat
         file.write_text(json.dumps({"transport": {"link": {"tls": tls}}}))
     else:
         endpoint = f"tcp/127.0.0.1:{endpoint.rpartition(':')[2]}"
-    with pytest.raises(ConnectionFailedError), connected_by(Way((endpoint,), file), REFUSED_S):
+    with pytest.raises(ConnectionFailedError), connected_by(RouterAddress((endpoint,), file), REFUSED_S):
         pass
 
 
@@ -391,10 +393,10 @@ def test_a_session_ends_with_its_certificate(
     authority: TestAuthority, tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     with ExitStack() as stack:
-        door = stack.enter_context(opened(authority, tmp_path))
+        door = stack.enter_context(shipped_router(authority, tmp_path))
         brief = authority.sign_for("operator", "brief", seconds=BRIEF_S)
         began_s = time.monotonic()
-        session = stack.enter_context(connected_by(door.way(brief), PATIENCE_S))
+        session = stack.enter_context(connected_by(door.connection(brief), PATIENCE_S))
         assert list(session.info.routers_zid())
         wait_until(lambda: not list(session.info.routers_zid()), "the end of the session")
         closed_s = time.monotonic() - began_s
@@ -407,10 +409,10 @@ def test_a_session_ends_with_its_certificate(
 )
 def test_a_second_daemon_on_another_computer_sees_the_first(authority: TestAuthority, tmp_path: Path) -> None:
     with ExitStack() as stack:
-        door = stack.enter_context(opened(authority, tmp_path))
+        door = stack.enter_context(shipped_router(authority, tmp_path))
         service = ZenohConfig(file=authority.session("vehicle", door.certified))
-        here, there = (stack.enter_context(open_session(service, LIMITS)) for _ in range(2))
-        first, second = (Presence(session, service, LIMITS, KEYS, 1) for session in (here, there))
+        here, there = (stack.enter_context(open_session(service, VEHICLE_LIMITS)) for _ in range(2))
+        first, second = (SingletonGuard(session, service, VEHICLE_LIMITS, KEYS, 1) for session in (here, there))
         first.claim(threading.Event())
         with pytest.raises(UnavailableError, match="by another daemon"):
             second.claim(threading.Event())
@@ -423,10 +425,10 @@ def test_sockets_that_say_nothing_keep_nobody_out(
     authority: TestAuthority, tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     with ExitStack() as stack:
-        door = stack.enter_context(opened(authority, tmp_path))
+        door = stack.enter_context(shipped_router(authority, tmp_path))
         port = int(door.loopback.rpartition(":")[2])
         for _ in range(100):
             stack.enter_context(socket.create_connection(("127.0.0.1", port)))
         began_s = time.monotonic()
-        with connected_by(door.way("operator"), PATIENCE_S):
+        with connected_by(door.connection("operator"), PATIENCE_S):
             record_property("figure", f"{time.monotonic() - began_s:.2f} s")

@@ -19,7 +19,7 @@ from coec.calibration.commissioning.baseline import PRIOR_SPREAD_POSE, Baseline,
 from coec.calibration.commissioning.learning import commission, learn_accuracy
 from coec.calibration.commissioning.quantiles import distance2_quantile
 from coec.calibration.commissioning.verdict_limits import learned
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.monitor.check import CheckInput, gather
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, diagnose, observe
 from coec.calibration.ports import DepthModel, ImageReader, Silence
@@ -137,7 +137,7 @@ def test_spread_of_a_pair_is_found_from_checks_at_halves(sharp_street: Window, m
 def test_detection_learns_on_some_pairs_and_tries_others(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
-    evidence = gather(sight_of(sharp_street, stereo, images, CONFIG, Silence()), learning.FAR_RAD)
+    evidence = gather(prepare_window_data(sharp_street, stereo, images, CONFIG, Silence()), learning.FAR_RAD)
     heard: list[tuple[int, int]] = []
     tried = try_detection(evidence, sharp_street.T_camera_lidar_start, CONFIG, 1, 3, lambda *step: heard.append(step))
     rows = {row.name: row for row in table(tried)}
@@ -160,7 +160,7 @@ def test_detection_refuses_checks_that_the_monitor_would_not_take(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
     few = replace(sharp_street, pairs=sharp_street.pairs[: MIN_RECORDED - 1])
-    evidence = gather(sight_of(few, stereo, images, CONFIG, Silence()))
+    evidence = gather(prepare_window_data(few, stereo, images, CONFIG, Silence()))
     with pytest.raises(CalibrationError, match=f"needs {MIN_RECORDED} pairs, there are {MIN_RECORDED - 1}"):
         try_detection(evidence, few.T_camera_lidar_start, CONFIG, 1, 3, lambda *_: None)
 
@@ -179,7 +179,7 @@ def limits_of(says: NDArray[np.float64], rig: Rig, monkeypatch: pytest.MonkeyPat
         return SimpleNamespace(agreement_rad=0.0, mi=1.0, f1=1.0, f2=1.0)
 
     monkeypatch.setattr(learning, "check_at", check_of)
-    monkeypatch.setattr(learning, "ask_depth", depth_of)
+    monkeypatch.setattr(learning, "depth_cue", depth_of)
     monkeypatch.setattr(learning, "CHECKS", 12)
     evidence = cast(CheckInput, _Scripted(says, rig))
     limits = learning.learn_limits(evidence, np.eye(4), CONFIG, learn_accuracy(evidence, np.eye(4)), FALSE_ALARM_RATE)

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from baselines import a_baseline
-from boards import LENSES, rig_with
+from boards import BOARD_LENSES, board_rig
 from coec.adapters.files.baseline_file import baseline_hash
 from coec.calibration.commissioning.baseline import Accuracy, Baseline, uncommissioned
-from coec.calibration.commissioning.of_model import MIN_VEHICLES, for_rig, of_model
+from coec.calibration.commissioning.of_model import MIN_VEHICLES, for_rig, model_baseline
 from coec.errors import CalibrationError
 from coec.geometry import se3
 
 AMONG = np.array([0.003, 0.002, 0.004, 0.01, 0.02, 0.03])
 """How biases of vehicles differ, rad and m."""
 
-RIG = rig_with(LENSES["pinhole"])
+RIG = board_rig(BOARD_LENSES["pinhole"])
 
 COMMON = np.array([0.001, -0.002, 0.0, 0.01, 0.0, -0.02])
 
@@ -46,12 +46,14 @@ def vehicles() -> list[Baseline]:
 
 
 def test_the_order_of_the_vehicles_changes_nothing(vehicles: list[Baseline]) -> None:
-    made = {baseline_hash(of_model(order)) for order in itertools.islice(itertools.permutations(vehicles), 0, 120, 17)}
+    made = {
+        baseline_hash(model_baseline(order)) for order in itertools.islice(itertools.permutations(vehicles), 0, 120, 17)
+    }
     assert len(made) == 1
 
 
 def test_a_limit_refuses_no_more_than_that_of_any_vehicle(vehicles: list[Baseline]) -> None:
-    model = of_model(vehicles)
+    model = model_baseline(vehicles)
     assert model.limits["min_edge_contrast"] == min(one.limits["min_edge_contrast"] for one in vehicles)
     assert model.limits["max_runner_up"] == max(one.limits["max_runner_up"] for one in vehicles)
     assert model.monitor.max_distance2_rotation == max(one.monitor.max_distance2_rotation for one in vehicles)
@@ -60,11 +62,11 @@ def test_a_limit_refuses_no_more_than_that_of_any_vehicle(vehicles: list[Baselin
 
 def test_a_limit_that_a_vehicle_did_not_learn_stays_as_configured(vehicles: list[Baseline]) -> None:
     without = replace(vehicles[0], limits={"max_runner_up": 0.7})
-    assert set(of_model([without, *vehicles[1:]]).limits) == {"max_runner_up"}
+    assert set(model_baseline([without, *vehicles[1:]]).limits) == {"max_runner_up"}
 
 
 def test_only_what_all_sensors_share_names_them(vehicles: list[Baseline]) -> None:
-    assert of_model(vehicles).sensors == {"camera_frame": "front"}
+    assert model_baseline(vehicles).sensors == {"camera_frame": "front"}
 
 
 @pytest.mark.parametrize("count", [MIN_VEHICLES, 8, 30])
@@ -74,7 +76,7 @@ def test_the_bias_of_a_further_vehicle_lies_where_the_model_says(count: int) -> 
     rng = np.random.default_rng(count)
     apart = []
     for _ in range(200):
-        model = of_model([_vehicle(rng) for _ in range(count)])
+        model = model_baseline([_vehicle(rng) for _ in range(count)])
         apart.append((_vehicle(rng).pose.bias - model.pose.bias) / model.pose.bias_sigma)
     within = float(np.mean(np.abs(np.array(apart)) < 2.0))
     assert within == pytest.approx({3: 0.816, 8: 0.914, 30: 0.945}[count], abs=0.03)
@@ -84,7 +86,7 @@ def test_a_vehicle_is_measured_from_its_own_workshop_calibration_and_known_no_be
     vehicles: list[Baseline],
 ) -> None:
     alike = [replace(vehicles[0], pose=replace(one.pose, bias=COMMON)) for one in vehicles]
-    taken = for_rig(of_model(alike), RIG)
+    taken = for_rig(model_baseline(alike), RIG)
     np.testing.assert_array_equal(taken.T_camera_lidar, RIG.T_camera_lidar_nominal)
     np.testing.assert_allclose(taken.pose.bias, COMMON)
     _, of_camera = uncommissioned(RIG.camera)
@@ -96,7 +98,7 @@ def test_vehicles_that_differ_much_make_it_wider(vehicles: list[Baseline]) -> No
         replace(one, pose=Accuracy(one.pose.bias + 0.1 * number, one.pose.bias_sigma, one.pose.spread))
         for number, one in enumerate(vehicles)
     ]
-    taken = for_rig(of_model(far), RIG)
+    taken = for_rig(model_baseline(far), RIG)
     assert (taken.pose.bias_sigma > 0.1).all()
     assert np.isnan(taken.rotation.bias_sigma[3:]).all()
 
@@ -115,9 +117,9 @@ def test_what_does_not_belong_together_is_refused(
 ) -> None:
     other = replace(vehicles[0], **changed)  # type: ignore[arg-type]
     with pytest.raises(CalibrationError, match=says):
-        of_model([other, *vehicles[1:]])
+        model_baseline([other, *vehicles[1:]])
 
 
 def test_two_vehicles_do_not_tell_how_they_differ(vehicles: list[Baseline]) -> None:
     with pytest.raises(CalibrationError, match="at least 3 vehicles"):
-        of_model(vehicles[:2])
+        model_baseline(vehicles[:2])

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.budget import COLUMN_SHARE, EDGE_PX, HELD, STAMP_S, TERMS, systematic
-from coec.calibration.confidence.grain import LENS_PX, Grain, column_rad, grain_of
-from coec.calibration.objective.cells import SightLines
+from coec.calibration.confidence.budget import COLUMN_SHARE, EDGE_PX, HELD, STAMP_S, TERMS, systematic_shifts
+from coec.calibration.confidence.grain import LENS_PX, SensorResolution, column_rad, sensor_resolution
+from coec.calibration.objective.cells import PointsInView
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Window
-from estimates import RIG
+from estimates import ESTIMATE_RIG
 from landscapes import Array
 
 FRAMES = 4
 UP_OF_LIDAR = np.array([0.0, -1.0, 0.0])
-GRAIN = Grain(
+GRAIN = SensorResolution(
     pixel_rad=1e-3,
     lens_px=0.05,
     column_rad=3e-3,
@@ -26,16 +26,16 @@ GRAIN = Grain(
 )
 
 
-def street(rng: np.random.Generator, farthest_m: float = 40.0) -> SightLines:
+def street(rng: np.random.Generator, farthest_m: float = 40.0) -> PointsInView:
     """Points ahead, as many to the left as to the right, at many ranges."""
     direction = np.column_stack([rng.uniform(-0.8, 0.8, 3000), rng.uniform(-0.3, 0.3, 3000), np.ones(3000)])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     range_m = rng.uniform(5.0, farthest_m, 3000)
-    return SightLines(direction * range_m[:, None], np.ones(3000), rng.integers(0, FRAMES, 3000))
+    return PointsInView(direction * range_m[:, None], np.ones(3000), rng.integers(0, FRAMES, 3000))
 
 
-def shifts(sight: SightLines, dof: int, grain: Grain = GRAIN) -> dict[str, Array]:
-    return systematic(sight, grain, tuple(range(dof)), UP_OF_LIDAR)
+def shifts(sight: PointsInView, dof: int, grain: SensorResolution = GRAIN) -> dict[str, Array]:
+    return systematic_shifts(sight, grain, tuple(range(dof)), UP_OF_LIDAR)
 
 
 def test_every_term_answers_on_the_axes_that_were_searched_and_on_no_other(rng: np.random.Generator) -> None:
@@ -63,7 +63,7 @@ def test_a_centre_that_is_held_beside_is_a_turn_by_its_angle_at_the_range_of_thi
     assert abs(found["held_across"][1]) == pytest.approx(GRAIN.held_m / 4.0, rel=0.2)
     assert abs(found["held_down"][0]) == pytest.approx(GRAIN.held_m / 4.0, rel=0.2)
     assert np.abs(found["held_forward"]).max() < 0.1 * GRAIN.held_m / 4.0
-    only_forward = systematic(ahead, GRAIN, (0, 1, 2, 3, 4), UP_OF_LIDAR)
+    only_forward = systematic_shifts(ahead, GRAIN, (0, 1, 2, 3, 4), UP_OF_LIDAR)
     assert [name for name in only_forward if name not in TERMS] == ["held_forward"]
 
 
@@ -96,16 +96,16 @@ def test_what_a_fitted_camera_misses_is_in_the_budget() -> None:
     sweep = LidarFrame(0, "lidar", np.zeros((0, 3), np.float32))
     image = EncodedImage(ImageFormat.MONO8, 4, 3, bytes(12))
     pair = FramePair(CameraFrame(0, "camera", image), sweep)
-    window = Window("w", RIG, RIG.T_camera_lidar_nominal, (pair,))
-    missing = replace(window, rig=replace(RIG, camera_residual_px=33.7))
-    good, poor = (grain_of(one, RIG.T_camera_lidar_nominal, 0.01) for one in (window, missing))
+    window = Window("w", ESTIMATE_RIG, ESTIMATE_RIG.T_camera_lidar_nominal, (pair,))
+    missing = replace(window, rig=replace(ESTIMATE_RIG, camera_residual_px=33.7))
+    good, poor = (sensor_resolution(one, ESTIMATE_RIG.T_camera_lidar_nominal, 0.01) for one in (window, missing))
     assert good.lens_px == LENS_PX
     assert poor.lens_px == pytest.approx(33.7 / np.sqrt(3.0), rel=1e-3)
     np.testing.assert_array_equal(good.velocity_mps, np.zeros((1, 3)))
 
 
 def test_nothing_in_view_determines_nothing() -> None:
-    nothing = SightLines(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+    nothing = PointsInView(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
     assert shifts(nothing, 6) == {}
 
 

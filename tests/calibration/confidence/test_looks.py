@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from calibration.conftest import window_of
 from coec.adapters.images.codec import GreyImages
-from coec.calibration.confidence.looks import independent_looks, look
+from coec.calibration.confidence.looks import effective_sample_size, independent_samples_at
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.objective.edges import EdgeWitness, build_edges
+from coec.calibration.objective.edges import EdgeCue, build_edges
 from coec.calibration.types import Window
 from coec.config import LimitsConfig
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
-from drives import drawn_source
+from drives import rendered_source
 
 FRAMES = 10
 MOTORWAY = "sim:seed=3&seconds=12&camera_hz=0.5&lidar_hz=0.5&scene=highway&camera=pinhole640x400&lidar=64"
@@ -41,49 +41,51 @@ def sharp_edges_of(window: Window) -> EdgeFrames:
     rig, pairs, images = window.rig, window.pairs, GreyImages(LimitsConfig())
     return build_edges(
         pairs,
-        lambda frame, points: compensate(pairs[frame], rig, enabled=True, chosen=points),
+        lambda frame, points: compensate(pairs[frame], rig, enabled=True, selection=points),
         (images.grey(pair.camera) for pair in pairs),
         rig,
     ).sharp
 
 
-def test_each_place_of_a_drive_past_facades_is_a_look(sharp_edges: EdgeWitness, sharp_street: Window) -> None:
-    seen = look(sharp_edges.sharp, sharp_street.T_camera_lidar_start)
+def test_each_place_of_a_drive_past_facades_is_a_look(sharp_edges: EdgeCue, sharp_street: Window) -> None:
+    seen = independent_samples_at(sharp_edges.sharp, sharp_street.T_camera_lidar_start)
     assert 0.8 * FRAMES < seen.count <= FRAMES
 
 
-def test_ten_frames_of_a_standing_vehicle_are_one_look(sharp_edges: EdgeWitness, sharp_street: Window) -> None:
+def test_ten_frames_of_a_standing_vehicle_are_one_look(sharp_edges: EdgeCue, sharp_street: Window) -> None:
     pose = sharp_street.T_camera_lidar_start
-    once = look(chosen(sharp_edges.sharp, [0]), pose)
-    standing = look(chosen(sharp_edges.sharp, [0] * FRAMES), pose)
+    once = independent_samples_at(chosen(sharp_edges.sharp, [0]), pose)
+    standing = independent_samples_at(chosen(sharp_edges.sharp, [0] * FRAMES), pose)
     assert once.count == 1.0
     assert standing.count == pytest.approx(1.0, abs=1e-9)
     assert standing.significance == pytest.approx(once.significance, rel=1e-4)
 
 
 def test_a_motorway_is_in_between() -> None:
-    window = window_of(drawn_source(MOTORWAY))
-    count = look(sharp_edges_of(window), window.T_camera_lidar_start).count
+    window = window_of(rendered_source(MOTORWAY))
+    count = independent_samples_at(sharp_edges_of(window), window.T_camera_lidar_start).count
     assert 1.2 < count < 0.6 * len(window.pairs)
 
 
 @pytest.mark.parametrize("times", [2, 3])
-def test_the_same_frames_again_are_no_further_looks(sharp_edges: EdgeWitness, sharp_street: Window, times: int) -> None:
+def test_the_same_frames_again_are_no_further_looks(sharp_edges: EdgeCue, sharp_street: Window, times: int) -> None:
     frames, pose = chosen(sharp_edges.sharp, [0, 3, 6]), sharp_street.T_camera_lidar_start
     again = chosen(frames, [0, 1, 2] * times)
-    assert look(again, pose).count == pytest.approx(look(frames, pose).count, rel=1e-9)
+    assert independent_samples_at(again, pose).count == pytest.approx(
+        independent_samples_at(frames, pose).count, rel=1e-9
+    )
 
 
-def test_frames_in_reverse_are_the_same_looks(sharp_edges: EdgeWitness, sharp_street: Window) -> None:
+def test_frames_in_reverse_are_the_same_looks(sharp_edges: EdgeCue, sharp_street: Window) -> None:
     frames, pose = chosen(sharp_edges.sharp, [0, 3, 6, 8]), sharp_street.T_camera_lidar_start
-    backwards = look(chosen(frames, [3, 2, 1, 0]), pose)
-    assert backwards.count == look(frames, pose).count
-    assert backwards.significance == pytest.approx(look(frames, pose).significance, rel=1e-6)
+    backwards = independent_samples_at(chosen(frames, [3, 2, 1, 0]), pose)
+    assert backwards.count == independent_samples_at(frames, pose).count
+    assert backwards.significance == pytest.approx(independent_samples_at(frames, pose).significance, rel=1e-6)
 
 
-def test_independent_frames_keep_their_significance(sharp_edges: EdgeWitness, sharp_street: Window) -> None:
+def test_independent_frames_keep_their_significance(sharp_edges: EdgeCue, sharp_street: Window) -> None:
     pose = sharp_street.T_camera_lidar_start
-    seen = look(sharp_edges.sharp, pose)
+    seen = independent_samples_at(sharp_edges.sharp, pose)
     whole = frame_alignment(sharp_edges.sharp, pose).significance
     assert seen.significance == pytest.approx(whole * np.sqrt(seen.count / FRAMES))
 
@@ -94,7 +96,7 @@ def agreement(alike: float, own: float = 5.0) -> NDArray[np.float64]:
 
 
 def test_the_more_stands_still_the_fewer_looks() -> None:
-    counts = [independent_looks(agreement(alike)) for alike in np.linspace(0.0, 1.0, 21)]
+    counts = [effective_sample_size(agreement(alike)) for alike in np.linspace(0.0, 1.0, 21)]
     assert counts[0] == FRAMES
     assert counts[-1] == pytest.approx(1.0)
     assert (np.diff(counts) < 0.0).all()
@@ -102,10 +104,10 @@ def test_the_more_stands_still_the_fewer_looks() -> None:
 
 @pytest.mark.parametrize("alike", [-3.0, -0.2, 1.5])
 def test_looks_are_never_more_than_frames_nor_less_than_one(alike: float) -> None:
-    assert independent_looks(agreement(alike)) == (FRAMES if alike < 0.0 else 1.0)
+    assert effective_sample_size(agreement(alike)) == (FRAMES if alike < 0.0 else 1.0)
 
 
 @pytest.mark.fault("frames that agree nowhere", "they count as one look, and no number ends the service")
 @pytest.mark.parametrize("own", [0.0, -2.0])
 def test_frames_that_do_not_agree_with_themselves_are_one_look(own: float) -> None:
-    assert independent_looks(agreement(0.3, own)) == 1.0
+    assert effective_sample_size(agreement(0.3, own)) == 1.0

@@ -12,27 +12,38 @@ from coec.calibration.confidence.loosened import (
     HELD_FREE,
     LEAST_PX,
     LENS_FREE,
-    Loosened,
-    beside_a_turn,
-    loosen,
+    RelaxedAssumption,
+    relax_assumptions,
+    weight_beyond_turn,
 )
 from coec.calibration.confidence.told import CLOCKS, LENS, SHIFTS
 from coec.config import VerdictConfig
 from coec.geometry import se3
-from corners import ABOUT_NOTHING, CAMERA, FRAMES, levels, motions, pixels, things, window
+from corners import (
+    CORNER_CAMERA,
+    CORNER_FRAMES,
+    IDENTITY_POSE,
+    corner_edge_levels,
+    corner_motions,
+    corner_pixels,
+    corner_points,
+    corner_window,
+)
 
 KNOWN_M = VerdictConfig().held_translation_sigma_m
 
 
-def by_name(found: tuple[Loosened, ...]) -> dict[str, Loosened]:
+def by_name(found: tuple[RelaxedAssumption, ...]) -> dict[str, RelaxedAssumption]:
     return {one.name: one for one in found}
 
 
 @pytest.mark.parametrize("held", [(), (3, 4, 5)])
 def test_what_is_right_is_not_contradicted(held: tuple[int, ...], rng: np.random.Generator) -> None:
     """The pose itself may be off by a little: that is no fault of what was told."""
-    points, beside = things(rng), se3.perturbation(np.array([1e-3, -1e-3, 1e-3, 0.0, 0.0, 0.0]))
-    found = loosen(levels(pixels(points), points), window(motions()), beside, held, KNOWN_M)
+    points, beside = corner_points(rng), se3.perturbation(np.array([1e-3, -1e-3, 1e-3, 0.0, 0.0, 0.0]))
+    found = relax_assumptions(
+        corner_edge_levels(corner_pixels(points), points), corner_window(corner_motions()), beside, held, KNOWN_M
+    )
     assert [one.name for one in found] == [*([HELD_FREE] if held else []), CLOCKS_FREE, LENS_FREE]
     for one in found:
         assert not (one.contradicts and one.matters)
@@ -50,17 +61,19 @@ def test_another_lens_is_seen_and_told(
     record_property: Callable[[str, object], None],
 ) -> None:
     """The pose is the one that makes up for it best as far as a turn can."""
-    points = things(rng)
+    points = corner_points(rng)
     right, down, longer = deviation
-    lens = CAMERA._replace(
-        fx=CAMERA.fx * (1.0 + longer),
-        fy=CAMERA.fy * (1.0 + longer),
-        cx=CAMERA.cx + right * CAMERA.fx,
-        cy=CAMERA.cy + down * CAMERA.fy,
+    lens = CORNER_CAMERA._replace(
+        fx=CORNER_CAMERA.fx * (1.0 + longer),
+        fy=CORNER_CAMERA.fy * (1.0 + longer),
+        cx=CORNER_CAMERA.cx + right * CORNER_CAMERA.fx,
+        cy=CORNER_CAMERA.cy + down * CORNER_CAMERA.fy,
     )
     turned = se3.perturbation(np.array([-deviation[1], deviation[0], 0.0, 0.0, 0.0, 0.0]))
-    seen = pixels(points, lens)
-    found = by_name(loosen(levels(seen, points), window(motions()), turned, (), KNOWN_M))
+    seen = corner_pixels(points, lens)
+    found = by_name(
+        relax_assumptions(corner_edge_levels(seen, points), corner_window(corner_motions()), turned, (), KNOWN_M)
+    )
     assert found[LENS_FREE].contradicts
     record_property(
         "figure", f"certainty {found[LENS_FREE].certainty:.1f}, limit {VerdictConfig().max_intrinsics_certainty}"
@@ -80,14 +93,18 @@ def test_clocks_that_are_off_are_seen_and_told(
     expected_s: tuple[float, float, float], rng: np.random.Generator
 ) -> None:
     """The camera is late, later and later, or takes its rows one after the other."""
-    points, driven = things(rng), motions()
+    points, driven = corner_points(rng), corner_motions()
     passed = []
     for frame, (at, motion) in enumerate(zip(points, driven, strict=True)):
-        elapsed, row = frame / (FRAMES - 1) - 0.5, pixels([at])[0][:, 1] / CAMERA.height - 0.5
+        elapsed, row = frame / (CORNER_FRAMES - 1) - 0.5, corner_pixels([at])[0][:, 1] / CORNER_CAMERA.height - 0.5
         late_s = expected_s[0] + expected_s[1] * elapsed + expected_s[2] * row
         speed = np.array(motion.linear_mps) + np.cross(motion.angular_radps, at)
         passed.append(at - speed * late_s[:, None])
-    found = by_name(loosen(levels(pixels(passed), points), window(driven), ABOUT_NOTHING, (), KNOWN_M))
+    found = by_name(
+        relax_assumptions(
+            corner_edge_levels(corner_pixels(passed), points), corner_window(driven), IDENTITY_POSE, (), KNOWN_M
+        )
+    )
     assert found[CLOCKS_FREE].contradicts
     np.testing.assert_allclose(found[CLOCKS_FREE].deviation[CLOCKS], expected_s, atol=0.006)
     assert not (found[LENS_FREE].contradicts and found[LENS_FREE].matters)
@@ -97,32 +114,56 @@ def test_clocks_that_are_off_are_seen_and_told(
     "a camera whose centre is 6 cm from where it is held", "the window says so, with the rotation that this causes"
 )
 def test_a_centre_that_was_held_elsewhere_is_seen_and_its_turn_told(rng: np.random.Generator) -> None:
-    points, truth = things(rng), np.array([0.0, 0.0, 0.0, 0.05, -0.03, 0.0])
+    points, truth = corner_points(rng), np.array([0.0, 0.0, 0.0, 0.05, -0.03, 0.0])
     near = [at[at[:, 2] < 8.0] for at in points]
-    seen = pixels([at + truth[3:] for at in near])
-    found = by_name(loosen(levels(seen, near), window(motions()), ABOUT_NOTHING, (3, 4, 5), KNOWN_M))
+    seen = corner_pixels([at + truth[3:] for at in near])
+    found = by_name(
+        relax_assumptions(
+            corner_edge_levels(seen, near), corner_window(corner_motions()), IDENTITY_POSE, (3, 4, 5), KNOWN_M
+        )
+    )
     assert found[HELD_FREE].contradicts
     np.testing.assert_allclose(found[HELD_FREE].deviation[list(SHIFTS)], truth[3:], atol=0.01)
-    assert not by_name(loosen(levels(seen, near), window(motions()), se3.perturbation(truth), (3, 4, 5), KNOWN_M))[
-        HELD_FREE
-    ].contradicts
+    assert not by_name(
+        relax_assumptions(
+            corner_edge_levels(seen, near), corner_window(corner_motions()), se3.perturbation(truth), (3, 4, 5), KNOWN_M
+        )
+    )[HELD_FREE].contradicts
 
 
 def test_a_standing_vehicle_tells_nothing_of_its_clocks(rng: np.random.Generator) -> None:
-    points = things(rng)
-    found = loosen(levels(pixels(points), points), window(motions(speed=0.0)), ABOUT_NOTHING, (), KNOWN_M)
+    points = corner_points(rng)
+    found = relax_assumptions(
+        corner_edge_levels(corner_pixels(points), points),
+        corner_window(corner_motions(speed=0.0)),
+        IDENTITY_POSE,
+        (),
+        KNOWN_M,
+    )
     assert [one.name for one in found] == [LENS_FREE]
 
 
 def test_where_nothing_is_in_view_nothing_is_asked(rng: np.random.Generator) -> None:
-    behind = [-at for at in things(rng)]
-    assert loosen(levels(pixels(things(rng)), behind), window(motions()), ABOUT_NOTHING, (), KNOWN_M) == ()
+    behind = [-at for at in corner_points(rng)]
+    assert (
+        relax_assumptions(
+            corner_edge_levels(corner_pixels(corner_points(rng)), behind),
+            corner_window(corner_motions()),
+            IDENTITY_POSE,
+            (),
+            KNOWN_M,
+        )
+        == ()
+    )
 
 
 def test_the_same_window_gives_the_same_bits(rng: np.random.Generator) -> None:
-    points = things(rng)
-    edges, of = levels(pixels(points, CAMERA._replace(cx=242.0)), points), window(motions())
-    one, other = (loosen(edges, of, ABOUT_NOTHING, (), KNOWN_M) for _ in range(2))
+    points = corner_points(rng)
+    edges, of = (
+        corner_edge_levels(corner_pixels(points, CORNER_CAMERA._replace(cx=242.0)), points),
+        corner_window(corner_motions()),
+    )
+    one, other = (relax_assumptions(edges, of, IDENTITY_POSE, (), KNOWN_M) for _ in range(2))
     for a, b in zip(one, other, strict=True):
         assert (a.certainty, a.moved_px) == (b.certainty, b.moved_px)
         np.testing.assert_array_equal(a.deviation, b.deviation)
@@ -131,4 +172,4 @@ def test_the_same_window_gives_the_same_bits(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize(("moved_px", "share"), [(0.0, 0.0), (LEAST_PX, 0.5), (10.0 * LEAST_PX, 0.99)])
 def test_a_lens_is_believed_by_what_it_moves_beyond_what_edges_leave(moved_px: float, share: float) -> None:
     """Beside the turn that answers it: hardly anything of a principal point that a turn makes up for."""
-    assert beside_a_turn(moved_px) == pytest.approx(share, abs=1e-3)
+    assert weight_beyond_turn(moved_px) == pytest.approx(share, abs=1e-3)

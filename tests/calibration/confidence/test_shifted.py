@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.shifted import shifted
+from coec.calibration.confidence.shifted import translation_profile
 from coec.calibration.objective.cells import Cells
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.config import CalibrationConfig
@@ -38,7 +38,7 @@ class BentRidge:
 @pytest.fixture
 def ends() -> Array:
     """(6, 6) ξ of what is found with all six axes searched: across, down and forward, either way."""
-    found = shifted(BentRidge(), np.eye(4), range(6), CONFIG)
+    found = translation_profile(BentRidge(), np.eye(4), range(6), CONFIG)
     return np.array([se3.difference(end, found.best) for end in found.others])
 
 
@@ -54,10 +54,10 @@ def test_a_turn_that_makes_up_for_the_shift_is_followed_around_the_bend(ends: Ar
 
 
 def test_a_translation_that_was_not_searched_stays() -> None:
-    found = shifted(BentRidge(), np.eye(4), (0, 1, 2, 3, 5), CONFIG)
+    found = translation_profile(BentRidge(), np.eye(4), (0, 1, 2, 3, 5), CONFIG)
     heights = [se3.difference(end, found.best)[4] for end in found.others]
     assert heights == pytest.approx([0.0] * 4, abs=1e-9)
 
 
 def test_a_search_of_turns_alone_has_none() -> None:
-    assert shifted(BentRidge(), np.eye(4), range(3), CONFIG).others == ()
+    assert translation_profile(BentRidge(), np.eye(4), range(3), CONFIG).others == ()

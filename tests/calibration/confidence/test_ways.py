@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.told import PRINCIPAL_POINT, SIZE, Told
-from coec.calibration.confidence.ways import BEGINS, Ways, climbed, ends_along
+from coec.calibration.confidence.told import PRINCIPAL_POINT, SIZE, AssumedEdges
+from coec.calibration.confidence.ways import BEGINS, ParameterSubset, ends_along, local_ascent
 
 SUMMIT = np.array([0.016, -0.012])
 """Where the principal point is, in focal lengths from where it was assumed."""
 
 
-def ridge(dent: float) -> Told:
+def ridge(dent: float) -> AssumedEdges:
     """A level on which significance falls from the summit as it does for a principal point that a turn answers, by a
     few units, with dents of this depth every five thousandths of a focal length."""
 
@@ -26,15 +26,15 @@ def ridge(dent: float) -> Told:
         return np.asarray(60.0 - 0.4 * np.sum(off * off, axis=1) + dent * np.sum(dents, axis=1))
 
     level: Any = SimpleNamespace(frames=SimpleNamespace(camera=SimpleNamespace(width=700)), significances=significances)
-    return cast(Told, level)
+    return cast(AssumedEdges, level)
 
 
-def ways() -> Ways:
+def ways() -> ParameterSubset:
     """The principal point, and nothing else, is set free; half a thousandth moves the edges by a pixel beyond the turn
     that answers it."""
     directions = np.zeros((SIZE, 2))
     directions[list(PRINCIPAL_POINT), [0, 1]] = 1.0
-    return Ways(directions, np.full(2, 5e-4), tuple(PRINCIPAL_POINT), np.eye(2))
+    return ParameterSubset(directions, np.full(2, 5e-4), tuple(PRINCIPAL_POINT), np.eye(2))
 
 
 def off(end: NDArray[np.float64]) -> float:
@@ -56,4 +56,4 @@ def test_a_ridge_without_dents_has_one_end() -> None:
 
 def test_what_no_pose_answers_has_one_climb() -> None:
     (end,) = ends_along((), [ridge(0.5)], ways(), np.zeros(SIZE))
-    np.testing.assert_array_equal(end, climbed([ridge(0.5)], ways(), np.zeros(SIZE)))
+    np.testing.assert_array_equal(end, local_ascent([ridge(0.5)], ways(), np.zeros(SIZE)))

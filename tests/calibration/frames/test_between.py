@@ -43,7 +43,7 @@ def picked_s(
     found = []
     for second in seconds.tolist():
         if second in chosen:
-            between_pairs.chosen(round(second * S))
+            between_pairs.on_selected(round(second * S))
         elif (thinned := between_pairs.offer(pair(second, image_bytes), FORWARD)) is not None:
             found.append(thinned.stamp_ns / S)
     return found

@@ -12,7 +12,7 @@ from coec.calibration.frames.concatenation import SeveralOrigins
 from coec.calibration.frames.origin import OriginCheck, apparent_origin
 from coec.calibration.types import LidarFrame
 from coec.geometry import se3
-from sweeps import ROOF, a_sweep, in_frame
+from sweeps import ROOF_POSE, sweep_in_frame, turning_sweep
 
 LEFT = se3.exp(np.array([0.05, 0.0, 1.2, 0.6, 0.9, 1.2]))
 RIGHT = se3.exp(np.array([-0.04, 0.02, -1.2, 0.6, -0.9, 1.2]))
@@ -33,17 +33,17 @@ def thinned(sweep: LidarFrame, share: float) -> LidarFrame:
 
 
 def noisy(seed: int) -> LidarFrame:
-    return a_sweep(seed, noise_rad=np.radians(0.1), walkers=0.1)
+    return turning_sweep(seed, noise_rad=np.radians(0.1), walkers=0.1)
 
 
 @pytest.mark.parametrize(
-    "poses", [(ROOF, LEFT), (LEFT, RIGHT), (HERE, LEFT), (LEFT, HERE), (ROOF, LEFT, RIGHT)], ids=range(5)
+    "poses", [(ROOF_POSE, LEFT), (LEFT, RIGHT), (HERE, LEFT), (LEFT, HERE), (ROOF_POSE, LEFT, RIGHT)], ids=range(5)
 )
 @pytest.mark.parametrize("seed", [1, 2])
 def test_several_lidars_in_one_cloud_are_told_with_their_places(
     poses: tuple[NDArray[np.float64], ...], seed: int
 ) -> None:
-    found = apparent_origin(joined(*(in_frame(noisy(seed + n), T) for n, T in enumerate(poses))))
+    found = apparent_origin(joined(*(sweep_in_frame(noisy(seed + n), T) for n, T in enumerate(poses))))
     assert isinstance(found, SeveralOrigins)
     np.testing.assert_allclose(found.origins_m, [T[:3, 3] for T in poses[:2]], atol=0.15)
     assert "concatenated" in found.sentence
@@ -51,34 +51,34 @@ def test_several_lidars_in_one_cloud_are_told_with_their_places(
 
 @pytest.mark.parametrize("share", [0.75, 0.5])
 def test_a_small_lidar_beside_the_one_of_the_frame_is_told(share: float) -> None:
-    cloud = joined(a_sweep(1), thinned(in_frame(a_sweep(2), LEFT), share))
+    cloud = joined(turning_sweep(1), thinned(sweep_in_frame(turning_sweep(2), LEFT), share))
     assert isinstance(apparent_origin(cloud), SeveralOrigins)
 
 
 def test_rings_of_their_own_numbers_are_told_too() -> None:
-    other = in_frame(a_sweep(2), LEFT)
+    other = sweep_in_frame(turning_sweep(2), LEFT)
     assert other.ring is not None
-    cloud = joined(in_frame(a_sweep(1), ROOF), replace(other, ring=other.ring + np.uint16(16)))
+    cloud = joined(sweep_in_frame(turning_sweep(1), ROOF_POSE), replace(other, ring=other.ring + np.uint16(16)))
     assert isinstance(apparent_origin(cloud), SeveralOrigins)
 
 
 def test_the_next_cloud_is_told_from_what_was_found() -> None:
     check = OriginCheck()
     for seed in range(3):
-        cloud = joined(in_frame(noisy(seed), ROOF), in_frame(noisy(seed + 7), LEFT))
-        assert isinstance(check.look(cloud), SeveralOrigins)
-    assert check.look(a_sweep()) is None
+        cloud = joined(sweep_in_frame(noisy(seed), ROOF_POSE), sweep_in_frame(noisy(seed + 7), LEFT))
+        assert isinstance(check.inspect(cloud), SeveralOrigins)
+    assert check.inspect(turning_sweep()) is None
 
 
 @pytest.mark.parametrize("walkers", [0.0, 0.2, 0.4])
 def test_a_crowd_is_no_second_lidar(walkers: float) -> None:
-    assert apparent_origin(a_sweep(noise_rad=np.radians(0.1), walkers=walkers)) is None
+    assert apparent_origin(turning_sweep(noise_rad=np.radians(0.1), walkers=walkers)) is None
 
 
 @pytest.mark.parametrize("speed_mps", [15.0, 25.0, 40.0])
 def test_a_lidar_that_drove_on_while_it_turned_is_one(speed_mps: float) -> None:
     """Points that a driver has brought to where the LiDAR was at the end."""
-    sweep = a_sweep(noise_rad=np.radians(0.05))
+    sweep = turning_sweep(noise_rad=np.radians(0.05))
     ahead_m = speed_mps * np.linspace(-0.1, 0.0, len(sweep.xyz_m), dtype=np.float32)
     moved = sweep.xyz_m + ahead_m[:, None] * np.array([1.0, 0.0, 0.0], np.float32)
     assert not isinstance(apparent_origin(replace(sweep, xyz_m=moved)), SeveralOrigins)

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.frames import decoded_once
-from coec.calibration.frames.decoded_once import DecodedOnce
+from coec.calibration.frames.decoded_once import CachedImages
 from coec.calibration.types import CameraFrame
 
 
@@ -33,7 +33,7 @@ class Frame:
 
 def test_an_image_is_decoded_once_for_both_looks_and_then_forgotten() -> None:
     reader, frames = Counted(), [cast(CameraFrame, Frame(value)) for value in (7, 9)]
-    once = DecodedOnce(reader)
+    once = CachedImages(reader)
     first = [once.first(frame) for frame in frames]
     second = [once.grey(frame) for frame in frames]
     assert [int(grey[0, 0]) for grey in second] == [7, 9]
@@ -45,8 +45,8 @@ def test_an_image_is_decoded_once_for_both_looks_and_then_forgotten() -> None:
 
 def test_no_more_is_kept_than_may_be_and_what_goes_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
     reader, frames = Counted(), [cast(CameraFrame, Frame(value)) for value in range(3)]
-    monkeypatch.setattr(decoded_once, "MOST_KEPT_BYTES", 2 * 20)
-    once = DecodedOnce(reader)
+    monkeypatch.setattr(decoded_once, "MAX_CACHED_BYTES", 2 * 20)
+    once = CachedImages(reader)
     for frame in frames:
         once.first(frame)
     for frame in frames:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import scenarios
 from coec.adapters.images.codec import GreyImages
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.frames.ego_mask import GRID_WIDTH, MIN_FRAMES, DeadRegions, lit_pixels
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.types import Window
@@ -187,7 +187,7 @@ def test_the_mask_has_the_size_of_the_image(width: int, height: int) -> None:
 # ------------------------------------------------------------------------------------------------------- in a window
 def test_a_window_without_a_mask_gets_the_one_its_frames_tell(sharp_street: Window, stereo: DepthModel) -> None:
     bare = replace(sharp_street, rig=replace(sharp_street.rig, mask=None))
-    sight = sight_of(bare, stereo, GREY, CalibrationConfig(), Silence())
+    sight = prepare_window_data(bare, stereo, GREY, CalibrationConfig(), Silence())
     assert sight.window.rig.mask is not None
     camera = bare.rig.camera
     assert sight.window.rig.mask.shape == (camera.height, camera.width)
@@ -198,19 +198,19 @@ def test_a_window_without_a_mask_gets_the_one_its_frames_tell(sharp_street: Wind
 def test_frames_of_a_vehicle_that_is_known_to_stand_do_not_count(sharp_street: Window, stereo: DepthModel) -> None:
     bare = replace(sharp_street, rig=replace(sharp_street.rig, mask=None))
     standing = scenarios.with_motion(bare, lambda motion: replace(motion, linear_mps=(0.0, 0.0, 0.0)))
-    assert sight_of(standing, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is None
+    assert prepare_window_data(standing, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is None
 
 
 def test_the_mask_of_the_rig_is_left_alone(sharp_street: Window, stereo: DepthModel) -> None:
     given = np.ones((sharp_street.rig.camera.height, sharp_street.rig.camera.width), np.bool_)
     masked = replace(sharp_street, rig=replace(sharp_street.rig, mask=given))
-    assert sight_of(masked, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is given
+    assert prepare_window_data(masked, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is given
 
 
 def test_a_bonnet_painted_over_the_street_is_masked(sharp_street: Window, stereo: DepthModel) -> None:
     bare = replace(sharp_street, rig=replace(sharp_street.rig, mask=None))
     painted = scenarios.body(bare, np.random.default_rng(4))
-    mask = sight_of(painted, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask
+    mask = prepare_window_data(painted, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask
     assert mask is not None
     camera = bare.rig.camera
     assert not mask[int(0.85 * camera.height) :, camera.width // 2].any()
@@ -225,7 +225,7 @@ def test_a_bonnet_painted_over_the_street_is_masked(sharp_street: Window, stereo
 
 # ----------------------------------------------------------------------------------------------------- recordings
 def recorded(source: str) -> list[Grey]:
-    window = windows.load(source, None, 25, lambda *_: None).window
+    window = windows.load_window(source, None, 25, lambda *_: None).window
     return [GREY.grey(pair.camera) for pair in window.pairs]
 
 

@@ -20,7 +20,7 @@ from coec.simulation.drive import SimulatedDrive
 from coec.simulation.source import open_sim
 from coec.sources import open_source
 from coec.sources.spec import parse_spec
-from drives import drawn_source
+from drives import rendered_source
 
 CONFIG = CalibrationConfig()
 DRIVE = "sim:seed=0&seconds=600&camera_hz=0.5&lidar_hz=0.5&camera=fisheye700&lidar=32"
@@ -50,14 +50,14 @@ def in_order_of_turning() -> list[int]:
 def bends(in_order_of_turning: list[int]) -> Window:
     """The sharpest turns to both sides."""
     sharpest = (*in_order_of_turning[: BENDS // 2], *in_order_of_turning[-BENDS // 2 :])
-    return window_of(drawn_source(DRIVE, sharpest))
+    return window_of(rendered_source(DRIVE, sharpest))
 
 
 @pytest.fixture(scope="module")
 def straight(in_order_of_turning: list[int]) -> Window:
     """Frames that were taken while the vehicle went straight on."""
     middle = len(in_order_of_turning) // 2
-    return window_of(drawn_source(DRIVE, tuple(in_order_of_turning[middle - 3 : middle + 3])))
+    return window_of(rendered_source(DRIVE, tuple(in_order_of_turning[middle - 3 : middle + 3])))
 
 
 def late(window: Window, offset_s: float) -> Window:

@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 
 from coec.calibration.frames.window import (
-    Event,
-    KeptForgotten,
-    KeptPairs,
+    CarriedOverDropped,
+    CarriedOverPairs,
     PairSelected,
-    SliceEnded,
+    SliceClosed,
     WindowCutter,
+    WindowEvent,
 )
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, ImageQuality, Window
 from coec.config import WindowConfig
@@ -49,12 +49,12 @@ def at(street: Window, seconds: float, speed: float | None = 5.0) -> FramePair:
     return FramePair(replace(pair.camera, stamp_ns=stamp), replace(pair.lidar, stamp_ns=stamp), motion)
 
 
-def drive(cutter: WindowCutter, street: Window, seconds: list[float], speed: float | None = 5.0) -> list[Event]:
+def drive(cutter: WindowCutter, street: Window, seconds: list[float], speed: float | None = 5.0) -> list[WindowEvent]:
     start = street.T_camera_lidar_start
     return [event for s in seconds for event in cutter.offer(at(street, s, speed), start)]
 
 
-def selected_s(events: list[Event]) -> list[float]:
+def selected_s(events: list[WindowEvent]) -> list[float]:
     return [(e.pair.stamp_ns - 1_000 * S) / S for e in events if isinstance(e, PairSelected)]
 
 
@@ -68,8 +68,8 @@ def test_one_pair_of_each_bin_and_the_rest_is_not_looked_at(street: Window) -> N
 def test_the_slice_ends_by_sensor_time_and_the_next_begins(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre())
     events = drive(cutter, street, [float(i) for i in range(0, 60, 2)])
-    ends = [e for e in events if isinstance(e, SliceEnded)]
-    assert ends == [SliceEnded("street-1000000000000" if street.rig.pair == "street" else ends[0].window_id, 5, True)]
+    ends = [e for e in events if isinstance(e, SliceClosed)]
+    assert ends == [SliceClosed("street-1000000000000" if street.rig.pair == "street" else ends[0].window_id, 5, True)]
     firsts = [e for e in events if isinstance(e, PairSelected) and e.first]
     assert [e.pair.stamp_ns // S for e in firsts] == [1000, 1050]
     assert firsts[0].window_id == f"{street.rig.pair}-{1000 * S}"
@@ -175,22 +175,22 @@ def test_an_image_that_cannot_be_decoded_is_counted_by_its_reason(street: Window
 def test_sensor_time_that_steps_back_ends_the_slice(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre())
     events = drive(cutter, street, [0.0, 12.0, 24.0, -500.0])
-    assert [(e.pairs, e.complete) for e in events if isinstance(e, SliceEnded)] == [(3, True)]
+    assert [(e.pairs, e.complete) for e in events if isinstance(e, SliceClosed)] == [(3, True)]
     assert selected_s(events)[-1] == -500.0
 
 
-KEPT = KeptPairs("street-960000000000", 990 * S, 998 * S, 2)
+KEPT = CarriedOverPairs("street-960000000000", 990 * S, 998 * S, 2)
 
 
 def test_kept_pairs_count_for_the_window_and_end_it_when_it_is_as_large_as_any(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre())
     events = drive(cutter, street, [0.0, 2.0])
     assert cutter.selected == 1
-    cutter.keep(KEPT)
+    cutter.carry_over(KEPT)
     assert cutter.selected == 3
     events += drive(cutter, street, [10.0 + 2.0 * i for i in range(10)])
-    (ended,) = (e for e in events if isinstance(e, SliceEnded))
-    assert (ended.pairs, ended.complete, ended.kept) == (CONFIG.pairs, True, KEPT)
+    (ended,) = (e for e in events if isinstance(e, SliceClosed))
+    assert (ended.pairs, ended.complete, ended.carried_over) == (CONFIG.pairs, True, KEPT)
     assert selected_s(events)[:3] == [0.0, 10.0, 20.0]
     assert cutter.selected == 1, "the next one begins without them"
 
@@ -198,19 +198,19 @@ def test_kept_pairs_count_for_the_window_and_end_it_when_it_is_as_large_as_any(s
 def test_kept_pairs_wait_for_a_slice_that_is_a_window(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre())
     drive(cutter, street, [0.0])
-    cutter.keep(replace(KEPT, pairs=1))
+    cutter.carry_over(replace(KEPT, pairs=1))
     ((short,), later) = cutter.finish(), drive(cutter, street, [2.0, 12.0])
-    assert isinstance(short, SliceEnded)
-    assert (short.complete, short.kept) == (False, None)
+    assert isinstance(short, SliceClosed)
+    assert (short.complete, short.carried_over) == (False, None)
     assert len(selected_s(later)) == 2
     (ended,) = cutter.finish()
-    assert (ended.pairs, ended.complete, ended.kept) == (3, True, replace(KEPT, pairs=1))
+    assert (ended.pairs, ended.complete, ended.carried_over) == (3, True, replace(KEPT, pairs=1))
 
 
 @pytest.mark.parametrize("begins_s", [CONFIG.slice_s + 0.5, -10.0])
 def test_kept_pairs_of_another_time_are_forgotten_aloud(street: Window, begins_s: float) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre())
-    cutter.keep(KEPT)
+    cutter.carry_over(KEPT)
     events = drive(cutter, street, [begins_s])
-    assert [e for e in events if isinstance(e, KeptForgotten)] == [KeptForgotten(KEPT)]
+    assert [e for e in events if isinstance(e, CarriedOverDropped)] == [CarriedOverDropped(KEPT)]
     assert cutter.selected == 1

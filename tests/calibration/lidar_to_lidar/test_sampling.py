@@ -11,10 +11,10 @@ from coec.calibration.lidar_to_lidar.sampling import (
     CANDIDATES_HELD,
     PAIRS,
     SWEEPS_HELD,
-    Found,
-    Look,
-    Missed,
+    MissedSweep,
+    SampledSweeps,
     SweepSampler,
+    SweepSet,
 )
 from coec.calibration.types import EgoMotion, LidarFrame
 
@@ -27,7 +27,7 @@ def sampler(**more: bool) -> SweepSampler:
     return SweepSampler(15.0, 0.2, 300.0, 0.5, **more)
 
 
-def push(of: SweepSampler, stream: str, stamp_ns: int, *, speed_mps: float = 5.0, timed: bool = True) -> Found:
+def push(of: SweepSampler, stream: str, stamp_ns: int, *, speed_mps: float = 5.0, timed: bool = True) -> SampledSweeps:
     if stream == "ego":
         return of.push_motion(EgoMotion(stamp_ns, "ego", (speed_mps, 0.0, 0.0), (0.0, 0.0, 0.0)))
     sweep = LidarFrame(stamp_ns, stream, POINTS, time_offset_s=np.zeros(2, np.float32) if timed else None)
@@ -45,8 +45,8 @@ def arrivals(until_s: float, phase_ns: int = 30_000_000) -> list[Arrival]:
     )
 
 
-def stamps(found: Found) -> list[tuple[int, int]]:
-    return [(pair.a.stamp_ns, pair.b.stamp_ns) for look in found if isinstance(look, Look) for pair in look.pairs]
+def stamps(found: SampledSweeps) -> list[tuple[int, int]]:
+    return [(pair.a.stamp_ns, pair.b.stamp_ns) for look in found if isinstance(look, SweepSet) for pair in look.pairs]
 
 
 def test_a_look_is_of_two_pairs_at_the_beginning_of_each_period() -> None:
@@ -81,7 +81,7 @@ def test_what_is_held_is_bounded_whatever_falls_silent(silent: str) -> None:
             found += push(of, stream, stamp_ns)
             most = max(most, of.held)
     assert most <= SWEEPS_HELD + CANDIDATES_HELD
-    assert {one.cause for one in found if isinstance(one, Missed)} == {"a": set(), "b": {"no_sweep"}}.get(
+    assert {one.cause for one in found if isinstance(one, MissedSweep)} == {"a": set(), "b": {"no_sweep"}}.get(
         silent, {"no_ego_motion"}
     )
 
@@ -90,7 +90,7 @@ def test_a_standing_vehicle_and_points_without_time_are_missed_by_cause() -> Non
     of, found = sampler(), []
     for stream, stamp_ns in arrivals(10.0):
         found += push(of, stream, stamp_ns, speed_mps=0.1)
-    assert [one.cause for one in found if isinstance(one, Missed)] == ["standing", "standing"]
+    assert [one.cause for one in found if isinstance(one, MissedSweep)] == ["standing", "standing"]
     of, found = sampler(timed_a=True), []
     for stream, stamp_ns in arrivals(10.0):
         found += push(of, stream, stamp_ns, timed=stream != "a")
@@ -98,7 +98,7 @@ def test_a_standing_vehicle_and_points_without_time_are_missed_by_cause() -> Non
     of, found = sampler(timed_b=True), []
     for stream, stamp_ns in arrivals(10.0):
         found += push(of, stream, stamp_ns, timed=stream != "a")
-    assert [one.cause for one in found if isinstance(one, Missed)] == ["no_point_time"] * 2
+    assert [one.cause for one in found if isinstance(one, MissedSweep)] == ["no_point_time"] * 2
 
 
 def test_sensor_time_that_steps_back_begins_anew() -> None:

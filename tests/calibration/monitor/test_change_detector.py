@@ -12,8 +12,8 @@ from pydantic import TypeAdapter
 
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.monitor.change_detector import (
-    QUESTIONS,
-    Finding,
+    TESTS_PER_CHECK,
+    MonitorOutcome,
     MonitorState,
     Observation,
     after_observation,
@@ -89,28 +89,28 @@ def fresh(number: int, **how: object) -> Observation:
 
 class TestEvidence:
     def test_nothing_seen_is_unknown(self) -> None:
-        assert MonitorState().outcome is Finding.UNKNOWN
+        assert MonitorState().outcome is MonitorOutcome.UNKNOWN
         assert diagnose(MonitorState()) is None
 
     def test_one_check_decides_nothing(self) -> None:
         state = after(fresh(0))
-        assert state.outcome is Finding.CLEAR
+        assert state.outcome is MonitorOutcome.CLEAR
         assert diagnose(state) is None
 
     def test_two_checks_are_a_suspicion_and_three_a_certainty(self) -> None:
-        assert after(fresh(0), fresh(1)).outcome is Finding.SUSPECT
+        assert after(fresh(0), fresh(1)).outcome is MonitorOutcome.SUSPECT
         state = after(fresh(0), fresh(1), fresh(2))
-        assert state.outcome is Finding.CONFIRMED
+        assert state.outcome is MonitorOutcome.CONFIRMED
         assert diagnose(state) == BENT_MOUNT
 
     def test_checks_that_put_the_mount_in_different_places_do_not_add_up(self) -> None:
         # As in a tunnel and on an open road of a simulated drive, where the mount is right.
         places = [turned(0.0, -0.4, -2.4), turned(0.9, -0.2, -0.1), turned(4.6, -0.3, -2.2), turned(-1.4, -5.2, 0.3)]
         states = [after(*(fresh(n, offset=place) for n, place in enumerate(places[:count]))) for count in (1, 2, 3, 4)]
-        assert [state.outcome for state in states] == [Finding.CLEAR, *[Finding.AT_ODDS] * 3]
-        assert after_observation(states[-1], fresh(9, flagged=False), LEVELS).outcome is Finding.CLEAR
+        assert [state.outcome for state in states] == [MonitorOutcome.CLEAR, *[MonitorOutcome.AT_ODDS] * 3]
+        assert after_observation(states[-1], fresh(9, flagged=False), LEVELS).outcome is MonitorOutcome.CLEAR
         open_still = replace(fresh(9, flagged=False), undecided=True)
-        assert after_observation(states[-1], open_still, LEVELS).outcome is Finding.AT_ODDS
+        assert after_observation(states[-1], open_still, LEVELS).outcome is MonitorOutcome.AT_ODDS
 
     @pytest.mark.parametrize("knock", [turned(1.0, 0.0, 0.0), turned(2.0, -2.0, 1.0), turned(5.0, -4.0, 3.0)])
     def test_a_knock_of_any_size_is_the_same_at_every_check(self, knock: NDArray[np.float64]) -> None:
@@ -118,41 +118,41 @@ class TestEvidence:
         # What checks of simulated drives differ by, 0.06° and a fiftieth of the knock.
         spread = np.radians(0.06) + 0.02 * np.abs(knock).max()
         checks = [fresh(n, offset=knock + np.r_[rng.normal(0.0, spread, 3), 0, 0, 0]) for n in range(4)]
-        assert after(*checks).outcome is Finding.CONFIRMED
+        assert after(*checks).outcome is MonitorOutcome.CONFIRMED
 
     def test_a_shift_is_a_move_too(self) -> None:
         shift = np.array([0.0, 0.0, 0.0, 0.0, 0.05, 0.0])
-        assert after(*(fresh(n, offset=shift) for n in range(3))).outcome is Finding.CONFIRMED
+        assert after(*(fresh(n, offset=shift) for n in range(3))).outcome is MonitorOutcome.CONFIRMED
 
     def test_one_check_elsewhere_says_nothing_against_a_suspicion_and_does_not_make_another(self) -> None:
         suspect = after(fresh(0), fresh(1))
         elsewhere = after_observation(suspect, fresh(2, offset=turned(-4.0, 3.0, 0.0)), LEVELS)
-        assert elsewhere.outcome is Finding.SUSPECT
+        assert elsewhere.outcome is MonitorOutcome.SUSPECT
         assert elsewhere.evidence < suspect.evidence + 1.0
         again = after_observation(elsewhere, fresh(3), LEVELS)
-        assert after_observation(again, fresh(4), LEVELS).outcome is Finding.CONFIRMED
+        assert after_observation(again, fresh(4), LEVELS).outcome is MonitorOutcome.CONFIRMED
 
     def test_of_one_place_there_is_one_check_however_long_the_vehicle_stands_there(self) -> None:
         """As long as no check contradicts it: here the vehicle stops where its mount has already moved."""
         state = after(fresh(0, flagged=False), *(fresh(n, standing=True) for n in range(1, 10)))
-        assert state.outcome is Finding.CLEAR
+        assert state.outcome is MonitorOutcome.CLEAR
         assert state.evidence == after(fresh(0, flagged=False), fresh(1, standing=True)).evidence
-        assert after_observation(state, fresh(10), LEVELS).outcome is Finding.SUSPECT
+        assert after_observation(state, fresh(10), LEVELS).outcome is MonitorOutcome.SUSPECT
 
     def test_checks_at_the_same_pairs_are_one_check(self) -> None:
-        assert after(*[seen([1, 2, 3, 4])] * 10).outcome is Finding.CLEAR
+        assert after(*[seen([1, 2, 3, 4])] * 10).outcome is MonitorOutcome.CLEAR
 
     def test_one_bad_pair_in_overlapping_checks_decides_nothing(self) -> None:
         # Six pairs to a check, three of them new; the bad pair is in two checks.
         checks = [seen(range(3 * k, 3 * k + 6), flagged=k in (4, 5)) for k in range(10)]
         states = [after(*checks[: k + 1]) for k in range(len(checks))]
-        assert {state.outcome for state in states} == {Finding.CLEAR}
+        assert {state.outcome for state in states} == {MonitorOutcome.CLEAR}
 
     def test_clears_with_hysteresis(self) -> None:
         confirmed = [fresh(k) for k in range(10)]
         right = [fresh(10 + k, flagged=False) for k in range(3)]
-        assert after(*confirmed, right[0]).outcome is Finding.CONFIRMED
-        assert after(*confirmed, *right).outcome is Finding.CLEAR
+        assert after(*confirmed, right[0]).outcome is MonitorOutcome.CONFIRMED
+        assert after(*confirmed, *right).outcome is MonitorOutcome.CLEAR
 
     def test_what_confirms_is_no_more_after_an_hour_than_after_a_minute(self) -> None:
         assert after(*(fresh(k) for k in range(720))).evidence == LEVELS.most
@@ -167,31 +167,31 @@ class TestEvidence:
             for scene in (1.0, 5.0)
         }
         record_property("figure", f"{states[5.0].evidence:.1f} of {LEVELS.confirmed:.1f} nats")
-        assert states[1.0].outcome is Finding.CONFIRMED
+        assert states[1.0].outcome is MonitorOutcome.CONFIRMED
         assert states[5.0].evidence < LEVELS.clear
 
     def test_clear_checks_just_after_a_faint_one_count_as_faint(self) -> None:
         """As on a highway, where now and then one is clear and as far off as the others."""
         now_and_then = [fresh(n, weak=n % 3 != 2) for n in range(60)]
-        assert after(*now_and_then).outcome is Finding.SUSPECT
-        assert after(*now_and_then, *(fresh(60 + n) for n in range(5))).outcome is Finding.CONFIRMED
+        assert after(*now_and_then).outcome is MonitorOutcome.SUSPECT
+        assert after(*now_and_then, *(fresh(60 + n) for n in range(5))).outcome is MonitorOutcome.CONFIRMED
 
     def test_a_large_move_is_confirmed_on_a_highway_too(self) -> None:
         assert (
             after(*(fresh(n, offset=turned(2.0, 0.0, 0.0), dispersion=5.0) for n in range(8))).outcome
-            is Finding.CONFIRMED
+            is MonitorOutcome.CONFIRMED
         )
 
     def test_faint_edges_suspect_and_never_confirm(self) -> None:
         state = after(*[fresh(k, weak=True) for k in range(40)])
-        assert state.outcome is Finding.SUSPECT
+        assert state.outcome is MonitorOutcome.SUSPECT
 
     def test_faint_checks_that_are_off_alike_teach_nothing_of_the_rig(self) -> None:
         """So that clear checks of a right mount are no move after a long stretch of them."""
         rain = [fresh(n, offset=turned(0.5, 0.1, 0.6), weak=True) for n in range(60)]
         states = [after(*rain, *(fresh(60 + n, flagged=False) for n in range(count))) for count in (0, 10)]
         assert states[0].turned.right == after(rain[0]).turned.right
-        assert states[1].outcome is Finding.CLEAR
+        assert states[1].outcome is MonitorOutcome.CLEAR
 
     def test_a_night_in_which_two_faint_checks_agree_is_no_suspicion(self) -> None:
         # The last five checks of a simulated drive by night, where the mount is right.
@@ -203,16 +203,16 @@ class TestEvidence:
             fresh(4, offset=turned(-2.6, 0.3, 1.2), weak=True),
         ]
         states = [after(*night[:count]) for count in range(1, 6)]
-        assert {state.outcome for state in states[1:]} == {Finding.AT_ODDS}
+        assert {state.outcome for state in states[1:]} == {MonitorOutcome.AT_ODDS}
 
     def test_a_faint_check_at_a_right_pose_says_little_for_it(self) -> None:
         suspect = after(fresh(0), fresh(1))
         faint = after_observation(suspect, fresh(2, flagged=False, weak=True), LEVELS)
-        assert faint.outcome is Finding.SUSPECT
+        assert faint.outcome is MonitorOutcome.SUSPECT
 
     def test_a_check_that_does_not_tell_translations_tells_rotations(self) -> None:
         half = np.array([*OFFSET[:3], np.nan, np.nan, np.nan])
-        assert after(*(fresh(n, offset=half) for n in range(3))).outcome is Finding.CONFIRMED
+        assert after(*(fresh(n, offset=half) for n in range(3))).outcome is MonitorOutcome.CONFIRMED
 
     def test_goes_through_json(self) -> None:
         state = after(fresh(0), fresh(1), fresh(2, causes=(DARK,)))
@@ -237,14 +237,14 @@ class TestStandstill:
 
     def test_checks_that_contradict_it_count_but_confirm_nothing(self) -> None:
         moved = [fresh(0, flagged=False), *(self.standing(n, flagged=n > 3) for n in range(1, 60))]
-        assert after(*moved[:6]).outcome is Finding.SUSPECT
+        assert after(*moved[:6]).outcome is MonitorOutcome.SUSPECT
         assert after(*moved).evidence == LEVELS.suspect
-        assert after(*moved, *(fresh(60 + n) for n in range(2))).outcome is Finding.CONFIRMED
+        assert after(*moved, *(fresh(60 + n) for n in range(2))).outcome is MonitorOutcome.CONFIRMED
 
     def test_a_lorry_that_leaves_again_is_forgotten(self) -> None:
         lorry = [fresh(0, flagged=False), *(self.standing(n, flagged=3 < n < 8) for n in range(1, 14))]
         state = after(*lorry)
-        assert state.outcome is Finding.CLEAR
+        assert state.outcome is MonitorOutcome.CLEAR
         assert is_acquitted(state, 10**15, MonitorConfig()), "the place has an acquitting check again"
 
     def test_another_offset_contradicts_though_neither_check_is_flagged(self) -> None:
@@ -305,10 +305,12 @@ class TestAcquittal:
     def test_a_window_without_translation_does_not_clear_a_translation(self) -> None:
         shifted = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
         state = after(*(fresh(n, flagged=False) for n in range(5)), *(fresh(5 + n, offset=shifted) for n in range(4)))
-        assert state.outcome is Finding.CONFIRMED
+        assert state.outcome is MonitorOutcome.CONFIRMED
         kept = after_window(state, 10**9, LEVELS, solved_translation=False, agrees=True)
-        assert kept.outcome is Finding.CONFIRMED
-        assert after_window(state, 10**9, LEVELS, solved_translation=True, agrees=True).outcome is Finding.UNKNOWN
+        assert kept.outcome is MonitorOutcome.CONFIRMED
+        assert (
+            after_window(state, 10**9, LEVELS, solved_translation=True, agrees=True).outcome is MonitorOutcome.UNKNOWN
+        )
 
 
 class TestMountScatter:
@@ -356,34 +358,34 @@ class TestWrongFromTheFirstCheck:
     def test_all_checks_together_doubt_it_though_none_does_alone(self) -> None:
         checks = self.checks(turned(0.3, 0.3, 0.25), 2)
         assert not any(check.flagged for check in checks)
-        assert after(checks[0]).outcome is Finding.CLEAR
-        assert after(*checks).outcome is Finding.AT_ODDS
+        assert after(checks[0]).outcome is MonitorOutcome.CLEAR
+        assert after(*checks).outcome is MonitorOutcome.AT_ODDS
 
     def test_what_estimators_are_off_on_other_rigs_is_no_doubt(self) -> None:
-        assert after(*self.checks(turned(0.12, -0.12, 0.12), 12)).outcome is Finding.CLEAR
+        assert after(*self.checks(turned(0.12, -0.12, 0.12), 12)).outcome is MonitorOutcome.CLEAR
 
     def test_a_window_that_vouches_for_it_ends_the_doubt(self) -> None:
         state = MonitorState(vouched=True)
         for check in self.checks(turned(0.3, 0.3, 0.25), 12):
             state = after_observation(state, check, LEVELS)
-        assert state.outcome is Finding.CLEAR
+        assert state.outcome is MonitorOutcome.CLEAR
 
 
 class TestAlarmLevels:
     def test_are_the_logarithm_of_the_tests_that_begin_in_the_stated_time(self) -> None:
         levels = alarm_levels(MonitorConfig(hours_between_false_alarms=1000.0, period_s=10.0))
-        assert levels.confirmed == pytest.approx(np.log(QUESTIONS * 1000.0 * 360.0))
+        assert levels.confirmed == pytest.approx(np.log(TESTS_PER_CHECK * 1000.0 * 360.0))
 
     def test_no_single_check_comes_to_any_however_rare_checks_are(self) -> None:
         levels = alarm_levels(MonitorConfig(period_s=86_400.0))
         state = after_observation(after(fresh(0, flagged=False)), fresh(1), levels)
-        assert state.outcome is Finding.CLEAR
+        assert state.outcome is MonitorOutcome.CLEAR
 
 
 class TestCauses:
     def test_bad_data_are_no_evidence_of_a_bent_mount(self) -> None:
         state = after(*[fresh(k, causes=(LENS_DIRTY,)) for k in range(10)])
-        assert (state.outcome, state.evidence) == (Finding.UNKNOWN, 0.0)
+        assert (state.outcome, state.evidence) == (MonitorOutcome.UNKNOWN, 0.0)
         assert diagnose(state) == LENS_DIRTY
 
     def test_one_check_with_a_cause_is_not_believed(self) -> None:

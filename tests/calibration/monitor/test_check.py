@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.monitor.check import Check, CheckInput, Expected, check_at, gather
 from coec.calibration.monitor.check_verdict import (
     MIN_EDGES_IN_VIEW,
-    MIN_LOOKS,
+    MIN_INDEPENDENT_SAMPLES,
     TELLING_CONTRAST,
     Opinion,
     judge_check,
@@ -67,7 +67,9 @@ def test_are_those_of_the_curvature() -> None:
 
 @pytest.fixture(scope="module")
 def evidence(sharp_street: Window, stereo: DepthModel) -> CheckInput:
-    return gather(sight_of(sharp_street, stereo, GreyImages(LimitsConfig()), CONFIG, Silence()), np.radians(1.0))
+    return gather(
+        prepare_window_data(sharp_street, stereo, GreyImages(LimitsConfig()), CONFIG, Silence()), np.radians(1.0)
+    )
 
 
 class TestSupport:
@@ -98,17 +100,17 @@ class TestSupport:
         one_thing[:, 3] = 16 * 0.3
         assert everywhere.insists
         aside = support(there, there - one_thing)
-        assert aside.kept == pytest.approx(everywhere.kept, abs=0.02)
+        assert aside.retained == pytest.approx(everywhere.retained, abs=0.02)
         assert not aside.gained
         record_property("figure", f"gained by {aside.certainty:.1f} σ; by all alike {everywhere.certainty:.0f} σ")
 
     def test_an_optimum_without_edges_gained_nothing(self) -> None:
         told = support(np.zeros((6, 16)), np.zeros((6, 16)))
-        assert (told.kept, told.certainty, told.insists) == (1.0, 0.0, False)
+        assert (told.retained, told.certainty, told.insists) == (1.0, 0.0, False)
 
 
-NOTHING = Support(kept=1.0, certainty=0.0)
-INSISTS = Support(kept=0.6, certainty=4.0)
+NOTHING = Support(retained=1.0, certainty=0.0)
+INSISTS = Support(retained=0.6, certainty=4.0)
 
 A_CHECK = Check(
     pairs=1,
@@ -119,7 +121,7 @@ A_CHECK = Check(
     edges=10.0,
     edges_at_best=10.0,
     edges_in_view=100_000,
-    looks=6.0,
+    independent_samples=6.0,
     scatter_rad=np.zeros(3),
     of_rotation=NOTHING,
     of_pose=NOTHING,
@@ -167,7 +169,7 @@ class TestOpinion:
         assert [self.said(seen, off) for off in (0.9, 1.1, 2.1)] == [Opinion.CLEAR, *[Opinion.UNDECIDED] * 2]
 
     def test_but_where_most_edges_are_lost_any_scene_tells(self) -> None:
-        seen = replace(A_CHECK, of_rotation=replace(INSISTS, kept=0.4), contrast=TELLING_CONTRAST - 0.1)
+        seen = replace(A_CHECK, of_rotation=replace(INSISTS, retained=0.4), contrast=TELLING_CONTRAST - 0.1)
         assert self.said(seen, 2.1) is Opinion.FLAGGED
 
     def test_what_one_optimum_insists_on_the_other_does_not_say(self) -> None:
@@ -193,8 +195,8 @@ def test_an_optimum_that_stands_out_by_chance_only_is_weak(
     [
         (MIN_EDGES_IN_VIEW + 1, 6.0, False),
         (MIN_EDGES_IN_VIEW - 1, 6.0, True),
-        (1000.0, MIN_LOOKS + 0.1, False),
-        (1000.0, MIN_LOOKS - 0.1, True),
+        (1000.0, MIN_INDEPENDENT_SAMPLES + 0.1, False),
+        (1000.0, MIN_INDEPENDENT_SAMPLES - 0.1, True),
     ],
 )
 def test_few_edges_and_frames_that_say_the_same_decide_nothing_however_well_they_fit(
@@ -203,7 +205,7 @@ def test_few_edges_and_frames_that_say_the_same_decide_nothing_however_well_they
     pairs = len(evidence.pairs)
     moved = np.array([0.0, np.radians(1.0), 0, 0, 0, 0])
     seen = replace(
-        A_CHECK, pairs=pairs, edges_in_view=int(in_view * pairs), looks=looks, edges_at_best=100.0,
+        A_CHECK, pairs=pairs, edges_in_view=int(in_view * pairs), independent_samples=looks, edges_at_best=100.0,
         offset_rotation=moved, of_rotation=INSISTS,
     )  # fmt: skip
     told = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)

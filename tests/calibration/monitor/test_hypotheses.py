@@ -8,7 +8,7 @@ import pytest
 
 from coec.calibration.monitor.change_detector import ROTATIONS
 from coec.calibration.monitor.hypotheses import STAY, Hypotheses, Hypothesis, after_check
-from coec.calibration.monitor.likelihood import Belief, Three, Told
+from coec.calibration.monitor.likelihood import CheckMeasurement, OffsetPosterior, Three
 
 NOISE, PLACE, RIG = (radians(0.05) ** 2,) * 3, (radians(0.07) ** 2,) * 3, (radians(0.12) ** 2,) * 3
 KNOWN: Three = (1e-9, 1e-9, 1e-9)
@@ -21,9 +21,11 @@ def at(degrees: float) -> Three:
 
 def evidence_after(seen_deg: float, right_deg: float, age: float) -> float:
     """Of an old test that took the mount to have moved to where the next check sees it, too."""
-    told = Told(at(seen_deg), NOISE, PLACE, PLACE, RIG, at(seen_deg), weak=False)
-    rig = Belief(at(0.0), KNOWN)
-    test = Hypothesis(1, age, EVIDENCE, Belief(at(seen_deg), KNOWN), Belief(at(right_deg), KNOWN), rig)
+    told = CheckMeasurement(at(seen_deg), NOISE, PLACE, PLACE, RIG, at(seen_deg), weak=False)
+    rig = OffsetPosterior(at(0.0), KNOWN)
+    test = Hypothesis(
+        1, age, EVIDENCE, OffsetPosterior(at(seen_deg), KNOWN), OffsetPosterior(at(right_deg), KNOWN), rig
+    )
     leading = after_check(Hypotheses(rig, (test,), told.before), told, ROTATIONS, 1.0, MOST).leading
     assert leading is not None
     return leading.evidence

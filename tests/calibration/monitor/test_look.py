@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coec.adapters.images.codec import GreyImages
-from coec.calibration.estimators import Sight, sight_of
+from coec.calibration.estimators import WindowData, prepare_window_data
 from coec.calibration.monitor.check import check_at, gather, join, seen_part
 from coec.calibration.monitor.check_verdict import diagnose, observe
 from coec.calibration.monitor.neighbourhood import REACH_RAD
@@ -43,8 +43,8 @@ def moved(window: Window, xi: list[float]) -> Window:
     return replace(window, T_camera_lidar_start=se3.perturb(window.T_camera_lidar_start, np.array(xi)))
 
 
-def sight(window: Window, depth: DepthModel) -> Sight:
-    return sight_of(window, depth, IMAGES, CONFIG, Silence())
+def sight(window: Window, depth: DepthModel) -> WindowData:
+    return prepare_window_data(window, depth, IMAGES, CONFIG, Silence())
 
 
 class TestDepth:

@@ -16,8 +16,14 @@ from coec.adapters.depth.maps import CachedDepth, open_depth
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Baseline
 from coec.calibration.commissioning.learning import learn_accuracy
-from coec.calibration.estimators import sight_of
-from coec.calibration.monitor.change_detector import Finding, MonitorState, after_observation, alarm_levels, diagnose
+from coec.calibration.estimators import prepare_window_data
+from coec.calibration.monitor.change_detector import (
+    MonitorOutcome,
+    MonitorState,
+    after_observation,
+    alarm_levels,
+    diagnose,
+)
 from coec.calibration.monitor.check import gather
 from coec.calibration.monitor.check_verdict import UNCOMMISSIONED, observe
 from coec.calibration.monitor.sensor_faults import (
@@ -55,10 +61,12 @@ class Drive:
 
 @pytest.fixture(scope="module")
 def drive(sample_data: Path) -> Drive:
-    whole = windows.load(f"kitti360:{sample_data / 'kitti360'}?camera=image_00", None, 25, lambda *_: None).window
+    whole = windows.load_window(
+        f"kitti360:{sample_data / 'kitti360'}?camera=image_00", None, 25, lambda *_: None
+    ).window
     depth = CachedDepth(open_depth(DepthConfig(model="stereo"), LimitsConfig()), 10)
     learned = replace(whole, pairs=whole.pairs[::2])
-    evidence = gather(sight_of(learned, depth, GreyImages(LimitsConfig()), CalibrationConfig(), Silence()))
+    evidence = gather(prepare_window_data(learned, depth, GreyImages(LimitsConfig()), CalibrationConfig(), Silence()))
     right = whole.rig.T_camera_lidar_nominal
     rotation, pose = learn_accuracy(evidence, right)
     baseline = Baseline(
@@ -148,12 +156,12 @@ class TestScenarios:
     def test_what_happens_on_every_drive_is_no_cause(self, drive: Drive, change: Change) -> None:
         state = states(drive, change)[-1]
         assert diagnose(state) is None
-        assert state.outcome is Finding.CLEAR
+        assert state.outcome is MonitorOutcome.CLEAR
 
     @pytest.mark.parametrize("change", [turned((5.0, -5.0, 3.0)), scenarios.images_of_other_frames])
     def test_what_no_check_can_explain_is_never_certain_and_never_clear(self, drive: Drive, change: Change) -> None:
         after = states(drive, change, checks=30)
-        assert {state.outcome for state in after[2:]} <= {Finding.AT_ODDS, Finding.SUSPECT}
+        assert {state.outcome for state in after[2:]} <= {MonitorOutcome.AT_ODDS, MonitorOutcome.SUSPECT}
         assert diagnose(after[-1]) is None
 
 

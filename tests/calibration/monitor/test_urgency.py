@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from coec.calibration.frames.window import PairSelected, SliceEnded, WindowCutter
-from coec.calibration.monitor.urgency import TRIES, Urgency
+from coec.calibration.frames.window import PairSelected, SliceClosed, WindowCutter
+from coec.calibration.monitor.urgency import TRIES, UrgentWindow
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, ImageQuality, Window
 from coec.config import MonitorConfig, WindowConfig
 
@@ -33,21 +33,21 @@ class Drive:
         self.street = street
         self.rate_hz = rate_hz
         self.cutter = WindowCutter(WINDOW, street.rig, Inspector(), AsTheyAre())
-        self.urgency = Urgency(MONITOR)
+        self.urgency = UrgentWindow(MONITOR)
         self.selected: list[float] = []
 
-    def until(self, begin_s: float, end_s: float) -> list[tuple[float, SliceEnded]]:
+    def until(self, begin_s: float, end_s: float) -> list[tuple[float, SliceClosed]]:
         ends = []
         for i in range(round((end_s - begin_s) * self.rate_hz)):
             second = begin_s + i / self.rate_hz
             pair = self.at(round(second * S))
-            ends += [(second, e) for e in self.urgency.heed(self.cutter, self.rate_hz)]
+            ends += [(second, e) for e in self.urgency.apply(self.cutter, self.rate_hz)]
             for event in self.cutter.offer(pair, self.street.T_camera_lidar_start):
                 if isinstance(event, PairSelected):
                     self.selected.append(second)
-                elif isinstance(event, SliceEnded):
+                elif isinstance(event, SliceClosed):
                     ends.append((second, event))
-                    self.urgency.ended(event, self.cutter, self.rate_hz)
+                    self.urgency.on_slice_closed(event, self.cutter, self.rate_hz)
         return ends
 
     def at(self, stamp_ns: int) -> FramePair:
@@ -119,7 +119,7 @@ def test_the_alarms_of_one_suspicion_are_counted(street: Window) -> None:
 def test_what_the_rig_waits_for_outlasts_the_calm_of_the_pair(street: Window) -> None:
     drive = Drive(street)
     drive.until(1000, 1070)
-    drive.urgency.wanted(since_ns=1055 * S, longer_s=15.0)
+    drive.urgency.request(since_ns=1055 * S, longer_s=15.0)
     drive.urgency.calm()
     assert drive.urgency.is_waiting
     ends = drive.until(1070, 1220)
@@ -130,7 +130,7 @@ def test_what_the_rig_waits_for_outlasts_the_calm_of_the_pair(street: Window) ->
 def test_a_suspicion_does_not_wait_for_the_turn_that_the_rig_gave(street: Window) -> None:
     drive = Drive(street)
     drive.until(1000, 1070)
-    drive.urgency.wanted(since_ns=1055 * S, longer_s=60.0)
+    drive.urgency.request(since_ns=1055 * S, longer_s=60.0)
     assert [second for second, _ in drive.until(1070, 1075)] == [1070.0]
     drive.urgency.alarm(since_ns=1072 * S)
     assert [(second, end.complete) for second, end in drive.until(1075, 1100)] == [(1075.0, False), (1095.0, True)]
@@ -140,13 +140,13 @@ def test_what_the_rig_wants_is_no_second_window_while_one_is_on_its_way(street: 
     drive = Drive(street)
     drive.until(1000, 1070)
     drive.urgency.alarm(since_ns=1055 * S)
-    drive.urgency.wanted(since_ns=1055 * S, longer_s=60.0)
+    drive.urgency.request(since_ns=1055 * S, longer_s=60.0)
     assert [second for second, _ in drive.until(1070, 1200)] == [1070.0, 1090.0, 1190.0]
 
 
 def test_nothing_is_wanted_of_a_time_that_is_no_more(street: Window) -> None:
     drive = Drive(street)
     drive.until(1000, 1070)
-    drive.urgency.wanted(since_ns=1055 * S, longer_s=0.0)
+    drive.urgency.request(since_ns=1055 * S, longer_s=0.0)
     drive.urgency.forget()
     assert [second for second, _ in drive.until(1070, 1110)] == [1100.0]

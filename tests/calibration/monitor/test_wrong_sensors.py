@@ -13,14 +13,14 @@ from calibration.test_lifecycle import RULES
 from coec.adapters.images.codec import GreyImages
 from coec.calibration import lifecycle
 from coec.calibration.frames.sampling import CheckSampler, stands
-from coec.calibration.lifecycle import HealthState, PairState, Provenance, Status
+from coec.calibration.lifecycle import CalibrationStatus, HealthState, PairState, Provenance
 from coec.calibration.monitor.change_detector import MonitorState
 from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import FramePair, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.geometry import se3
-from drives import drawn_source
+from drives import rendered_source
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -41,7 +41,7 @@ class Course:
 @pytest.fixture(scope="module")
 def drive() -> Window:
     """A drive at 8 m/s with a pair a second."""
-    return window_of(drawn_source(DRIVE))
+    return window_of(rendered_source(DRIVE))
 
 
 def course(drive: Window, depth: DepthModel, change: Change = lambda pair: pair, rig: Rig | None = None) -> Course:
@@ -51,7 +51,7 @@ def course(drive: Window, depth: DepthModel, change: Change = lambda pair: pair,
     state = PairState(
         pose,
         Provenance.ESTIMATED,
-        Status.ACCEPTED,
+        CalibrationStatus.ACCEPTED,
         0,
         health=HealthState.HEALTHY,
         reasons=(),

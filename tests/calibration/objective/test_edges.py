@@ -13,8 +13,8 @@ from coec.calibration.objective.edges import (
     MAX_PIXELS,
     RANKED_POINTS,
     THINNED_POINTS,
+    EdgeCue,
     EdgesAlone,
-    EdgeWitness,
     build_edges,
 )
 from coec.calibration.types import Rig, Window
@@ -31,7 +31,7 @@ from coec.geometry.projection import project, unproject
 GREY = GreyImages(LimitsConfig())
 
 
-def with_camera(window: Window, camera: Camera) -> EdgeWitness:
+def with_camera(window: Window, camera: Camera) -> EdgeCue:
     """The edges of one pair, seen through another lens in an image of noise."""
     pair, rig = window.pairs[0], replace(window.rig, camera=camera, mask=None)
     grey = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width)).astype(np.uint8)
@@ -81,7 +81,7 @@ def test_levels_double_and_end_at_the_same_angle_for_any_lens(street: Window, le
         assert COARSEST_BLUR_RAD <= edges.band_blur_rad[-1] < 2.0 * COARSEST_BLUR_RAD
 
 
-def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     rig = sharp_street.rig
     lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
     scales = EdgeScales(lit, 0, BANDS - 1, rig.T_camera_lidar_nominal[:2, 2])
@@ -93,9 +93,7 @@ def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeWit
             np.testing.assert_array_equal(frames.maps[f], band)
 
 
-def test_points_are_the_range_edges_where_they_were_at_the_exposure(
-    sharp_street: Window, sharp_edges: EdgeWitness
-) -> None:
+def test_points_are_the_range_edges_where_they_were_at_the_exposure(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     first = sharp_edges.sharp.first_point
     for f, pair in enumerate(sharp_street.pairs):
         found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
@@ -105,7 +103,7 @@ def test_points_are_the_range_edges_where_they_were_at_the_exposure(
         np.testing.assert_array_equal(sharp_edges.sharp.weight[first[f] : first[f + 1]], found.weight)
 
 
-def test_charts_are_of_the_coarse_bands_with_all_of_their_points_or_some(sharp_edges: EdgeWitness) -> None:
+def test_charts_are_of_the_coarse_bands_with_all_of_their_points_or_some(sharp_edges: EdgeCue) -> None:
     for charts, band, blur_rad in zip(
         sharp_edges.charts, sharp_edges.bands[:0:-1], sharp_edges.band_blur_rad[:0:-1], strict=True
     ):

@@ -11,7 +11,7 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.estimators import SAME_BASIN_RAD
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.objective.cells import COLUMNS, ROWS
-from coec.calibration.objective.edges import EdgeWitness
+from coec.calibration.objective.edges import EdgeCue
 from coec.calibration.objective.fused import OTHER_POSES, FusedObjective, Fusion, Scale
 from coec.calibration.objective.mutual_information import (
     MutualInformation,
@@ -77,7 +77,7 @@ def depth_witness(sharp_street: Window, stereo: DepthModel) -> MutualInformation
 
 
 @pytest.fixture(scope="module")
-def fusion(sharp_street: Window, sharp_edges: EdgeWitness, depth_witness: MutualInformation) -> Fusion:
+def fusion(sharp_street: Window, sharp_edges: EdgeCue, depth_witness: MutualInformation) -> Fusion:
     return Fusion(sharp_edges, depth_witness, sharp_street.T_camera_lidar_start, REACH)
 
 
@@ -118,7 +118,7 @@ def z_of(edges: EdgeFrames, pose: Matrix4) -> float:
 @pytest.mark.parametrize("turn_deg", [0.0, 0.4, 3.0, 20.0])
 def test_the_score_is_the_sum_of_both_witnesses_in_their_own_standard_deviations(
     sharp_street: Window,
-    sharp_edges: EdgeWitness,
+    sharp_edges: EdgeCue,
     depth_witness: MutualInformation,
     fusion: Fusion,
     turn_deg: float,
@@ -138,7 +138,7 @@ def test_the_score_is_the_sum_of_both_witnesses_in_their_own_standard_deviations
 
 
 def test_basins_are_ranked_from_coarse_to_fine_and_settled_on_the_sharpest_edges(
-    sharp_edges: EdgeWitness, fusion: Fusion
+    sharp_edges: EdgeCue, fusion: Fusion
 ) -> None:
     assert [objective.step_rad for objective in fusion.ranking] == [*reversed(sharp_edges.band_blur_rad[:-1])]
     whole, sharp = fusion.settling
@@ -164,7 +164,7 @@ def test_its_cells_sum_to_the_objective_but_for_a_constant(sharp_street: Window,
     poses = [truth, *sample_reach(truth, SearchBox(np.radians(1.0), 0.0), 4)]
     rest = [cells.at(pose[None])[0].sum(axis=1).mean() - fused.evaluate(pose).score for pose in poses]
     np.testing.assert_allclose(rest, rest[0], atol=1e-9)
-    in_front = cells.sight.p_camera[:, 2] > 0.0
+    in_front = cells.points.p_camera[:, 2] > 0.0
     assert in_front.mean() > 0.9
 
 
@@ -191,7 +191,7 @@ def test_the_truth_stands_out_and_other_poses_are_spread_around_nought(sharp_str
 
 
 def test_depth_that_does_not_vary_with_the_pose_leaves_the_edges_to_decide(
-    sharp_street: Window, sharp_edges: EdgeWitness
+    sharp_street: Window, sharp_edges: EdgeCue
 ) -> None:
     """One value everywhere: no mutual information at any pose, and no division by its deviation."""
 

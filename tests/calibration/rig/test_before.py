@@ -9,26 +9,26 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.calibration.rig.before import CREEP, SHAKEN, Before, remembered
-from coec.calibration.rig.joint import estimate
-from coec.calibration.rig.types import Link, RigGraph, was
+from coec.calibration.rig.before import CREEP, SHAKEN, PreMoveKnowledge, remembered
+from coec.calibration.rig.joint import estimate_jointly
+from coec.calibration.rig.types import RigGraph, RigidLink, was
 from coec.calibration.tracker import NS_PER_H, Measurement
 from coec.calibration.types import Matrix4, Uncertainty
 from coec.geometry import se3
-from rigs import NS, POSES, SIGMA, TURN, graph, windows, with_moved
+from rigs import NS, POSES, SIGMA, TURN, edge_windows, graph, moved_poses
 
 CAMERAS = ("front", "left", "rear")
 STAR = graph([(camera, "roof") for camera in CAMERAS])
 EXACT, NOTHING = np.full(6, 1e-5), np.full(6, 5.0)
 KNOCK = np.array([0.01, -0.015, 0.008, 0.02, -0.01, 0.03])
-AFTER = with_moved("roof", xi=KNOCK)
+AFTER = moved_poses("roof", xi=KNOCK)
 Poses = Mapping[str, Matrix4]
 
 
-def known(rig: RigGraph, seed: int, sigma: np.ndarray, sensors: tuple[str, ...] = ("roof",)) -> Before:
+def known(rig: RigGraph, seed: int, sigma: np.ndarray, sensors: tuple[str, ...] = ("roof",)) -> PreMoveKnowledge:
     """What windows of before the knock say of the pairs of these sensors."""
-    told = windows(rig, POSES, seed, sigma)
-    return Before(sensors, {e.name: told[e.name] for e in rig.edges if {e.a, e.b} & set(sensors)})
+    told = edge_windows(rig, POSES, seed, sigma)
+    return PreMoveKnowledge(sensors, {e.name: told[e.name] for e in rig.edges if {e.a, e.b} & set(sensors)})
 
 
 def truth(rig: RigGraph, name: str, poses: Poses) -> Matrix4:
@@ -42,7 +42,7 @@ def move_of(found: Matrix4, before: Matrix4) -> Matrix4:
 
 
 def test_with_exact_knowledge_all_pairs_share_one_move_of_the_lidar() -> None:
-    found = estimate(STAR, windows(STAR, AFTER, 1), known(STAR, 2, EXACT))
+    found = estimate_jointly(STAR, edge_windows(STAR, AFTER, 1), known(STAR, 2, EXACT))
     told = [move_of(found.T_a_b[edge.name], truth(STAR, edge.name, POSES)) for edge in STAR.edges]
     for other in told[1:]:
         np.testing.assert_allclose(se3.difference(other, told[0]), 0.0, atol=1e-4)
@@ -53,8 +53,8 @@ def test_with_exact_knowledge_all_pairs_share_one_move_of_the_lidar() -> None:
 
 
 def test_with_no_knowledge_every_pair_keeps_its_own_result() -> None:
-    told = windows(STAR, AFTER, 1)
-    alone, found = estimate(STAR, told), estimate(STAR, told, known(STAR, 2, NOTHING))
+    told = edge_windows(STAR, AFTER, 1)
+    alone, found = estimate_jointly(STAR, told), estimate_jointly(STAR, told, known(STAR, 2, NOTHING))
     for name in STAR.edge:
         np.testing.assert_allclose(se3.difference(found.T_a_b[name], alone.T_a_b[name]) / SIGMA, 0.0, atol=0.02)
         np.testing.assert_allclose(found.between(name, name), alone.between(name, name), atol=0.02 * SIGMA.max() ** 2)
@@ -63,8 +63,8 @@ def test_with_no_knowledge_every_pair_keeps_its_own_result() -> None:
 def test_what_was_known_halves_the_error_and_no_more_is_claimed() -> None:
     of_rig, of_pairs, claims = np.zeros(6), np.zeros(6), []
     for seed in range(25):
-        told = windows(STAR, AFTER, seed)
-        found = estimate(STAR, told, known(STAR, 1000 + seed, 0.3 * SIGMA))
+        told = edge_windows(STAR, AFTER, seed)
+        found = estimate_jointly(STAR, told, known(STAR, 1000 + seed, 0.3 * SIGMA))
         for name in STAR.edge:
             error = se3.difference(found.T_a_b[name], truth(STAR, name, AFTER))
             of_rig += error**2
@@ -75,18 +75,18 @@ def test_what_was_known_halves_the_error_and_no_more_is_claimed() -> None:
 
 
 def test_neither_the_order_of_the_pairs_nor_the_frame_of_the_lidar_matters() -> None:
-    told, before = windows(STAR, AFTER, 3), known(STAR, 4, 0.5 * SIGMA)
-    found = estimate(STAR, told, before)
+    told, before = edge_windows(STAR, AFTER, 3), known(STAR, 4, 0.5 * SIGMA)
+    found = estimate_jointly(STAR, told, before)
     shuffled = RigGraph.of(STAR.sensors[::-1], STAR.edges[::-1])
     backwards = replace(before, edges=dict(reversed(list(before.edges.items()))))
-    again = estimate(shuffled, dict(reversed(list(told.items()))), backwards)
+    again = estimate_jointly(shuffled, dict(reversed(list(told.items()))), backwards)
     frame = se3.exp(np.array([0.3, -0.8, 1.1, 2.0, -1.0, 0.5]))
 
     def turned(one: Measurement) -> Measurement:
         return replace(one, T_camera_lidar=one.T_camera_lidar @ frame)
 
     edges = [replace(edge, T_a_b=edge.T_a_b @ frame) for edge in STAR.edges]
-    other = estimate(
+    other = estimate_jointly(
         RigGraph.of(STAR.sensors, edges),
         {name: turned(one) for name, one in told.items()},
         replace(before, edges={name: turned(one) for name, one in before.edges.items()}),
@@ -99,8 +99,8 @@ def test_neither_the_order_of_the_pairs_nor_the_frame_of_the_lidar_matters() -> 
 
 
 def test_a_camera_that_moved_leaves_the_others_where_they_were() -> None:
-    told = windows(STAR, with_moved("front"), 5)
-    alone, found = estimate(STAR, told), estimate(STAR, told, known(STAR, 6, EXACT, ("front",)))
+    told = edge_windows(STAR, moved_poses("front"), 5)
+    alone, found = estimate_jointly(STAR, told), estimate_jointly(STAR, told, known(STAR, 6, EXACT, ("front",)))
     for name in STAR.edge:
         np.testing.assert_allclose(se3.difference(found.T_a_b[name], alone.T_a_b[name]) / SIGMA, 0.0, atol=0.02)
     assert found.freedom == 0
@@ -112,9 +112,9 @@ def test_a_camera_that_moved_leaves_the_others_where_they_were() -> None:
 def test_what_a_camera_denies_of_the_past_is_left_out_and_bends_nothing(
     record_property: Callable[[str, object], None],
 ) -> None:
-    after = {**AFTER, "left": with_moved("left")["left"]}
-    told = windows(STAR, after, 7)
-    found = estimate(STAR, told, known(STAR, 8, 0.3 * SIGMA))
+    after = {**AFTER, "left": moved_poses("left")["left"]}
+    told = edge_windows(STAR, after, 7)
+    found = estimate_jointly(STAR, told, known(STAR, 8, 0.3 * SIGMA))
     assert not found.consistent
     assert found.left_out == "left-roof"
     assert any(was("left-roof") in loop.names for loop in found.open_loops)
@@ -127,8 +127,8 @@ def test_what_a_camera_denies_of_the_past_is_left_out_and_bends_nothing(
 
 def test_of_two_pairs_that_tell_different_moves_nobody_knows_which_is_right() -> None:
     rig = graph([(camera, "roof") for camera in CAMERAS[:2]])
-    told = windows(rig, {**AFTER, "left": with_moved("left")["left"]}, 7)
-    found = estimate(rig, told, known(rig, 8, 0.3 * SIGMA))
+    told = edge_windows(rig, {**AFTER, "left": moved_poses("left")["left"]}, 7)
+    found = estimate_jointly(rig, told, known(rig, 8, 0.3 * SIGMA))
     assert not found.consistent
     assert found.left_out is None
     assert found.widened > 3.0
@@ -136,18 +136,18 @@ def test_of_two_pairs_that_tell_different_moves_nobody_knows_which_is_right() ->
 
 def test_a_bad_window_is_told_from_what_was_known_before_where_another_lidar_speaks() -> None:
     rig = graph([(camera, lidar) for camera in CAMERAS for lidar in ("roof", "bumper")])
-    told = windows(rig, AFTER, 9)
+    told = edge_windows(rig, AFTER, 9)
     bad = replace(told["left-roof"], T_camera_lidar=se3.perturb(told["left-roof"].T_camera_lidar, TURN))
-    found = estimate(rig, {**told, "left-roof": bad}, known(rig, 10, 0.3 * SIGMA))
+    found = estimate_jointly(rig, {**told, "left-roof": bad}, known(rig, 10, 0.3 * SIGMA))
     assert found.left_out == "left-roof"
     away = se3.difference(found.T_a_b["left-roof"], truth(rig, "left-roof", AFTER))
     assert np.abs(away[:3]).max() < radians(0.2), "the others say where it is"
 
 
 def test_a_bar_holds_before_as_it_does_after() -> None:
-    bar = Link("bar", "front", "left", POSES["front"] @ se3.inverse(POSES["left"]), np.full(6, 1e-4))
+    bar = RigidLink("bar", "front", "left", POSES["front"] @ se3.inverse(POSES["left"]), np.full(6, 1e-4))
     rig = graph([(camera, "roof") for camera in CAMERAS], [bar])
-    joined = Before(("front", "left"), known(rig, 1, SIGMA, ("front", "left")).edges).joined(rig)
+    joined = PreMoveKnowledge(("front", "left"), known(rig, 1, SIGMA, ("front", "left")).edges).joined(rig)
     assert {link.name: (link.a, link.b) for link in joined.links} == {
         "bar": ("front", "left"),
         was("bar"): (was("front"), was("left")),
@@ -163,5 +163,5 @@ def test_what_was_known_is_less_sure_after_a_while_and_scenes_are_no_more_in_com
     added = SIGMA**2 + SHAKEN**2 + 4.0 * CREEP**2
     np.testing.assert_allclose(old.uncertainty.noise, np.diag(added) + np.outer(scene, scene), rtol=1e-12)
     assert list(old.uncertainty.systematic) == ["lens_across"]
-    assert old.told_axes() == list(range(6))
+    assert old.determined_axes() == list(range(6))
     np.testing.assert_array_equal(remembered(one, 0).uncertainty.noise, remembered(one, NS).uncertainty.noise)

@@ -11,12 +11,12 @@ import pytest
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.likelihood import BAD_SHARE, WEAK_TIMES
 from coec.calibration.monitor.sensor_faults import CAUSES
-from coec.calibration.rig.evidence import BIAS_TIMES, Look, of_check, of_window
-from coec.calibration.rig.steps import MOST_LOOKS, REACH, History, steps_at
+from coec.calibration.rig.evidence import BIAS_TIMES, EdgeObservation, observation_of_check, observation_of_window
+from coec.calibration.rig.steps import MAX_OBSERVATIONS, REACH, EdgeHistory, steps_at
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Uncertainty
 from coec.geometry import se3
-from rigs import BIAS, NS, PLACE, POSES, SIGMA, TURN, graph, look
+from rigs import BIAS, NS, PLACE, POSES, SIGMA, TURN, edge_check, graph
 
 POSE = POSES["front"] @ se3.inverse(POSES["roof"])
 EDGE = graph([("front", "roof")]).edges[0]
@@ -30,7 +30,7 @@ def _observation(offset: np.ndarray, weak: bool = False) -> Observation:
 
 
 def test_a_check_puts_the_pair_where_its_optimum_is() -> None:
-    found = of_check("front-roof", POSE, _observation(TURN))
+    found = observation_of_check("front-roof", POSE, _observation(TURN))
     assert found is not None
     np.testing.assert_allclose(se3.difference(found.T_a_b, POSE), TURN, atol=1e-12)
     sigma = np.sqrt(1.0 / found.information.diagonal())
@@ -39,19 +39,19 @@ def test_a_check_puts_the_pair_where_its_optimum_is() -> None:
 
 
 def test_a_faint_check_says_less_and_one_of_bad_data_nothing() -> None:
-    clear, faint = (of_check("e", POSE, _observation(np.zeros(6), weak)) for weak in (False, True))
+    clear, faint = (observation_of_check("e", POSE, _observation(np.zeros(6), weak)) for weak in (False, True))
     assert clear is not None
     assert faint is not None
     np.testing.assert_allclose(clear.information, faint.information * WEAK_TIMES**2, rtol=1e-9)
     assert faint.log_bad > clear.log_bad
     cause = next(iter(CAUSES.values()))
-    assert of_check("e", POSE, replace(_observation(TURN), causes=(cause,))) is None
-    assert of_check("e", POSE, _observation(TURN), share=0.0) is None
+    assert observation_of_check("e", POSE, replace(_observation(TURN), causes=(cause,))) is None
+    assert observation_of_check("e", POSE, _observation(TURN), share=0.0) is None
 
 
 def test_a_check_carries_since_when_its_pair_is_suspected_by_itself() -> None:
     for since_ns in (None, 5):
-        found = of_check("e", POSE, _observation(TURN), stepped_ns=since_ns)
+        found = observation_of_check("e", POSE, _observation(TURN), stepped_ns=since_ns)
         assert found is not None
         assert found.stepped_ns == since_ns
 
@@ -60,53 +60,53 @@ def test_a_check_carries_since_when_its_pair_is_suspected_by_itself() -> None:
     "a check of a rig's pair is NaN, or comes where no pose is served", "it counts for nothing, or is refused"
 )
 def test_hostile_checks_say_nothing() -> None:
-    assert of_check("e", POSE, _observation(np.full(6, np.nan))) is None
-    only_turns = of_check("e", POSE, _observation(np.array([0.01, 0.0, 0.0, np.nan, 0.0, 0.0])))
+    assert observation_of_check("e", POSE, _observation(np.full(6, np.nan))) is None
+    only_turns = observation_of_check("e", POSE, _observation(np.array([0.01, 0.0, 0.0, np.nan, 0.0, 0.0])))
     assert only_turns is not None
     assert not only_turns.information[3:].any()
     with pytest.raises(ValueError, match="e: a pose must be a rigid transform"):
-        of_check("e", np.full((4, 4), np.inf), _observation(TURN))
+        observation_of_check("e", np.full((4, 4), np.inf), _observation(TURN))
 
 
 def test_a_window_of_rotations_tells_rotations_and_what_windows_share_counts() -> None:
     noise = np.diag([*SIGMA[:3] ** 2, np.nan, np.nan, np.nan])
     noise[3:, :] = noise[:, 3:] = np.nan
     window = Measurement(POSE, Uncertainty(noise, {"lens_down": SIGMA * np.eye(6)[0]}, 9.0), NS)
-    found = of_window("e", window)
+    found = observation_of_window("e", window)
     assert found is not None
     assert not found.information[3:].any()
     assert found.information[0, 0] == pytest.approx(1.0 / (2.0 * SIGMA[0] ** 2 + (BIAS_TIMES * BIAS[0]) ** 2))
-    assert of_window("e", replace(window, uncertainty=Uncertainty.unknown())) is None
+    assert observation_of_window("e", replace(window, uncertainty=Uncertainty.unknown())) is None
 
 
 def test_a_step_is_the_difference_of_two_robust_means() -> None:
-    rng, history = np.random.default_rng(1), History.at(EDGE.T_a_b, BIAS)
-    for turn in range(MOST_LOOKS):
+    rng, history = np.random.default_rng(1), EdgeHistory.at(EDGE.T_a_b, BIAS)
+    for turn in range(MAX_OBSERVATIONS):
         error = SIGMA * rng.normal(size=6) + (TURN if turn >= 16 else 0.0)
         if turn in (5, 18):
             error = np.array([radians(3.0), 0.0, radians(-2.0), 0.1, 0.0, 0.0])
-        history = history.after(look(EDGE, POSES, float(turn), error), calm=True)
+        history = history.after(edge_check(EDGE, POSES, float(turn), error), calm=True)
     steps = steps_at(history, [16 * NS, 20 * NS])
     away = steps.xi[0] - TURN
     assert float(away @ np.linalg.solve(steps.covariance[0], away)) < 22.5
-    assert steps.looks[0] == pytest.approx(7.0, abs=0.3)  # of eight one is bad
+    assert steps.observations[0] == pytest.approx(7.0, abs=0.3)  # of eight one is bad
     assert steps.log_stepped[0] > steps.log_stepped[1]  # it was then, and not later
 
 
 def test_old_looks_are_counted_together_in_calm_and_forgotten_in_doubt() -> None:
     rng = np.random.default_rng(2)
-    calm = doubt = History.at(EDGE.T_a_b, BIAS)
-    for turn in range(3 * MOST_LOOKS):
-        seen = look(EDGE, POSES, float(turn), PLACE + 0.1 * SIGMA * rng.normal(size=6))
+    calm = doubt = EdgeHistory.at(EDGE.T_a_b, BIAS)
+    for turn in range(3 * MAX_OBSERVATIONS):
+        seen = edge_check(EDGE, POSES, float(turn), PLACE + 0.1 * SIGMA * rng.normal(size=6))
         calm, doubt = calm.after(seen, calm=True), doubt.after(seen, calm=False)
-    assert len(calm.looks) == len(doubt.looks) == MOST_LOOKS
+    assert len(calm.observations) == len(doubt.observations) == MAX_OBSERVATIONS
     np.testing.assert_allclose(calm.mean, PLACE, rtol=0.15)
     np.testing.assert_array_equal(doubt.mean, 0.0)
 
 
-def window(xi: np.ndarray, sigma: np.ndarray, at_s: float) -> Look:
+def window(xi: np.ndarray, sigma: np.ndarray, at_s: float) -> EdgeObservation:
     """An accepted one that puts the edge at ξ from where it was."""
-    found = of_window(
+    found = observation_of_window(
         EDGE.name, Measurement(se3.perturb(EDGE.T_a_b, xi), Uncertainty.independent(sigma), round(at_s * NS))
     )
     assert found is not None
@@ -114,22 +114,22 @@ def window(xi: np.ndarray, sigma: np.ndarray, at_s: float) -> Look:
 
 
 def test_a_window_against_an_origin_that_windows_told_is_known_better_than_the_bias_of_looks() -> None:
-    known = History.served(EDGE.T_a_b, SIGMA)
+    known = EdgeHistory.served(EDGE.T_a_b, SIGMA)
     steps = steps_at(known.after(window(TURN, SIGMA, 9.0), calm=True), [5 * NS])
     np.testing.assert_allclose(steps.xi[0], TURN, atol=1e-3)
     np.testing.assert_allclose(np.sqrt(steps.covariance[0].diagonal()), np.sqrt(2.0) * SIGMA, rtol=1e-2)
-    assert steps.looks[0] == 1.0
-    unknown = History.at(EDGE.T_a_b, SIGMA).after(window(TURN, SIGMA, 9.0), calm=True)
+    assert steps.observations[0] == 1.0
+    unknown = EdgeHistory.at(EDGE.T_a_b, SIGMA).after(window(TURN, SIGMA, 9.0), calm=True)
     assert np.sqrt(steps_at(unknown, [5 * NS]).covariance[0, 1, 1]) > BIAS_TIMES * BIAS[1]
 
 
 def test_what_a_window_says_of_a_step_is_the_integral_over_all_steps() -> None:
     """Of one axis, by the sum over a grid."""
     sigma = np.array([SIGMA[0], *[np.nan] * 5])
-    known = History.served(EDGE.T_a_b, sigma)
+    known = EdgeHistory.served(EDGE.T_a_b, sigma)
     looked = known
     for turn in range(4):
-        looked = looked.after(look(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
+        looked = looked.after(edge_check(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
     for off in (0.0, 2.0 * SIGMA[0], 8.0 * TURN[1]):
         seen = window(np.array([off, *[0.0] * 5]), sigma, 9.0)
         before, after = (
@@ -151,22 +151,22 @@ def normal(x: np.ndarray | float, variance: float) -> np.ndarray:
 
 
 def test_a_window_that_contradicts_all_looks_moves_no_step() -> None:
-    known = History.served(EDGE.T_a_b, SIGMA)
+    known = EdgeHistory.served(EDGE.T_a_b, SIGMA)
     for turn in range(8):
-        known = known.after(look(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
+        known = known.after(edge_check(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
     steps = steps_at(known.after(window(10.0 * TURN, SIGMA, 9.0), calm=True), [4 * NS])
     np.testing.assert_allclose(steps.xi[0], 0.0, atol=1e-6)
-    assert steps.looks[0] == pytest.approx(4.0, abs=0.2)
+    assert steps.observations[0] == pytest.approx(4.0, abs=0.2)
 
 
 def test_among_looks_that_all_contradict_each_other_a_window_tells_the_right_one() -> None:
-    rng, known = np.random.default_rng(4), History.served(EDGE.T_a_b, SIGMA)
+    rng, known = np.random.default_rng(4), EdgeHistory.served(EDGE.T_a_b, SIGMA)
     for turn in range(4):
-        known = known.after(look(EDGE, POSES, float(turn), SIGMA * rng.normal(size=6)), calm=True)
+        known = known.after(edge_check(EDGE, POSES, float(turn), SIGMA * rng.normal(size=6)), calm=True)
     for turn in range(4, 8):
         error = TURN if turn == 6 else radians(3.0) * rng.normal(size=6)
-        known = known.after(look(EDGE, POSES, float(turn), error), calm=True)
+        known = known.after(edge_check(EDGE, POSES, float(turn), error), calm=True)
     steps = steps_at(known.after(window(TURN, SIGMA, 5.0), calm=True), [4 * NS])
     np.testing.assert_allclose(steps.xi[0], TURN, atol=4.0 * SIGMA[3])
     np.testing.assert_allclose(steps.xi[0, :3], TURN[:3], atol=2.0 * SIGMA[0])
-    assert steps.looks[0] == pytest.approx(2.0, abs=0.1)
+    assert steps.observations[0] == pytest.approx(2.0, abs=0.1)

@@ -9,11 +9,11 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.calibration.rig.joint import estimate
-from coec.calibration.rig.types import Edge, Link, RigGraph, Sensor
+from coec.calibration.rig.joint import estimate_jointly
+from coec.calibration.rig.types import Edge, RigGraph, RigidLink, Sensor
 from coec.calibration.types import Uncertainty
 from coec.geometry import se3
-from rigs import POSES, SIGMA, TURN, graph, windows, with_moved
+from rigs import POSES, SIGMA, TURN, edge_windows, graph, moved_poses
 
 LOOPED = [(camera, lidar) for camera in ("front", "left", "rear") for lidar in ("roof", "bumper")]
 EXACT = np.full(6, 1e-5)
@@ -24,9 +24,9 @@ def _truth(edge: Edge) -> np.ndarray:
 
 
 def test_exact_windows_give_the_truth_from_far_away() -> None:
-    built = with_moved("front", "roof", xi=np.array([0.05, -0.03, 0.04, 0.1, -0.05, 0.02]))
+    built = moved_poses("front", "roof", xi=np.array([0.05, -0.03, 0.04, 0.1, -0.05, 0.02]))
     rig = graph(LOOPED, poses=built)
-    found = estimate(rig, windows(graph(LOOPED), POSES, 1, sigma=1e-6 * np.ones(6)))
+    found = estimate_jointly(rig, edge_windows(graph(LOOPED), POSES, 1, sigma=1e-6 * np.ones(6)))
     for edge in rig.edges:
         np.testing.assert_allclose(found.T_a_b[edge.name], _truth(edge), atol=2e-5)
     assert found.freedom == 12
@@ -37,8 +37,8 @@ def test_the_rig_knows_its_pairs_better_than_they_do_and_claims_what_it_knows() 
     rig = graph(LOOPED)
     of_rig, of_pairs, claims = np.zeros(6), np.zeros(6), []
     for seed in range(15):
-        told = windows(rig, POSES, seed)
-        found = estimate(rig, told)
+        told = edge_windows(rig, POSES, seed)
+        found = estimate_jointly(rig, told)
         assert found.left_out is None
         for edge in rig.edges:
             error = se3.difference(found.T_a_b[edge.name], _truth(edge))
@@ -52,7 +52,7 @@ def test_the_rig_knows_its_pairs_better_than_they_do_and_claims_what_it_knows() 
 def test_covariances_of_two_pairs_are_those_of_many_drawn_rigs() -> None:
     rig, errors = graph(LOOPED[:4]), []
     for seed in range(60):
-        found = estimate(rig, windows(rig, POSES, seed))
+        found = estimate_jointly(rig, edge_windows(rig, POSES, seed))
         errors.append(np.concatenate([se3.difference(found.T_a_b[e.name], _truth(e)) for e in rig.edges]))
     drawn = np.cov(np.array(errors).T)
     scale = np.sqrt(np.outer(found.covariance.diagonal(), found.covariance.diagonal()))
@@ -65,9 +65,9 @@ def test_covariances_of_two_pairs_are_those_of_many_drawn_rigs() -> None:
 )
 def test_one_bad_edge_is_found_and_bends_nothing(record_property: Callable[[str, object], None]) -> None:
     rig = graph([*LOOPED, ("roof", "bumper")])
-    told = windows(rig, POSES, 4)
+    told = edge_windows(rig, POSES, 4)
     bad = replace(told["roof-bumper"], T_camera_lidar=se3.perturb(told["roof-bumper"].T_camera_lidar, TURN))
-    found = estimate(rig, {**told, "roof-bumper": bad})
+    found = estimate_jointly(rig, {**told, "roof-bumper": bad})
     assert not found.consistent
     assert found.left_out == "roof-bumper"
     assert any("roof-bumper" in loop.names for loop in found.open_loops)
@@ -78,9 +78,9 @@ def test_one_bad_edge_is_found_and_bends_nothing(record_property: Callable[[str,
 
 def test_of_a_single_loop_nobody_knows_which_edge_is_wrong() -> None:
     rig = graph(LOOPED[:4])
-    told = windows(rig, POSES, 4)
+    told = edge_windows(rig, POSES, 4)
     bad = replace(told["left-roof"], T_camera_lidar=se3.perturb(told["left-roof"].T_camera_lidar, TURN))
-    found = estimate(rig, {**told, "left-roof": bad})
+    found = estimate_jointly(rig, {**told, "left-roof": bad})
     assert not found.consistent
     assert found.left_out is None
     assert [set(loop.names) for loop in found.open_loops] == [set(rig.edge)]
@@ -89,8 +89,8 @@ def test_of_a_single_loop_nobody_knows_which_edge_is_wrong() -> None:
 
 def test_without_a_loop_every_pair_keeps_its_own_result() -> None:
     rig = graph(LOOPED[::2])
-    told = windows(rig, POSES, 2)
-    found = estimate(rig, told)
+    told = edge_windows(rig, POSES, 2)
+    found = estimate_jointly(rig, told)
     assert found.freedom == 0
     assert found.chance == 1.0
     for name, window in told.items():
@@ -101,9 +101,9 @@ def test_without_a_loop_every_pair_keeps_its_own_result() -> None:
 
 def test_an_edge_that_nothing_measured_is_told_by_the_others() -> None:
     rig = graph(LOOPED)
-    told = windows(rig, POSES, 3)
+    told = edge_windows(rig, POSES, 3)
     del told["left-bumper"]
-    found = estimate(rig, told)
+    found = estimate_jointly(rig, told)
     sigma = np.sqrt(found.between("left-bumper", "left-bumper").diagonal())
     assert (sigma[:3] < radians(0.3)).all()
     assert np.abs(se3.difference(found.T_a_b["left-bumper"], _truth(rig.edge["left-bumper"]))[:3]).max() < radians(0.3)
@@ -114,18 +114,18 @@ def test_an_error_of_a_lens_is_common_to_the_pairs_of_its_camera() -> None:
     shift = np.array([0.0, radians(0.1), 0.0, 0.0, 0.0, 0.0])
     told = {
         name: replace(window, uncertainty=Uncertainty(np.diag(EXACT**2), {"lens_across": shift}, 9.0))
-        for name, window in windows(rig, POSES, 1, sigma=EXACT).items()
+        for name, window in edge_windows(rig, POSES, 1, sigma=EXACT).items()
     }
-    found = estimate(rig, told)
+    found = estimate_jointly(rig, told)
     assert found.between("front-roof", "front-bumper")[1, 1] == pytest.approx(shift[1] ** 2, rel=0.01)
     assert abs(found.between("front-roof", "left-roof")[1, 1]) < 0.05 * shift[1] ** 2
 
 
 def test_a_link_holds_what_the_windows_leave_open() -> None:
-    known = Link("bar", "front", "left", POSES["front"] @ se3.inverse(POSES["left"]), np.full(6, 1e-4))
+    known = RigidLink("bar", "front", "left", POSES["front"] @ se3.inverse(POSES["left"]), np.full(6, 1e-4))
     pairs = LOOPED[:4:2]
-    told = windows(graph(pairs), POSES, 5)
-    alone, linked = (estimate(graph(pairs, links), told) for links in ((), (known,)))
+    told = edge_windows(graph(pairs), POSES, 5)
+    alone, linked = (estimate_jointly(graph(pairs, links), told) for links in ((), (known,)))
     between = linked.T_a_b["front-roof"] @ se3.inverse(linked.T_a_b["left-roof"])
     np.testing.assert_allclose(se3.difference(between, known.T_a_b), 0.0, atol=5e-4)
     assert linked.freedom == 6
@@ -134,14 +134,14 @@ def test_a_link_holds_what_the_windows_leave_open() -> None:
 
 def test_neither_names_nor_order_nor_the_frame_of_the_rig_matter() -> None:
     rig = graph(LOOPED)
-    told = windows(rig, POSES, 6)
+    told = edge_windows(rig, POSES, 6)
     other = {"front": "z", "left": "m", "rear": "a", "roof": "k", "bumper": "b"}
     twin = RigGraph.of(
         [Sensor(other[sensor.name], sensor.kind) for sensor in rig.sensors],
         [Edge(f"e{9 - place}", other[e.a], other[e.b], e.T_a_b) for place, e in enumerate(rig.edges)],
     )
-    found = estimate(rig, told)
-    renamed = estimate(twin, {f"e{9 - place}": told[edge.name] for place, edge in enumerate(rig.edges)})
+    found = estimate_jointly(rig, told)
+    renamed = estimate_jointly(twin, {f"e{9 - place}": told[edge.name] for place, edge in enumerate(rig.edges)})
     for place, edge in enumerate(rig.edges):
         np.testing.assert_allclose(renamed.T_a_b[f"e{9 - place}"], found.T_a_b[edge.name], atol=1e-9)
     assert renamed.chi2 == pytest.approx(found.chi2, rel=1e-6)
@@ -152,7 +152,7 @@ def test_neither_names_nor_order_nor_the_frame_of_the_rig_matter() -> None:
 )
 def test_hostile_windows_are_refused() -> None:
     rig = graph(LOOPED[:2])
-    told = windows(rig, POSES, 1)
+    told = edge_windows(rig, POSES, 1)
     one = told["front-roof"]
     hostile = [
         replace(one, T_camera_lidar=np.full((4, 4), np.nan)),
@@ -162,8 +162,8 @@ def test_hostile_windows_are_refused() -> None:
     ]
     for window in hostile:
         with pytest.raises(ValueError, match="front-roof"):
-            estimate(rig, {**told, "front-roof": window})
+            estimate_jointly(rig, {**told, "front-roof": window})
     with pytest.raises(ValueError, match="no edge of this rig"):
-        estimate(rig, {"other": one})
+        estimate_jointly(rig, {"other": one})
     with pytest.raises(ValueError, match="no window says anything"):
-        estimate(rig, {"front-roof": replace(one, uncertainty=Uncertainty.unknown())})
+        estimate_jointly(rig, {"front-roof": replace(one, uncertainty=Uncertainty.unknown())})

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from coec.adapters.depth.maps import open_depth
-from coec.calibration.rig.joint import estimate
-from coec.calibration.rig.types import Edge, Kind, Link, RigGraph, Sensor
+from coec.calibration.rig.joint import estimate_jointly
+from coec.calibration.rig.types import Edge, RigGraph, RigidLink, Sensor, SensorKind
 from coec.calibration.tracker import Measurement
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.evaluation.experiments import Bench, greys_of, inferred
@@ -22,14 +22,14 @@ BAR = np.array([np.radians(0.02)] * 3 + [0.002] * 3)
 
 
 def _calibrated(source: str) -> tuple[Measurement, np.ndarray]:
-    loaded = windows.load(source, None, 25, lambda *_: None)
+    loaded = windows.load_window(source, None, 25, lambda *_: None)
     configuration = CalibrationConfig()
     depth = inferred(loaded.window, open_depth(configuration.depth, LimitsConfig()), lambda *_: None)
     bench = Bench(loaded.window, depth, greys_of(loaded.window), configuration)
     outcome = bench.solve(bench.reference)
     assert outcome.trial.estimate is not None
     assert outcome.accepted
-    return Measurement.of(outcome.trial.estimate), bench.reference
+    return Measurement.from_estimate(outcome.trial.estimate), bench.reference
 
 
 @pytest.mark.slow
@@ -44,11 +44,11 @@ def test_two_cameras_on_a_bar_close_and_keep_what_they_have_in_common(
     built = {name: reference for name, (_, reference) in told.items()}
     T_1_0 = built["image_01"] @ se3.inverse(built["image_00"])
     assert np.linalg.norm(T_1_0[:3, 3]) == pytest.approx(0.594, abs=0.01)
-    sensors = [*(Sensor(name, Kind.CAMERA) for name in cameras), Sensor("velodyne", Kind.LIDAR)]
+    sensors = [*(Sensor(name, SensorKind.CAMERA) for name in cameras), Sensor("velodyne", SensorKind.LIDAR)]
     edges = [Edge(name, name, "velodyne", built[name]) for name in cameras]
-    rig = RigGraph.of(sensors, edges, [Link("bar", "image_01", "image_00", T_1_0, BAR)])
+    rig = RigGraph.of(sensors, edges, [RigidLink("bar", "image_01", "image_00", T_1_0, BAR)])
     seen = {name: window for name, (window, _) in told.items()}
-    found = estimate(rig, seen)
+    found = estimate_jointly(rig, seen)
     alone = {name: se3.difference(seen[name].T_camera_lidar, built[name])[:3] for name in cameras}
     joined = {name: se3.difference(found.T_a_b[name], built[name])[:3] for name in cameras}
     apart = {

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from coec.calibration.lidar_to_lidar.types import KNOWN_BEFORE
-from coec.calibration.rig.lidar_looks import UNTOLD, look_of, told_by, window_of
+from coec.calibration.rig.lidar_looks import (
+    UNDETERMINED_TIMES,
+    determined_covariance,
+    observation_of_registration,
+    window_of,
+)
 from coec.geometry import se3
 
 SHARP = np.diag([*np.radians([0.03] * 3), 0.005, 0.005, 0.005]) ** 2
@@ -14,40 +19,40 @@ ALONG = np.array([0.0, 0.0, 0.0, 0.6, 0.8, 0.0])
 
 
 def test_what_is_sharp_is_told_as_it_is() -> None:
-    told = told_by(SHARP)
+    told = determined_covariance(SHARP)
     assert told is not None
     np.testing.assert_allclose(told, SHARP, rtol=1e-9, atol=1e-15)
-    look = look_of("roof to bumper", 7, np.eye(4), told)
+    look = observation_of_registration("roof to bumper", 7, np.eye(4), told)
     np.testing.assert_allclose(look.information, np.linalg.inv(SHARP), rtol=1e-6)
     assert not look.weak
 
 
 def test_a_direction_that_nothing_tells_is_as_wide_as_if_it_were_not_known_and_the_others_are_kept() -> None:
-    told = told_by(SHARP + 0.5**2 * np.outer(ALONG, ALONG))
+    told = determined_covariance(SHARP + 0.5**2 * np.outer(ALONG, ALONG))
     assert told is not None
     across = np.array([0.0, 0.0, 0.0, -0.8, 0.6, 0.0])
-    assert np.sqrt(ALONG @ told @ ALONG) == pytest.approx(UNTOLD * KNOWN_BEFORE[3], rel=1e-3)
+    assert np.sqrt(ALONG @ told @ ALONG) == pytest.approx(UNDETERMINED_TIMES * KNOWN_BEFORE[3], rel=1e-3)
     assert np.sqrt(across @ told @ across) == pytest.approx(0.005, rel=1e-3)
     assert np.sqrt(told[0, 0]) == pytest.approx(np.radians(0.03), rel=1e-6)
     # A minute of such looks tells less than what was known before.
-    information = look_of("e", 0, np.eye(4), told).information
+    information = observation_of_registration("e", 0, np.eye(4), told).information
     assert ALONG @ information @ ALONG * 24 < 1.0 / KNOWN_BEFORE[3] ** 2 * 1.01
 
 
 def test_where_nothing_is_told_there_is_no_look() -> None:
-    assert told_by(np.diag((0.6 * KNOWN_BEFORE) ** 2)) is None
+    assert determined_covariance(np.diag((0.6 * KNOWN_BEFORE) ** 2)) is None
 
 
 @pytest.mark.parametrize("bad", [np.full((6, 6), np.nan), np.eye(5), np.full((6, 6), np.inf)])
 def test_what_is_no_covariance_is_refused(bad: np.ndarray) -> None:
     with pytest.raises(ValueError, match="6, 6"):
-        told_by(bad)
+        determined_covariance(bad)
 
 
 def test_the_window_is_as_sure_as_all_looks_of_one_rig_can_be() -> None:
-    told = told_by(SHARP)
+    told = determined_covariance(SHARP)
     assert told is not None
     window = window_of(7, se3.exp(np.full(6, 0.1)), told)
     assert (window.uncertainty.sigma >= np.sqrt(SHARP.diagonal())).all()
     assert np.rad2deg(window.uncertainty.sigma[0]) > 0.04
-    assert window.told_axes() == list(range(6))
+    assert window.determined_axes() == list(range(6))

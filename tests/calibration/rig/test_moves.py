@@ -9,7 +9,7 @@ import pytest
 
 from coec.calibration.commissioning.quantiles import normal_quantile
 from coec.calibration.rig.moves import M_PER_RAD, SCALES, movers, patterns, who_moved
-from coec.calibration.rig.steps import Steps
+from coec.calibration.rig.steps import EdgeSteps
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.geometry import se3
 from rigs import POSES, graph
@@ -35,10 +35,10 @@ def test_sets_are_as_likely_against_each_other_as_sampling_says() -> None:
     roof = [mover.sensors for mover in moving].index(("roof",))
     seen = design[roof] @ true + rng.multivariate_normal(np.zeros(6), 0.1 * COARSE, size=len(rig.edges))
     steps = {
-        edge.name: Steps(
+        edge.name: EdgeSteps(
             xi=seen[place][None],
             covariance=COARSE[None],
-            looks=np.ones(1),
+            observations=np.ones(1),
             log_transient=np.array([-700.0]),
             log_stepped=np.zeros(1),
             log_still=float(_log_normal(seen[place])),
@@ -79,8 +79,8 @@ def test_edges_that_nobody_looked_at_since_speak_neither_for_nor_against_a_senso
     rig = graph([*STAR, ("front", "bumper"), ("roof", "bumper")])
     rounds, step = np.tile(COARSE, (2, 1, 1)), np.tile([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
     likely = float(_log_normal(np.zeros(6)))
-    still = Steps(np.zeros((2, 6)), rounds, np.array([0.0, 3.0]), np.array([0.0, -700.0]), np.zeros(2), likely)
-    seen = Steps(step, rounds, np.ones(2), np.full(2, -700.0), np.zeros(2), float(_log_normal(step[0])))
+    still = EdgeSteps(np.zeros((2, 6)), rounds, np.array([0.0, 3.0]), np.array([0.0, -700.0]), np.zeros(2), likely)
+    seen = EdgeSteps(step, rounds, np.ones(2), np.full(2, -700.0), np.zeros(2), float(_log_normal(step[0])))
     found = who_moved(rig, {edge.name: seen if edge.name == "roof-bumper" else still for edge in rig.edges})
     assert log(found.sensors["roof"] / found.sensors["bumper"]) == pytest.approx(0.0, abs=1.0)
     assert found.sensors["roof"] + found.sensors["bumper"] > 0.8

@@ -10,22 +10,22 @@ import pytest
 from coec.calibration.rig import vehicle
 from coec.calibration.rig.attribution import SensorHealth
 from coec.calibration.rig.objections import misfits
-from coec.calibration.rig.types import Link
-from coec.calibration.rig.vehicle import Served
+from coec.calibration.rig.types import RigidLink
+from coec.calibration.rig.vehicle import ServedEdge
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from driven_rig import LOOPS, STAR, Drive, known_of, pose_of, windowed
-from rigs import NS, POSES, SIGMA, TURN, graph, with_moved
+from driven_rig import LOOPS, STAR, RigDrive, known_of, pose_of, windowed_measurement
+from rigs import NS, POSES, SIGMA, TURN, graph, moved_poses
 
 
 @pytest.mark.fault("the LiDAR of a rig is knocked by 1°", "one event, one correction for all of its cameras")
 def test_a_knocked_lidar_is_put_right_in_all_its_pairs_at_once(
     record_property: Callable[[str, object], None],
 ) -> None:
-    drive, after = Drive(graph(STAR)), with_moved("roof")
-    drive.looks(POSES, 8)
+    drive, after = RigDrive(graph(STAR)), moved_poses("roof")
+    drive.add_checks(POSES, 8)
     knocked_s = drive.at_s
-    drive.looks(after, 4)
+    drive.add_checks(after, 4)
     assert drive.health() == {
         "front": SensorHealth.CALIBRATED,
         "left": SensorHealth.CALIBRATED,
@@ -34,9 +34,9 @@ def test_a_knocked_lidar_is_put_right_in_all_its_pairs_at_once(
     }
     assert drive.state.correction is None
     for name in ("front-roof", "left-roof"):
-        drive.window(name, after, knocked_s + 6.0)
+        drive.add_window(name, after, knocked_s + 6.0)
     assert drive.state.correction is None
-    drive.window("rear-roof", after, knocked_s + 6.0)
+    drive.add_window("rear-roof", after, knocked_s + 6.0)
     correction = drive.state.correction
     assert correction is not None
     assert correction.sensors == ("roof",)
@@ -44,7 +44,7 @@ def test_a_knocked_lidar_is_put_right_in_all_its_pairs_at_once(
     for name, told in correction.pairs.items():
         away = se3.difference(told.T_a_b, pose_of(drive.state.graph.edge[name], after))
         assert float(away @ np.linalg.solve(told.covariance, away)) < 22.5  # 99.9 % of six axes
-    drive.looks(after, 3)
+    drive.add_checks(after, 3)
     assert drive.state.event is None
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
     assert drive.state.correction is correction
@@ -54,7 +54,7 @@ def test_a_knocked_lidar_is_put_right_in_all_its_pairs_at_once(
     record_property("figure", f"{len(correction.pairs)} pairs")
 
 
-def moves_of_the_lidar(drive: Drive) -> list[Matrix4]:
+def moves_of_the_lidar(drive: RigDrive) -> list[Matrix4]:
     """As each pair is told it, about the LiDAR's own axes as they were."""
     correction = drive.state.correction
     assert correction is not None
@@ -65,17 +65,17 @@ def moves_of_the_lidar(drive: Drive) -> list[Matrix4]:
 
 
 def test_all_pairs_of_a_knocked_lidar_are_told_nearly_one_move() -> None:
-    drive, after = Drive(graph(STAR)), with_moved("roof")
-    drive.looks(POSES, 8)
+    drive, after = RigDrive(graph(STAR)), moved_poses("roof")
+    drive.add_checks(POSES, 8)
     knocked_s = drive.at_s
-    drive.looks(after, 4)
-    own = {edge.name: drive.window(edge.name, after, knocked_s + 6.0) for edge in drive.state.graph.edges}
+    drive.add_checks(after, 4)
+    own = {edge.name: drive.add_window(edge.name, after, knocked_s + 6.0) for edge in drive.state.graph.edges}
     apart = [se3.difference(move, moves_of_the_lidar(drive)[0]) for move in moves_of_the_lidar(drive)[1:]]
     edges = drive.state.graph.edge
     of_windows = [np.asarray(se3.inverse(pose_of(edges[name], POSES)) @ pose) for name, pose in own.items()]
     apart_alone = [se3.difference(move, of_windows[0]) for move in of_windows[1:]]
     assert np.linalg.norm(apart) < 0.5 * np.linalg.norm(apart_alone)
-    drive.looks(after, 3)
+    drive.add_checks(after, 3)
     assert drive.state.event is None
     assert drive.state.before is None, "it is over: what is served now is what is known"
     assert all(one.stamp_ns > round(knocked_s * NS) for of in drive.state.known.values() for one in of)
@@ -83,25 +83,25 @@ def test_all_pairs_of_a_knocked_lidar_are_told_nearly_one_move() -> None:
 
 @pytest.mark.fault("two pairs of a knocked LiDAR tell different moves of it", "`inconsistent_rig`; each keeps its own")
 def test_windows_that_tell_different_moves_are_put_together_by_nobody() -> None:
-    drive, after = Drive(graph(STAR[:2])), with_moved("roof")
-    drive.looks(POSES, 8)
+    drive, after = RigDrive(graph(STAR[:2])), moved_poses("roof")
+    drive.add_checks(POSES, 8)
     knocked_s = drive.at_s
-    drive.looks(after, 6)
-    drive.window("front-roof", after, knocked_s + 6.0)
-    drive.window("left-roof", {**after, "left": with_moved("left")["left"]}, knocked_s + 6.0)
+    drive.add_checks(after, 6)
+    drive.add_window("front-roof", after, knocked_s + 6.0)
+    drive.add_window("left-roof", {**after, "left": moved_poses("left")["left"]}, knocked_s + 6.0)
     assert drive.state.correction is None
     assert set(misfits(drive.state)) == {"front-roof", "left-roof"}
 
 
 def test_what_was_found_of_after_a_knock_before_it_was_named_is_not_taken_for_before() -> None:
-    drive, after = Drive(graph(STAR)), with_moved("roof")
-    drive.looks(POSES, 8)
+    drive, after = RigDrive(graph(STAR)), moved_poses("roof")
+    drive.add_checks(POSES, 8)
     knocked_s = drive.at_s
-    drive.looks(after, 1)
+    drive.add_checks(after, 1)
     edge = drive.state.graph.edge["front-roof"]
-    found = Served(pose_of(edge, after), SIGMA, round(knocked_s * NS), known_of(edge, after, drive.at_s))
+    found = ServedEdge(pose_of(edge, after), SIGMA, round(knocked_s * NS), known_of(edge, after, drive.at_s))
     drive.state = vehicle.after_served(drive.state, edge.name, found, round(drive.at_s * NS))
-    drive.looks(after, 3)
+    drive.add_checks(after, 3)
     before = drive.state.before
     assert before is not None
     assert set(before.edges) == {"front-roof", "left-roof", "rear-roof"}
@@ -113,36 +113,36 @@ def test_what_was_found_of_after_a_knock_before_it_was_named_is_not_taken_for_be
 def test_a_pair_whose_two_sensors_both_moved_is_one_that_moved() -> None:
     rig = graph(LOOPS)
     assert vehicle.pairs_of(rig, ("front", "roof")) == ("front-bumper", "front-roof", "left-roof", "rear-roof")
-    bar = Link("bar", "front", "roof", POSES["front"] @ se3.inverse(POSES["roof"]), np.full(6, 1e-4))
+    bar = RigidLink("bar", "front", "roof", POSES["front"] @ se3.inverse(POSES["roof"]), np.full(6, 1e-4))
     assert "front-roof" not in vehicle.pairs_of(graph(LOOPS, [bar]), ("front", "roof")), "they moved as one"
 
 
 def test_windows_that_began_before_the_move_put_nothing_right() -> None:
-    drive, after = Drive(graph(STAR)), with_moved("roof")
-    drive.looks(POSES, 8)
+    drive, after = RigDrive(graph(STAR)), moved_poses("roof")
+    drive.add_checks(POSES, 8)
     knocked_s = drive.at_s
-    drive.looks(after, 4)
+    drive.add_checks(after, 4)
     for edge in drive.state.graph.edges:
-        drive.window(edge.name, POSES, knocked_s - 20.0)
+        drive.add_window(edge.name, POSES, knocked_s - 20.0)
     assert drive.state.correction is None
     assert drive.health()["roof"] is SensorHealth.LIDAR_MOVED
     assert not drive.state.windows
 
 
 def test_it_stays_moved_for_as_long_as_a_pair_serves_what_was_before() -> None:
-    drive, after = Drive(graph(STAR)), with_moved("roof")
-    drive.looks(POSES, 8)
+    drive, after = RigDrive(graph(STAR)), moved_poses("roof")
+    drive.add_checks(POSES, 8)
     knocked_s = drive.at_s
-    drive.looks(after, 4)
+    drive.add_checks(after, 4)
     for edge in drive.state.graph.edges:
-        drive.window(edge.name, after, knocked_s + 6.0, serves=edge.name != "left-roof")
+        drive.add_window(edge.name, after, knocked_s + 6.0, serves=edge.name != "left-roof")
     assert drive.state.correction is not None
-    drive.looks(after, 6)
+    drive.add_checks(after, 6)
     assert drive.health()["roof"] is SensorHealth.LIDAR_MOVED
     told = drive.state.correction.pairs["left-roof"]
-    served = Served(told.T_a_b, SIGMA, round((knocked_s + 6.0) * NS))
+    served = ServedEdge(told.T_a_b, SIGMA, round((knocked_s + 6.0) * NS))
     drive.state = vehicle.after_served(drive.state, "left-roof", served, round(drive.at_s * NS))
-    drive.looks(after, 1)
+    drive.add_checks(after, 1)
     assert drive.health()["roof"] is SensorHealth.CALIBRATED
 
 
@@ -150,13 +150,13 @@ def test_it_stays_moved_for_as_long_as_a_pair_serves_what_was_before() -> None:
     "one camera sees nothing when its LiDAR is knocked", "the others determine where the LiDAR is for its pair"
 )
 def test_a_pair_that_is_blind_is_not_waited_for_and_told_by_the_others() -> None:
-    drive, after = Drive(graph(STAR)), with_moved("roof")
-    drive.looks(POSES, 8)
-    drive.looks(POSES, 13, blind=("rear-roof",))
+    drive, after = RigDrive(graph(STAR)), moved_poses("roof")
+    drive.add_checks(POSES, 8)
+    drive.add_checks(POSES, 13, blind=("rear-roof",))
     knocked_s = drive.at_s
-    drive.looks(after, 4, blind=("rear-roof",))
+    drive.add_checks(after, 4, blind=("rear-roof",))
     for name in ("front-roof", "left-roof"):
-        drive.window(name, after, knocked_s + 6.0)
+        drive.add_window(name, after, knocked_s + 6.0)
     assert drive.state.correction is not None
     told = drive.state.correction.pairs["rear-roof"]
     away = se3.difference(told.T_a_b, pose_of(drive.state.graph.edge["rear-roof"], after))
@@ -168,13 +168,13 @@ def test_a_pair_that_is_blind_is_not_waited_for_and_told_by_the_others() -> None
     "a camera is knocked by 1°, and its pair puts itself right before looks alone name it", "it is named all the same"
 )
 def test_a_camera_whose_pair_repairs_itself_at_once_is_named_all_the_same() -> None:
-    drive, after = Drive(graph(STAR)), with_moved("front")
-    drive.looks(POSES, 8)
+    drive, after = RigDrive(graph(STAR)), moved_poses("front")
+    drive.add_checks(POSES, 8)
     knocked_s = drive.at_s
-    drive.looks(after, 2)
+    drive.add_checks(after, 2)
     assert drive.state.move is None, "looks alone say too little yet"
     edge = drive.state.graph.edge["front-roof"]
-    window = windowed(edge, after, knocked_s, SIGMA)
+    window = windowed_measurement(edge, after, knocked_s, SIGMA)
     drive.state = vehicle.after_window(drive.state, edge.name, window, round(drive.at_s * NS))
     assert drive.health()["front"] is SensorHealth.CAMERA_MOVED
     move = drive.state.move
@@ -182,9 +182,9 @@ def test_a_camera_whose_pair_repairs_itself_at_once_is_named_all_the_same() -> N
     assert move.event.sensors == ("front",)
     assert np.degrees(move.moved["front"].x[:3]) == pytest.approx([0.0, 1.0, 0.0], abs=0.25)
     assert (move.event.stepped_ns, move.over_ns) == (window.start_ns, None)
-    served = Served(window.measurement.T_camera_lidar, SIGMA, window.start_ns)
+    served = ServedEdge(window.measurement.T_camera_lidar, SIGMA, window.start_ns)
     drive.state = vehicle.after_served(drive.state, edge.name, served, round(drive.at_s * NS))
-    drive.looks(after, 3)
+    drive.add_checks(after, 3)
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
     assert drive.state.correction is None, "what one pair tells by itself needs nobody to tell it"
     move = drive.state.move
@@ -193,23 +193,23 @@ def test_a_camera_whose_pair_repairs_itself_at_once_is_named_all_the_same() -> N
 
 
 def test_a_window_that_looks_of_its_own_time_deny_names_nobody() -> None:
-    drive = Drive(graph(STAR))
-    drive.looks(POSES, 8)
-    drive.window("front-roof", with_moved("front"), drive.at_s - 20.0, serves=False)
+    drive = RigDrive(graph(STAR))
+    drive.add_checks(POSES, 8)
+    drive.add_window("front-roof", moved_poses("front"), drive.at_s - 20.0, serves=False)
     assert SensorHealth.CAMERA_MOVED not in drive.health().values()
-    drive.looks(POSES, 4)
+    drive.add_checks(POSES, 4)
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
     assert drive.state.move is None
 
 
 def test_what_nobody_can_attribute_is_over_when_its_pair_serves_what_it_found() -> None:
-    drive, after = Drive(graph(STAR[:1])), with_moved("front", xi=3.0 * TURN)
-    drive.looks(POSES, 8)
+    drive, after = RigDrive(graph(STAR[:1])), moved_poses("front", xi=3.0 * TURN)
+    drive.add_checks(POSES, 8)
     knocked_s = drive.at_s
-    drive.looks(after, 4)
+    drive.add_checks(after, 4)
     assert set(drive.health().values()) == {SensorHealth.UNDECIDED}
-    drive.window("front-roof", after, knocked_s + 6.0)
-    drive.looks(after, 2)
+    drive.add_window("front-roof", after, knocked_s + 6.0)
+    drive.add_checks(after, 2)
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
 
 
@@ -217,11 +217,11 @@ def test_what_nobody_can_attribute_is_over_when_its_pair_serves_what_it_found() 
     "a window of one pair of a rig is 1° off", "`inconsistent_rig` for the pairs of its loop; nothing is corrected"
 )
 def test_a_window_that_does_not_fit_the_others_is_said_of_the_pairs_of_its_loop() -> None:
-    drive = Drive(graph(LOOPS))
-    drive.looks(POSES, 4)
+    drive = RigDrive(graph(LOOPS))
+    drive.add_checks(POSES, 4)
     assert misfits(drive.state) == ()
     edge = drive.state.graph.edge["left-roof"]
-    drive.state = vehicle.after_window(drive.state, edge.name, windowed(edge, POSES, 5.0, TURN), 20 * NS)
+    drive.state = vehicle.after_window(drive.state, edge.name, windowed_measurement(edge, POSES, 5.0, TURN), 20 * NS)
     assert set(misfits(drive.state)) == {"front-roof", "left-roof", "front-bumper", "left-bumper"}
     assert drive.state.correction is None
 
@@ -229,13 +229,13 @@ def test_a_window_that_does_not_fit_the_others_is_said_of_the_pairs_of_its_loop(
 def test_a_first_calibration_far_from_nominal_is_no_move() -> None:
     rig = graph(STAR)
     wide = np.array([np.radians(3.0)] * 3 + [0.2] * 3)
-    built = {edge.name: Served(se3.perturb(pose_of(edge, POSES), TURN), wide, None) for edge in rig.edges}
-    drive = Drive(rig)
-    drive.state = vehicle.begun(rig, built, {})
-    drive.looks(POSES, 6)
+    built = {edge.name: ServedEdge(se3.perturb(pose_of(edge, POSES), TURN), wide, None) for edge in rig.edges}
+    drive = RigDrive(rig)
+    drive.state = vehicle.initial_rig(rig, built, {})
+    drive.add_checks(POSES, 6)
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
     for edge in rig.edges:
-        drive.window(edge.name, POSES, 10.0)
-    drive.looks(POSES, 4)
+        drive.add_window(edge.name, POSES, 10.0)
+    drive.add_checks(POSES, 4)
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
     assert drive.state.correction is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.search.test_global_search import angle_deg, away_from
-from coec.calibration.objective.edges import EdgeWitness
+from coec.calibration.objective.edges import EdgeCue
 from coec.calibration.search.change_point import MIN_FRAMES, change_point
 from coec.calibration.types import Matrix4, Window
 from coec.config import VerdictConfig
@@ -15,7 +15,7 @@ from coec.geometry import se3
 LIMITS = VerdictConfig()
 
 
-def turned(edges: EdgeWitness, first: int, last: int, T_before: Matrix4, T_after: Matrix4) -> EdgeWitness:
+def turned(edges: EdgeCue, first: int, last: int, T_before: Matrix4, T_after: Matrix4) -> EdgeCue:
     """The witness as if the mount had been at `T_after` in the frames `first` to before `last`."""
     carried = se3.inverse(T_after) @ T_before
     band, chart, sharp = edges.bands[0], edges.charts[-1], edges.sharp
@@ -33,7 +33,7 @@ def turned(edges: EdgeWitness, first: int, last: int, T_before: Matrix4, T_after
     )
 
 
-def test_a_mount_that_stays_gains_nothing(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_a_mount_that_stays_gains_nothing(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     found = change_point(sharp_edges, sharp_street.T_camera_lidar_start)
     assert found is not None
     assert found.gain < 0.5 * LIMITS.max_change_gain
@@ -43,7 +43,7 @@ def test_a_mount_that_stays_gains_nothing(sharp_street: Window, sharp_edges: Edg
     ("first_late", "size_deg"), [(9, 3.0), (8, 1.5), (7, 0.5), (6, 0.3), (5, 0.5), (3, 3.0), (2, 1.0)]
 )
 def test_a_knock_is_found_where_and_when_it_was(
-    sharp_street: Window, sharp_edges: EdgeWitness, first_late: int, size_deg: float
+    sharp_street: Window, sharp_edges: EdgeCue, first_late: int, size_deg: float
 ) -> None:
     T_before = sharp_street.T_camera_lidar_start
     T_after = away_from(T_before, size_deg, seed=first_late)
@@ -60,21 +60,21 @@ def test_a_knock_is_found_where_and_when_it_was(
     assert np.degrees(found.turn_rad) == pytest.approx(size_deg, abs=0.6)
 
 
-def test_one_bad_frame_is_no_knock(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_one_bad_frame_is_no_knock(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     pose = sharp_street.T_camera_lidar_start
     found = change_point(turned(sharp_edges, 4, 5, pose, away_from(pose, 2.0, seed=1)), pose)
     assert found is not None
     assert found.gain < LIMITS.max_change_gain
 
 
-def test_frames_that_fit_nothing_are_no_knock(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_frames_that_fit_nothing_are_no_knock(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     pose = sharp_street.T_camera_lidar_start
     found = change_point(turned(sharp_edges, 6, 10, pose, away_from(pose, 90.0, seed=2)), pose)
     assert found is not None
     assert not (found.of_camera and found.gain > LIMITS.max_change_gain)
 
 
-def test_same_input_same_bits(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_same_input_same_bits(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     pose = sharp_street.T_camera_lidar_start
     edges = turned(sharp_edges, 6, 10, pose, away_from(pose, 1.0, seed=3))
     one, other = change_point(edges, pose), change_point(edges, pose)
@@ -83,6 +83,6 @@ def test_same_input_same_bits(sharp_street: Window, sharp_edges: EdgeWitness) ->
     assert (one.first_late, one.gain, one.T_after.tobytes()) == (other.first_late, other.gain, other.T_after.tobytes())
 
 
-def test_few_frames_have_no_early_and_late(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_few_frames_have_no_early_and_late(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     few = replace(sharp_edges.whole, first_point=sharp_edges.whole.first_point[:MIN_FRAMES])
     assert change_point(replace(sharp_edges, whole=few), sharp_street.T_camera_lidar_start) is None

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from calibration.conftest import window_of
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.objective.edges import EdgeWitness, build_edges, in_reach
+from coec.calibration.objective.edges import EdgeCue, build_edges, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import AT_RIM, FINE, ROUNDS, at_rim, basin_next_to, find_basins, sample_reach
 from coec.calibration.types import Matrix4, Window
@@ -79,7 +79,7 @@ def test_no_pose_of_the_reach_is_far_from_the_cover() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_true_basin_is_found_from_twenty_degrees_away(
-    sharp_street: Window, sharp_edges: EdgeWitness, seed: int
+    sharp_street: Window, sharp_edges: EdgeCue, seed: int
 ) -> None:
     truth = sharp_street.rig.T_camera_lidar_nominal
     basins = find_basins(sharp_edges, away_from(truth, 20.0, seed), TURN)
@@ -94,7 +94,7 @@ def test_the_true_translation_is_found_from_half_a_metre_away(sample_data: Path)
     images = GreyImages(LimitsConfig())
     edges = build_edges(
         window.pairs,
-        lambda frame, chosen: compensate(window.pairs[frame], window.rig, enabled=True, chosen=chosen),
+        lambda frame, chosen: compensate(window.pairs[frame], window.rig, enabled=True, selection=chosen),
         [images.grey(pair.camera) for pair in window.pairs],
         window.rig,
     )
@@ -106,7 +106,7 @@ def test_the_true_translation_is_found_from_half_a_metre_away(sample_data: Path)
         assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.2
 
 
-def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     basins = find_basins(sharp_edges, away_from(sharp_street.rig.T_camera_lidar_nominal, 10.0, 4), TURN)
     assert 1 <= len(basins) <= ROUNDS[-1].poses
     z = [basin.significance for basin in basins]
@@ -115,17 +115,17 @@ def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, shar
     assert z == charted_significances(sharp_edges.charts[FINE], poses).tolist()
     for index, a in enumerate(basins):
         for b in basins[:index]:
-            assert angle_deg(a.T_camera_lidar, b.T_camera_lidar) >= np.degrees(ROUNDS[-1].apart_rad) - 1e-6
+            assert angle_deg(a.T_camera_lidar, b.T_camera_lidar) >= np.degrees(ROUNDS[-1].separation_rad) - 1e-6
 
 
-def test_rotation_only_leaves_the_lidar_where_the_start_has_it(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_rotation_only_leaves_the_lidar_where_the_start_has_it(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     start = away_from(sharp_street.rig.T_camera_lidar_nominal, 8.0, 6)
     poses = np.stack([basin.T_camera_lidar for basin in find_basins(sharp_edges, start, TURN)])
     _, shifts = moves(poses, start)
     assert np.abs(shifts).max() < 1e-9
 
 
-def test_basins_lie_within_the_reach(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_basins_lie_within_the_reach(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     start = away_from(sharp_street.rig.T_camera_lidar_nominal, 15.0, 0)
     turns, shifts = moves(np.stack([b.T_camera_lidar for b in find_basins(sharp_edges, start, BOTH)]), start)
     assert np.linalg.norm(turns, axis=1).max() <= BOTH.rotation_rad + 1e-6
@@ -143,7 +143,7 @@ def test_rotation_only_has_no_rim_of_translation() -> None:
     assert not at_rim(se3.perturb(START, np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])), START, TURN)
 
 
-def test_same_input_same_basins_to_the_bit(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_same_input_same_basins_to_the_bit(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     start = away_from(sharp_street.rig.T_camera_lidar_nominal, 12.0, 3)
     first, second = (find_basins(sharp_edges, start, BOTH) for _ in range(2))
     assert [b.T_camera_lidar.tobytes() for b in first] == [b.T_camera_lidar.tobytes() for b in second]
@@ -151,7 +151,7 @@ def test_same_input_same_basins_to_the_bit(sharp_street: Window, sharp_edges: Ed
 
 
 def test_what_lies_next_to_a_pose_is_the_true_basin_from_a_degree_away(
-    sharp_street: Window, sharp_edges: EdgeWitness
+    sharp_street: Window, sharp_edges: EdgeCue
 ) -> None:
     truth = sharp_street.rig.T_camera_lidar_nominal
     near = SearchBox(np.radians(5.0), 0.0)
@@ -161,7 +161,7 @@ def test_what_lies_next_to_a_pose_is_the_true_basin_from_a_degree_away(
     assert angle_deg(basin_next_to(sharp_edges, far, near), far) <= 5.0
 
 
-def test_edges_out_of_reach_are_nothing_to_the_bit(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+def test_edges_out_of_reach_are_nothing_to_the_bit(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     start = away_from(sharp_street.rig.T_camera_lidar_nominal, 9.0, 1)
     charts = sharp_edges.charts[FINE]
     kept = in_reach(charts, sharp_edges.half_view_rad, start, BOTH)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import NEAR, SearchResult, maximise, near, polish, polish_in_turn
-from coec.calibration.search.observability import CentreKept
+from coec.calibration.search.observability import FixedCentre
 from coec.calibration.types import Matrix4, StopReason
 from coec.config import SearchConfig
 from coec.geometry import se3
@@ -80,7 +80,7 @@ def test_evaluations_run_out() -> None:
 
 def test_a_basin_is_polished_but_for_the_axes_that_are_kept() -> None:
     hill = Hill((1.0, -1.5, 2.0), (0.1, -0.05, 0.0))
-    found = polish(hill, START, SIX, Silence(), kept=CentreKept((3, 4, 5), START))
+    found = polish(hill, START, SIX, Silence(), constraint=FixedCentre((3, 4, 5), START))
     assert apart_deg(found, hill) < 0.01
     np.testing.assert_allclose(np.array(hill.visited)[:, 3:], 0.0, atol=1e-9)
 

@@ -16,7 +16,7 @@ from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.search.local_search import SearchResult
-from coec.calibration.search.observability import CentreKept, unobservable, without
+from coec.calibration.search.observability import FixedCentre, unobservable, without
 from coec.calibration.types import Estimate, Matrix4, StopReason, Window
 from coec.config import CalibrationConfig, LimitsConfig, SearchConfig, VerdictConfig
 from coec.geometry import se3
@@ -95,7 +95,7 @@ def test_the_centre_stays_where_the_start_had_it_however_the_start_was_turned(
 
 def test_putting_the_centre_back_leaves_the_rotation_and_the_other_axes() -> None:
     pose = se3.perturb(LEVER_ARM, np.array([0.3, -0.2, 0.1, 0.4, 0.5, 0.6]))
-    back = CentreKept((4,), LEVER_ARM)(pose)
+    back = FixedCentre((4,), LEVER_ARM)(pose)
     np.testing.assert_array_equal(back[:3, :3], pose[:3, :3])
     np.testing.assert_allclose(se3.difference(back, LEVER_ARM)[3:], [0.4, 0.0, 0.6], atol=1e-12)
     assert pose[1, 3] != back[1, 3]

@@ -17,9 +17,9 @@ from coec.geometry.edges.charts import (
     WEIGHT_STEPS,
     EdgeCharts,
     charted_significances,
-    climb,
     edge_charts,
-    keep_apart,
+    pattern_search,
+    select_separated,
 )
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, VOID
 from coec.geometry.projection import project, unproject
@@ -232,7 +232,7 @@ def test_the_number_of_threads_does_not_matter_to_the_bit(threads: tuple[int, ..
     poses, steps, found = turned(POSE, 0.1, 40), np.array([0.01] * 3 + [0.1] * 3), []
     for count in threads:
         numba.set_num_threads(count)
-        ends, z = climb(charts, poses, steps, 2, POSE, ANYWHERE)
+        ends, z = pattern_search(charts, poses, steps, 2, POSE, ANYWHERE)
         found.append((charted_significances(charts, poses).tobytes(), ends.tobytes(), z.tobytes()))
     assert found[0] == found[1]
 
@@ -268,7 +268,7 @@ ALL_AXES = np.array([0.01] * 3 + [0.1] * 3)
 
 def test_a_climb_returns_to_the_pose_that_the_maps_were_made_for() -> None:
     # Two degrees are two pixels of this camera, the width of the blur.
-    ends, _ = climb(aimed(), turned(POSE, np.radians(2.0), 12), TURNS, 4, np.eye(4), ANYWHERE)
+    ends, _ = pattern_search(aimed(), turned(POSE, np.radians(2.0), 12), TURNS, 4, np.eye(4), ANYWHERE)
     errors_deg = [np.degrees(se3.rotation_angle_rad(end @ se3.inverse(POSE))) for end in ends]
     # Half a pixel, to which the maps were rounded.
     assert max(errors_deg) < 0.5
@@ -278,7 +278,7 @@ def test_a_climb_never_ends_below_its_start_and_says_where_it_is() -> None:
     charts = aimed()
     starts = np.concatenate([turned(POSE, angle, 20) for angle in (0.0, 0.05, 0.2, 0.6)])
     before = starts.copy()
-    ends, z = climb(charts, starts, ALL_AXES, 4, np.eye(4), ANYWHERE)
+    ends, z = pattern_search(charts, starts, ALL_AXES, 4, np.eye(4), ANYWHERE)
     assert (starts == before).all()
     assert (z >= charted_significances(charts, starts)).all()
     assert z.tolist() == charted_significances(charts, ends).tolist()
@@ -295,7 +295,7 @@ def stepped(pose: NDArray[np.float64], axis: int, amount: float) -> NDArray[np.f
 
 def test_no_further_step_of_the_last_size_leads_up() -> None:
     charts, halvings = aimed(), 2
-    ends, z = climb(charts, turned(POSE, 0.03, 10), ALL_AXES, halvings, np.eye(4), ANYWHERE)
+    ends, z = pattern_search(charts, turned(POSE, 0.03, 10), ALL_AXES, halvings, np.eye(4), ANYWHERE)
     for end, reached in zip(ends, z, strict=True):
         around = [
             stepped(end, axis, sign * ALL_AXES[axis] * 0.5**halvings) for axis in range(6) for sign in (-1.0, 1.0)
@@ -306,7 +306,7 @@ def test_no_further_step_of_the_last_size_leads_up() -> None:
 def test_a_climb_stays_within_reach() -> None:
     charts, reach = aimed(), np.array([np.radians(1.0), 0.05])
     away = se3.perturb(POSE, np.array([np.radians(2.0), 0.0, 0.0, 0.2, 0.0, 0.0]))
-    ends, z = climb(charts, away[None], ALL_AXES, 3, away, reach)
+    ends, z = pattern_search(charts, away[None], ALL_AXES, 3, away, reach)
     moved = ends[0] @ se3.inverse(away)
     assert z[0] > charted_significances(charts, away[None])[0]
     assert 0.5 * reach[0] < se3.rotation_angle_rad(moved) <= reach[0] + 1e-9
@@ -315,7 +315,7 @@ def test_a_climb_stays_within_reach() -> None:
 
 def test_a_climb_without_steps_of_translation_turns_about_the_camera_axes_only() -> None:
     starts = turned(POSE, np.radians(2.0), 12)
-    ends, _ = climb(aimed(), starts, TURNS, 4, np.eye(4), ANYWHERE)
+    ends, _ = pattern_search(aimed(), starts, TURNS, 4, np.eye(4), ANYWHERE)
     moved = np.array([end @ se3.inverse(start) for start, end in zip(starts, ends, strict=True)])
     assert np.abs(moved[:, :3, 3]).max() < 1e-12
     assert np.abs(moved[:, :3, :3] - np.eye(3)).max() > 1e-3
@@ -327,7 +327,7 @@ def test_what_is_kept_lies_apart_and_what_is_left_out_does_not(count: int) -> No
     poses = turned(np.eye(4), 0.3, 150, seed=2)
     order = np.random.default_rng(4).permutation(150)
     limit_rad = 0.1
-    kept = keep_apart(poses, order, count, 1.0 + 2.0 * np.cos(limit_rad)).tolist()
+    kept = select_separated(poses, order, count, 1.0 + 2.0 * np.cos(limit_rad)).tolist()
     expected: list[int] = []
     for index in order.tolist():
         gaps = [se3.rotation_angle_rad(poses[index] @ se3.inverse(poses[other])) for other in expected]

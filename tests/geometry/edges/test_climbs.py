@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from coec.geometry import se3
 from coec.geometry.cameras import build
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
-from coec.geometry.edges.climbs import MAX_SWEEPS, Climb, climbed
+from coec.geometry.edges.climbs import MAX_SWEEPS, AscentStart, ascend
 
 WIDTH, HEIGHT, EDGES = 96, 64, 300
 TRUTH = se3.perturbation(np.array([0.02, -0.03, 0.01, 0.0, 0.0, 0.0]))
@@ -40,13 +40,13 @@ def frames() -> EdgeFrames:
     )
 
 
-def score(frames: EdgeFrames, pose: NDArray[np.float64], climb: Climb) -> float:
+def score(frames: EdgeFrames, pose: NDArray[np.float64], climb: AscentStart) -> float:
     at = frame_alignment(frames, pose)
     of_frames = at.strength / np.sqrt(at.square)
     return float(np.cumsum(of_frames[climb.first : climb.last])[-1])
 
 
-def plain(frames: EdgeFrames, climb: Climb) -> tuple[NDArray[np.float64], float]:
+def plain(frames: EdgeFrames, climb: AscentStart) -> tuple[NDArray[np.float64], float]:
     pose, best, fineness = climb.pose, score(frames, climb.pose, climb), 0
     for _ in range(MAX_SWEEPS):
         improved = False
@@ -63,12 +63,12 @@ def plain(frames: EdgeFrames, climb: Climb) -> tuple[NDArray[np.float64], float]
 
 def test_climbs_at_once_end_where_each_ends_by_itself(frames: EdgeFrames) -> None:
     begun = [
-        Climb(se3.perturb(TRUTH, 0.01 * np.array([1.0, -1.0, 0.5, 0.0, 0.0, 0.0])), 0, 5),
-        Climb(TRUTH, 3, 5),
-        Climb(se3.perturb(TRUTH, np.array([0.0, 0.015, 0.0, 0.0, 0.0, 0.0])), 0, 1),
+        AscentStart(se3.perturb(TRUTH, 0.01 * np.array([1.0, -1.0, 0.5, 0.0, 0.0, 0.0])), 0, 5),
+        AscentStart(TRUTH, 3, 5),
+        AscentStart(se3.perturb(TRUTH, np.array([0.0, 0.015, 0.0, 0.0, 0.0, 0.0])), 0, 1),
     ]
     kept = [climb.pose.copy() for climb in begun]
-    for end, climb, before in zip(climbed(frames, begun, MOVES), begun, kept, strict=True):
+    for end, climb, before in zip(ascend(frames, begun, MOVES), begun, kept, strict=True):
         pose, best = plain(frames, climb)
         np.testing.assert_allclose(end.pose, pose, rtol=0.0, atol=1e-15)
         assert end.score == pytest.approx(best, rel=1e-12)
@@ -77,6 +77,6 @@ def test_climbs_at_once_end_where_each_ends_by_itself(frames: EdgeFrames) -> Non
 
 
 def test_a_climb_of_no_frames_ends_where_it_began(frames: EdgeFrames) -> None:
-    (end,) = climbed(frames, [Climb(TRUTH, 2, 2)], MOVES)
+    (end,) = ascend(frames, [AscentStart(TRUTH, 2, 2)], MOVES)
     np.testing.assert_array_equal(end.pose, TRUTH)
     assert end.score == 0.0

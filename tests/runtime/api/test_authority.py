@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from coec.config import AuthorityConfig, SenderConfig
 from coec.runtime.api.authority import Authority, NotAllowedError
-from coec.schemas.commands import NAMES
+from coec.schemas.commands import COMMAND_NAMES
 
 FILES = {"certificate": "v.pem", "private_key": "v-key.pem", "root_ca": "ca.pem"}
 OUTSIDE = "it connects to tcp/10.0.0.2:7447"
@@ -19,7 +19,7 @@ def config(**fields: object) -> AuthorityConfig:
 
 def may(authority: Authority, name: str | None) -> set[str]:
     allowed: set[str] = set()
-    for command in NAMES:
+    for command in COMMAND_NAMES:
         try:
             authority.require(name, command)
         except NotAllowedError:
@@ -34,7 +34,7 @@ def test_a_sender_may_give_his_commands_and_no_other() -> None:
     told = {name: may(authority, name) for name in ("operator", "fleet", "viewer", "Operator", "", None)}
     assert told == {
         "operator": {"hold", "reset"},
-        "fleet": set(NAMES),
+        "fleet": set(COMMAND_NAMES),
         "viewer": set(),
         "Operator": set(),
         "": set(),
@@ -56,7 +56,7 @@ def test_who_proves_no_name_may_give_commands_where_the_configuration_says_so(
     anonymous: str, outside: str | None, allowed: bool
 ) -> None:
     authority = Authority(AuthorityConfig.model_validate({"anonymous": anonymous}), lambda: outside)
-    assert may(authority, None) == (set(NAMES) if allowed else set())
+    assert may(authority, None) == (set(COMMAND_NAMES) if allowed else set())
     assert not may(authority, "operator"), "a name that is not among the senders is worse than none"
 
 
@@ -87,4 +87,4 @@ def test_what_grants_nothing_that_is_meant_is_refused(document: dict[str, object
 
 
 def test_all_commands_are_the_default() -> None:
-    assert SenderConfig(name="operator").commands == NAMES
+    assert SenderConfig(name="operator").commands == COMMAND_NAMES

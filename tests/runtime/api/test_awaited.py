@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.exports.told import Frames
+from coec.adapters.exports.told import ExportFrames
 from coec.adapters.ros.wire.publisher import Publisher
-from coec.adapters.zenoh.ros_topics import Topics
+from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.calibration.types import Reason
-from coec.runtime.api.awaited import AwaitedAnswers, AwaitedError
-from coec.runtime.nominal.watch import Nominal
-from coec.schemas.commands import NAMES
+from coec.runtime.api.awaited import PendingPairAnswers, PendingPairError
+from coec.runtime.nominal.watch import NominalStatus
+from coec.schemas.commands import COMMAND_NAMES
 from runtime.waiting import CAMERA, INFO, POINTS, World, configured
 
 NO_INFO = Reason("no_camera_info", "No CameraInfo on /front/camera_info yet.")
@@ -26,9 +26,9 @@ class Awaited:
     """A pair that waits for what a test says."""
 
     def __init__(self, folder: Path) -> None:
-        self.nominal = Nominal(awaits=(NO_INFO, NO_CLOUD))
+        self.nominal = NominalStatus(awaits=(NO_INFO, NO_CLOUD))
         self.world = World(folder, lambda _: self.nominal)
-        self.answers = AwaitedAnswers(configured(folder).awaited[0], "vehicle", self.world.outside)
+        self.answers = PendingPairAnswers(configured(folder).awaited[0], "vehicle", self.world.outside)
 
     @property
     def health(self) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def test_its_health_is_unknown_and_says_what_is_missing(awaited: Awaited) -> Non
 def test_topics_that_nobody_publishes_are_named_with_those_that_are_there(awaited: Awaited) -> None:
     there = [Publisher(CAMERA, "sensor_msgs/msg/CompressedImage", "/driver", bytes(16))]
     there.append(Publisher("/rear/points", "sensor_msgs/msg/PointCloud2", "/driver", bytes(16)))
-    awaited.world.topics = Topics(tuple(there))
+    awaited.world.topics = RosTopicList(tuple(there))
     awaited.answers.renew()
     needs = awaited.health["needs"]
     assert f"no publisher of {POINTS}; there are: /rear/points" in needs
@@ -67,7 +67,7 @@ def test_health_is_published_when_its_reasons_change_and_not_otherwise(awaited: 
     assert [key for key, _ in awaited.world.published] == ["coec/@v1/vehicle/front/health"]
     awaited.answers.renew()
     assert len(awaited.world.published) == 1
-    awaited.nominal = Nominal(awaits=(NO_CLOUD,))
+    awaited.nominal = NominalStatus(awaits=(NO_CLOUD,))
     awaited.answers.renew()
     awaited.world.troubles = (Reason("disk_full", "The disk is full."),)
     awaited.answers.renew()
@@ -81,7 +81,7 @@ def test_health_is_published_when_its_reasons_change_and_not_otherwise(awaited: 
     "ask",
     [
         lambda a: a.extrinsic("json"),
-        lambda a: a.exported("urdf", Frames(None, None)),
+        lambda a: a.exported("urdf", ExportFrames(None, None)),
         lambda a: a.history(0, 2**63 - 1, 10),
         lambda a: a.windows("json"),
         lambda a: a.read_window("front-1", 0, 1),
@@ -92,23 +92,25 @@ def test_health_is_published_when_its_reasons_change_and_not_otherwise(awaited: 
     ],
 )
 def test_every_other_question_ends_in_an_error_that_says_what_is_missing(
-    awaited: Awaited, ask: Callable[[AwaitedAnswers], object]
+    awaited: Awaited, ask: Callable[[PendingPairAnswers], object]
 ) -> None:
-    with pytest.raises(AwaitedError, match=r"waits for its nominal calibration\. No CameraInfo .* No sweep yet") as why:
+    with pytest.raises(
+        PendingPairError, match=r"waits for its nominal calibration\. No CameraInfo .* No sweep yet"
+    ) as why:
         ask(awaited.answers)
     assert why.value.reply_code == "awaiting"
-    awaited.nominal = Nominal(awaits=(NO_CLOUD,))
-    with pytest.raises(AwaitedError, match=r"calibration\. No sweep yet"):
+    awaited.nominal = NominalStatus(awaits=(NO_CLOUD,))
+    with pytest.raises(PendingPairError, match=r"calibration\. No sweep yet"):
         ask(awaited.answers)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", COMMAND_NAMES)
 def test_a_command_is_acknowledged_refused_and_counted(awaited: Awaited, name: str) -> None:
     said = awaited.answers.commands.carry_out(name, {}, "operator")
     assert (said.accepted, said.code, said.command) == (False, "awaiting", name)
     assert NO_INFO.text in said.text
-    awaited.answers.commands.note_refused(name, "stranger", AwaitedError("no"))
-    awaited.answers.commands.note_refused("\x1b[2J" * 100, "stranger", AwaitedError("no"))
+    awaited.answers.commands.note_refused(name, "stranger", PendingPairError("no"))
+    awaited.answers.commands.note_refused("\x1b[2J" * 100, "stranger", PendingPairError("no"))
     assert awaited.answers.status().commands == {
         f"{name}_refused": 1,
         f"{name}_not_allowed": 1,
@@ -117,7 +119,7 @@ def test_a_command_is_acknowledged_refused_and_counted(awaited: Awaited, name: s
 
 
 def test_its_status_has_what_was_lost_and_what_was_found_so_far(awaited: Awaited) -> None:
-    awaited.nominal = Nominal(
+    awaited.nominal = NominalStatus(
         awaits=(NO_CLOUD,), origins={"camera.frame_id": "the latest image"}, losses={"info_wrong_type": 3}
     )
     status = awaited.answers.status()

@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 
 from coec.adapters.zenoh.bus import Answer
-from coec.adapters.zenoh.client import ask, connected
+from coec.adapters.zenoh.client import connected, query_all
 from coec.config import Config, UplinkConfig, ZenohConfig
 from coec.errors import DecodeError, NotFoundError
-from coec.runtime.api.last_words import LastWords
+from coec.runtime.api.last_words import Heartbeats
 from coec.schemas import last_word
 from coec.schemas.keys import Keys
 from e2e.processes import Router
 from fakes import wait_until
-from last_words import a_word, packed
-from pair_bench import Bench
+from last_words import heartbeat, packed_heartbeat
+from pair_bench import PairBench
 from vehicles import PAIR, serving
 
 KEYS = Keys("coec", "vehicle")
@@ -34,14 +34,14 @@ class Clock:
 
 
 def test_it_is_said_on_change_from_time_to_time_and_at_the_end(tmp_path: Path) -> None:
-    bench, clock = Bench(tmp_path / "state", vehicle="vehicle"), Clock()
+    bench, clock = PairBench(tmp_path / "state", vehicle="vehicle"), Clock()
     said: list[tuple[str, Answer]] = []
-    words = LastWords(KEYS, "1.2", PERIOD, lambda key, answer: said.append((key, answer)), clock)
+    words = Heartbeats(KEYS, "1.2", PERIOD, lambda key, answer: said.append((key, answer)), clock)
 
     def heard(service: str) -> list[str]:
         before = len(said)
         words.renew(service, "h", [bench.answers])  # type: ignore[arg-type]
-        return [last_word.read(key, answer.payload).service for key, answer in said[before:]]
+        return [last_word.decode_heartbeat(key, answer.payload).service for key, answer in said[before:]]
 
     assert heard("running") == ["running"]
     assert heard("running") == [], "nothing has changed"
@@ -52,13 +52,13 @@ def test_it_is_said_on_change_from_time_to_time_and_at_the_end(tmp_path: Path) -
     assert heard("stopping") == ["stopping"], "whoever leaves says so"
     key, answer = said[-1]
     assert key == KEYS.last(PAIR)
-    word = last_word.read(key, answer.payload)
+    word = last_word.decode_heartbeat(key, answer.payload)
     assert (word.state, word.provenance, word.period_s, word.version) == ("unknown", "nominal", 30.0, "1.2")
 
 
 def test_of_a_pair_that_is_not_there_nothing_is_said() -> None:
     with pytest.raises(NotFoundError):
-        LastWords(KEYS, "0", PERIOD, lambda *_: None).answer("front", "json")
+        Heartbeats(KEYS, "0", PERIOD, lambda *_: None).answer("front", "json")
 
 
 def test_the_service_answers_for_itself_and_is_silent_about_pairs_that_it_does_not_have(
@@ -69,32 +69,32 @@ def test_the_service_answers_for_itself_and_is_silent_about_pairs_that_it_does_n
         serving(tmp_path, ZenohConfig(connect=(router.endpoint,))),
         connected([router.endpoint], 5.0) as session,
     ):
-        wait_until(lambda: bool(ask(session, KEYS.last(PAIR), 5.0)), "the vehicle answers")
+        wait_until(lambda: bool(query_all(session, KEYS.last(PAIR), 5.0)), "the vehicle answers")
         for expression in (KEYS.last(PAIR), KEYS.last("*"), "coec/@v1/*/last/*"):
-            (reply,) = ask(session, expression, 5.0)
-            assert last_word.read(reply.key, reply.payload).pair == PAIR
-        assert ask(session, KEYS.last("gone"), 5.0) == []
-        assert [reply.key for reply in ask(session, "coec/@v1/*/*/health", 5.0)] == [KEYS.health(PAIR)]
+            (reply,) = query_all(session, expression, 5.0)
+            assert last_word.decode_heartbeat(reply.key, reply.payload).pair == PAIR
+        assert query_all(session, KEYS.last("gone"), 5.0) == []
+        assert [reply.key for reply in query_all(session, "coec/@v1/*/*/health", 5.0)] == [KEYS.health(PAIR)]
 
 
 @pytest.mark.fault("a last word that is too large, invalid, or about another vehicle", "refused by cause, never shown")
 @pytest.mark.parametrize(
     ("key", "payload", "cause"),
     [
-        (KEYS.last("front"), b"\x00" * (last_word.MAX_BYTES + 1), "word_too_large"),
+        (KEYS.last("front"), b"\x00" * (last_word.MAX_HEARTBEAT_BYTES + 1), "word_too_large"),
         (KEYS.last("front"), b"", "word_malformed"),
         (KEYS.last("front"), b"\xc1", "word_malformed"),
         (KEYS.last("front"), b"\x91" * 9000, "word_malformed"),
-        (KEYS.last("front"), packed(a_word(), state="splendid"), "word_malformed"),
-        (KEYS.last("front"), packed(a_word(), drift=[float("nan")] * 6), "word_malformed"),
-        (KEYS.last("front"), packed(a_word(), reasons=[{"code": "x", "text": "x"}] * 9), "word_malformed"),
-        (KEYS.last("rear"), packed(a_word()), "word_of_another"),
-        (Keys("coec", "other").last("front"), packed(a_word()), "word_of_another"),
+        (KEYS.last("front"), packed_heartbeat(heartbeat(), state="splendid"), "word_malformed"),
+        (KEYS.last("front"), packed_heartbeat(heartbeat(), drift=[float("nan")] * 6), "word_malformed"),
+        (KEYS.last("front"), packed_heartbeat(heartbeat(), reasons=[{"code": "x", "text": "x"}] * 9), "word_malformed"),
+        (KEYS.last("rear"), packed_heartbeat(heartbeat()), "word_of_another"),
+        (Keys("coec", "other").last("front"), packed_heartbeat(heartbeat()), "word_of_another"),
     ],
 )
 def test_what_is_no_word_of_its_key_is_refused(key: str, payload: bytes, cause: str) -> None:
     with pytest.raises(DecodeError) as refused:
-        last_word.read(key, payload)
+        last_word.decode_heartbeat(key, payload)
     assert refused.value.reason == cause
 
 

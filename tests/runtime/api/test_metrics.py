@@ -8,7 +8,7 @@ from typing import get_args
 import pytest
 
 from coec.runtime.api import metrics
-from coec.runtime.api.metrics import FAMILIES, TextFormat, Took, View
+from coec.runtime.api.metrics import FAMILIES, LabelledHistogram, MetricsInput, TextFormat
 from coec.runtime.timings import LONG_S, QUICK_S, Histogram
 from coec.schemas.replies import (
     Axes,
@@ -25,9 +25,9 @@ from coec.schemas.replies import (
     WorkerStatus,
 )
 from coec.schemas.rig_state import RigReply, SensorState
-from open_metrics import Family, MalformedError, parse
-from rig_replies import knocked, untold
-from statuses import a_status
+from open_metrics import Family, MalformedError, parse_open_metrics
+from rig_replies import moved_lidar_reply, reply_before_checks
+from statuses import status_reply
 
 
 def a_health(state: str = "healthy", level: int = 0) -> HealthReply:
@@ -77,7 +77,7 @@ def a_health(state: str = "healthy", level: int = 0) -> HealthReply:
 
 def a_busy_status(state: str = "running") -> StatusReply:
     camera = StreamStatus(received=3, waiting=2, age_s=0.25, losses={"frame_id": 2})
-    return a_status(
+    return status_reply(
         version='1 "a\\b\n',
         vehicle="test",
         state=state,
@@ -89,22 +89,22 @@ def a_busy_status(state: str = "running") -> StatusReply:
     )
 
 
-def a_view() -> View:
+def a_view() -> MetricsInput:
     query, decode, job = Histogram(QUICK_S), Histogram(QUICK_S), Histogram(LONG_S)
     for seconds in (0.00005, 0.0001, 0.002, 99.0):
         query.add(seconds, "health")
     decode.add(0.002, "camera")
     job.add(2.0, "check")
     took = {
-        metrics.QUERY: [Took((), query)],
-        metrics.DECODE: [Took(("front",), decode)],
-        metrics.JOB: [Took((), job)],
+        metrics.QUERY: [LabelledHistogram((), query)],
+        metrics.DECODE: [LabelledHistogram(("front",), decode)],
+        metrics.JOB: [LabelledHistogram((), job)],
     }
-    return View(a_busy_status(), {"front": a_health()}, 5, 6, took)
+    return MetricsInput(a_busy_status(), {"front": a_health()}, 5, 6, took)
 
 
 def read(rig: RigReply | None = None) -> dict[str, Family]:
-    return parse(metrics.render(replace(a_view(), rig=rig)).decode())
+    return parse_open_metrics(metrics.render(replace(a_view(), rig=rig)).decode())
 
 
 def test_the_text_is_open_metrics_and_holds_every_family_with_its_help() -> None:
@@ -116,7 +116,7 @@ def test_the_text_is_open_metrics_and_holds_every_family_with_its_help() -> None
 
 
 def test_the_older_text_format_has_the_same_samples_below_families_that_it_knows() -> None:
-    view = replace(a_view(), rig=knocked())
+    view = replace(a_view(), rig=moved_lidar_reply())
     texts = {form: metrics.render(view, form).decode() for form in TextFormat}
     older = texts[TextFormat.PROMETHEUS].splitlines()
     samples = [line for line in older if not line.startswith("#")]
@@ -176,7 +176,7 @@ def test_what_is_not_known_is_not_told() -> None:
 
 
 def test_of_a_rig_its_sensors_are_told_its_fit_and_what_was_lost() -> None:
-    families = read(knocked())
+    families = read(moved_lidar_reply())
     for name, suffix, labels, value in [
         ("coec_sensor", "", {"sensor": "roof", "coec_sensor": "lidar_moved"}, 1),
         ("coec_sensor", "", {"sensor": "roof", "coec_sensor": "calibrated"}, 0),
@@ -191,7 +191,7 @@ def test_of_a_rig_its_sensors_are_told_its_fit_and_what_was_lost() -> None:
 
 
 def test_of_a_rig_of_which_nothing_is_known_no_figure_is_made_up() -> None:
-    families = read(untold())
+    families = read(reply_before_checks())
     assert families["coec_sensor"].value("", sensor="roof", coec_sensor="unknown") == 1
     for name in ("coec_sensor_moved_probability", "coec_rig_p_value", "coec_rig_losses"):
         assert families[name].samples == {}, name
@@ -228,4 +228,4 @@ def test_the_reader_of_these_tests_is_strict(change: str, to: str) -> None:
     text = metrics.render(a_view()).decode()
     assert change in text
     with pytest.raises(MalformedError):
-        parse(text.replace(change, to))
+        parse_open_metrics(text.replace(change, to))

@@ -11,19 +11,19 @@ from itertools import count
 import pytest
 from pydantic import ValidationError
 
-from coec.adapters.system.http import Page, Request
+from coec.adapters.system.http import HttpRequest, HttpResponse
 from coec.config import MetricsConfig
-from coec.runtime.api.http_door import HttpDoor
+from coec.runtime.api.http_door import MetricsServer
 from coec.runtime.api.metrics import TextFormat
 from coec.runtime.api.pages import accepted_format, pages
-from coec.runtime.api.router_watch import RouterWatch
+from coec.runtime.api.router_watch import RouterMonitor
 from ports import free_port
 from runtime.api.test_metrics import a_busy_status, a_health
 
 
-def health_page(state: str, **healths: tuple[str, int]) -> Page:
+def health_page(state: str, **healths: tuple[str, int]) -> HttpResponse:
     known = {name: a_health(*health) for name, health in healths.items()}
-    page = pages(lambda _: b"", lambda: a_busy_status(state), lambda: known, lambda: True)(Request("/health"))
+    page = pages(lambda _: b"", lambda: a_busy_status(state), lambda: known, lambda: True)(HttpRequest("/health"))
     assert page is not None
     return page
 
@@ -39,18 +39,18 @@ def test_health_is_good_when_every_pair_may_be_used() -> None:
 
 def test_there_are_three_pages() -> None:
     find = pages(lambda form: form.name.encode(), a_busy_status, dict, lambda: True)
-    plain, asked = find(Request("/metrics")), find(Request("/metrics", "application/openmetrics-text"))
+    plain, asked = find(HttpRequest("/metrics")), find(HttpRequest("/metrics", "application/openmetrics-text"))
     assert plain is not None
     assert asked is not None
     assert (plain.body, plain.content_type) == (b"PROMETHEUS", "text/plain; version=0.0.4; charset=utf-8")
     assert asked.body == b"OPEN_METRICS"
     assert asked.content_type == "application/openmetrics-text; version=1.0.0; charset=utf-8"
-    assert [find(Request(path)) for path in ("/", "/metrics/", "/config", "")] == [None] * 4
+    assert [find(HttpRequest(path)) for path in ("/", "/metrics/", "/config", "")] == [None] * 4
 
 
 @pytest.mark.parametrize(("alive", "status"), [(True, 200), (False, 503)])
 def test_a_service_that_is_stuck_is_not_alive_whatever_its_pairs_are(alive: bool, status: int) -> None:
-    page = pages(lambda _: b"", a_busy_status, dict, lambda: alive)(Request("/live"))
+    page = pages(lambda _: b"", a_busy_status, dict, lambda: alive)(HttpRequest("/live"))
     assert page is not None
     assert page.status == status
 
@@ -112,8 +112,8 @@ def test_what_is_no_address_is_refused(http: str) -> None:
 
 
 @pytest.fixture
-def door() -> Iterator[HttpDoor]:
-    made = HttpDoor(lambda _: Page(200, b"", "text/plain"))
+def door() -> Iterator[MetricsServer]:
+    made = MetricsServer(lambda _: HttpResponse(200, b"", "text/plain"))
     yield made
     assert made.close(20.0)
 
@@ -126,16 +126,16 @@ def answers(port: int) -> bool:
     return True
 
 
-def test_the_door_follows_the_configuration(door: HttpDoor) -> None:
+def test_the_door_follows_the_configuration(door: MetricsServer) -> None:
     first, second = free_port(), free_port()
-    door.use(MetricsConfig(http=f"127.0.0.1:{first}"))
+    door.reconfigure(MetricsConfig(http=f"127.0.0.1:{first}"))
     assert answers(first)
-    door.use(MetricsConfig(http=f"127.0.0.1:{second}"))
+    door.reconfigure(MetricsConfig(http=f"127.0.0.1:{second}"))
     assert (answers(first), answers(second)) == (False, True)
-    door.use(MetricsConfig())
+    door.reconfigure(MetricsConfig())
     assert not answers(second)
-    assert (door.trouble, door.insecure) == (None, None)
-    door.use(MetricsConfig(http=f"0.0.0.0:{first}", insecure=True))
+    assert (door.problem, door.insecure) == (None, None)
+    door.reconfigure(MetricsConfig(http=f"0.0.0.0:{first}", insecure=True))
     assert door.insecure is not None
     assert door.insecure.code == "http_insecure"
 
@@ -144,27 +144,27 @@ def test_the_door_follows_the_configuration(door: HttpDoor) -> None:
     "the port of the metrics is taken",
     "status says so; the calibration goes on, and the port is tried again with the next reload",
 )
-def test_a_taken_port_is_a_trouble_and_no_end(door: HttpDoor) -> None:
+def test_a_taken_port_is_a_trouble_and_no_end(door: MetricsServer) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        door.use(MetricsConfig(http=f"127.0.0.1:{port}"))
+        door.reconfigure(MetricsConfig(http=f"127.0.0.1:{port}"))
         assert door.server is None
-        assert door.trouble is not None
-        assert door.trouble.code == "http_unavailable"
-    door.use(MetricsConfig(http=f"127.0.0.1:{port}"))  # asked again, it is tried again
-    assert door.trouble is None
+        assert door.problem is not None
+        assert door.problem.code == "http_unavailable"
+    door.reconfigure(MetricsConfig(http=f"127.0.0.1:{port}"))  # asked again, it is tried again
+    assert door.problem is None
     assert answers(port)
 
 
 def test_a_router_that_is_away_is_told_once_each_time(caplog: pytest.LogCaptureFixture) -> None:
     there = iter([False, False, True, True, False, True])
     clock = count(100, 10)
-    watch = RouterWatch(("tcp/10.0.0.1:7447",), lambda: next(there), lambda: float(next(clock)))
+    watch = RouterMonitor(("tcp/10.0.0.1:7447",), lambda: next(there), lambda: float(next(clock)))
     codes = []
     with caplog.at_level(logging.INFO):
         for _ in range(6):
-            watch.look()
-            codes.append(watch.trouble and watch.trouble.code)
+            watch.check()
+            codes.append(watch.problem and watch.problem.code)
     assert codes == ["no_router", "no_router", None, None, "no_router", None]
     assert caplog.messages == [
         "no router at tcp/10.0.0.1:7447, trying again",
@@ -177,19 +177,19 @@ def test_a_router_that_is_away_is_told_once_each_time(caplog: pytest.LogCaptureF
 @pytest.mark.fault("a night without a router", "health has the reason; the log repeats it at growing intervals")
 def test_a_night_without_a_router_is_a_few_lines(caplog: pytest.LogCaptureFixture) -> None:
     clock = count(0)
-    watch = RouterWatch(("tcp/10.0.0.1:7447",), lambda: False, lambda: float(next(clock)))
+    watch = RouterMonitor(("tcp/10.0.0.1:7447",), lambda: False, lambda: float(next(clock)))
     with caplog.at_level(logging.INFO):
         for _ in range(8 * 3600):
-            watch.look()
+            watch.check()
     said = [message for message in caplog.messages if "trying again" in message]
     assert said == caplog.messages
     assert said[1] == "no router at tcp/10.0.0.1:7447 for 60 s, trying again"
     assert said[2] == "no router at tcp/10.0.0.1:7447 for 180 s, trying again"
     assert 8 <= len(said) <= 20
-    assert watch.trouble is not None
+    assert watch.problem is not None
 
 
 def test_who_is_the_router_itself_misses_none() -> None:
-    watch = RouterWatch((), lambda: False)
-    watch.look()
-    assert watch.trouble is None
+    watch = RouterMonitor((), lambda: False)
+    watch.check()
+    assert watch.problem is None

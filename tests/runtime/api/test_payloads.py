@@ -9,21 +9,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coec.errors import UsageError
-from coec.runtime.api.payloads import MAX_SENDER, parse, proven_sender, sender_of
-from coec.schemas.commands import MAX_REASON, NAMES
+from coec.runtime.api.payloads import MAX_SENDER, parse_payload, proven_sender, sender_of
+from coec.schemas.commands import COMMAND_NAMES, MAX_REASON
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", COMMAND_NAMES)
 @pytest.mark.parametrize("payload", [b"", b"{}", b"\x80"])
 def test_every_command_can_come_without_arguments(name: str, payload: bytes) -> None:
-    assert parse(name, payload) == {}
+    assert parse_payload(name, payload) == {}
 
 
 @pytest.mark.parametrize("pack", [lambda d: msgpack.packb(d), lambda d: str(d).replace("'", '"').encode()])
 def test_arguments_in_either_encoding(pack: object) -> None:
     assert callable(pack)
-    assert parse("rollback", pack({"to": "0123abcd"})) == {"to": "0123abcd"}
-    assert parse("hold", msgpack.packb({"release": True})) == {"release": True}
+    assert parse_payload("rollback", pack({"to": "0123abcd"})) == {"to": "0123abcd"}
+    assert parse_payload("hold", msgpack.packb({"release": True})) == {"release": True}
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_arguments_in_either_encoding(pack: object) -> None:
 )
 def test_what_is_no_command_is_refused_without_echo(name: str, payload: bytes) -> None:
     with pytest.raises(UsageError) as refused:
-        parse(name, payload)
+        parse_payload(name, payload)
     assert "force" not in str(refused.value)
     assert "dance" not in str(refused.value)
 
@@ -61,11 +61,11 @@ def test_what_is_no_command_is_refused_without_echo(name: str, payload: bytes) -
 def test_a_reason_is_one_line_that_steers_no_terminal() -> None:
     said = {"reason": " the mirror\nis \x1b[31mchanged\u202e, sagt Jürgen\x00 "}
     for payload in (json.dumps(said).encode(), msgpack.packb(said)):
-        assert parse("hold", payload) == {"reason": "the mirror is [31mchanged , sagt Jürgen"}
-    assert parse("reset", json.dumps({"reason": "ü" * MAX_REASON}).encode()) == {"reason": "ü" * MAX_REASON}
-    assert parse("reset", msgpack.packb({"reason": "€" * MAX_REASON})) == {"reason": "€" * MAX_REASON}
+        assert parse_payload("hold", payload) == {"reason": "the mirror is [31mchanged , sagt Jürgen"}
+    assert parse_payload("reset", json.dumps({"reason": "ü" * MAX_REASON}).encode()) == {"reason": "ü" * MAX_REASON}
+    assert parse_payload("reset", msgpack.packb({"reason": "€" * MAX_REASON})) == {"reason": "€" * MAX_REASON}
     with pytest.raises(UsageError, match="at most"):
-        parse("reset", json.dumps({"reason": "x" * (MAX_REASON + 1)}).encode())
+        parse_payload("reset", json.dumps({"reason": "x" * (MAX_REASON + 1)}).encode())
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_long_and_binary_senders_are_bounded() -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(
-    st.sampled_from(NAMES),
+    st.sampled_from(COMMAND_NAMES),
     st.one_of(
         st.binary(max_size=64),
         st.binary(max_size=16).map(lambda rest: b"{" + rest),
@@ -102,7 +102,7 @@ def test_long_and_binary_senders_are_bounded() -> None:
 )
 def test_any_bytes_are_a_command_or_an_error_of_ours(name: str, payload: bytes) -> None:
     with suppress(UsageError):
-        parse(name, payload)
+        parse_payload(name, payload)
 
 
 @given(st.binary(max_size=200) | st.text(alphabet="operator (certificate)", max_size=40).map(str.encode))
@@ -120,7 +120,7 @@ def test_a_proven_name_is_one_short_harmless_line(name: str) -> None:
 
 
 def test_a_command_for_the_rig_may_name_a_sensor_and_no_window() -> None:
-    assert parse("hold", b'{"sensor":"roof","release":true}', for_rig=True) == {
+    assert parse_payload("hold", b'{"sensor":"roof","release":true}', for_rig=True) == {
         "sensor": "roof",
         "release": True,
     }
@@ -130,4 +130,4 @@ def test_a_command_for_the_rig_may_name_a_sensor_and_no_window() -> None:
         ("rollback", b'{"to":"x"}', True),
     ):
         with pytest.raises(UsageError):
-            parse(name, payload, for_rig=for_rig)
+            parse_payload(name, payload, for_rig=for_rig)

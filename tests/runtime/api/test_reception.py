@@ -16,10 +16,10 @@ import pytest
 import zenoh
 
 from certificates import TestAuthority
-from coec.adapters.tls.conversation import Speaker
-from coec.adapters.zenoh.bus import JSON, WAITING, Lane, open_session
-from coec.adapters.zenoh.client import ask_one, connected
-from coec.adapters.zenoh.proven import give
+from coec.adapters.tls.conversation import CommandSender
+from coec.adapters.zenoh.bus import JSON, WAITING, QueryLane, open_session
+from coec.adapters.zenoh.client import connected, query_one
+from coec.adapters.zenoh.proven import send_authenticated
 from coec.config import AuthorityConfig, SenderConfig, ZenohConfig
 from coec.errors import NotProvenError, RemoteError
 from coec.runtime.api import commands
@@ -28,7 +28,7 @@ from coec.schemas.base import to_json
 from coec.schemas.commands import ProvenCommand
 from fakes import wait_until
 from ports import free_port
-from vehicles import KEYS, LIMITS, PAIR, Vehicle, serving
+from vehicles import KEYS, PAIR, VEHICLE_LIMITS, ServingVehicle, serving
 
 PATIENCE_S = 20.0
 HOLD = KEYS.command(PAIR, "hold")
@@ -44,19 +44,21 @@ def endpoint() -> str:
 @pytest.fixture(scope="module")
 def router(endpoint: str) -> Iterator[zenoh.Session]:
     """One without rules; whoever holds it may do all that a router in between can."""
-    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LIMITS) as session:
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), VEHICLE_LIMITS) as session:
         yield session
 
 
-Served = Callable[..., Vehicle]
+Served = Callable[..., ServingVehicle]
 
 
 @pytest.fixture
-def vehicle(router: zenoh.Session, endpoint: str, tmp_path: Path) -> Iterator[Callable[[AuthorityConfig], Vehicle]]:
+def vehicle(
+    router: zenoh.Session, endpoint: str, tmp_path: Path
+) -> Iterator[Callable[[AuthorityConfig], ServingVehicle]]:
     """A vehicle on the router, once it is told who may give commands."""
     with_end = []
 
-    def served(authority: AuthorityConfig) -> Vehicle:
+    def served(authority: AuthorityConfig) -> ServingVehicle:
         context = serving(tmp_path / "state", ZenohConfig(connect=(endpoint,)), authority)
         with_end.append(context)
         made = context.__enter__()
@@ -69,16 +71,16 @@ def vehicle(router: zenoh.Session, endpoint: str, tmp_path: Path) -> Iterator[Ca
 
 
 def plainly(session: zenoh.Session, payload: bytes | None = None, key: str = HOLD) -> dict[str, object]:
-    told: dict[str, object] = json.loads(ask_one(session, f"{key}?format=json", PATIENCE_S, payload).payload)
+    told: dict[str, object] = json.loads(query_one(session, f"{key}?format=json", PATIENCE_S, payload).payload)
     return told
 
 
 def proven(
     session: zenoh.Session, authority: TestAuthority, name: str, key: str = HOLD, payload: bytes | None = None
 ) -> dict[str, object]:
-    speaker = Speaker(authority.credentials(name), "vehicle")
+    speaker = CommandSender(authority.credentials(name), "vehicle")
     told: dict[str, object] = json.loads(
-        give(session, f"{key}?format=json", payload, PATIENCE_S, speaker, JSON).payload
+        send_authenticated(session, f"{key}?format=json", payload, PATIENCE_S, speaker, JSON).payload
     )
     return told
 
@@ -150,11 +152,11 @@ def test_what_was_meant_for_one_command_is_no_other(
     authority: TestAuthority, router: zenoh.Session, vehicle: Served
 ) -> None:
     there = vehicle(authority.of_service(SenderConfig(name="operator")))
-    speaker = Speaker(authority.credentials("operator"), "vehicle")
+    speaker = CommandSender(authority.credentials("operator"), "vehicle")
     reset = f"{KEYS.command(PAIR, 'reset')}?tls={'0' * 32};format=json"
-    flight = ask_one(router, reset, PATIENCE_S, speaker.hello()).payload
-    said = speaker.say(flight, to_json(ProvenCommand(selector=f"{HOLD}?format=json")))
-    code, why = refusal(lambda: ask_one(router, reset, PATIENCE_S, said))
+    flight = query_one(router, reset, PATIENCE_S, speaker.first_flight()).payload
+    said = speaker.send(flight, to_json(ProvenCommand(selector=f"{HOLD}?format=json")))
+    code, why = refusal(lambda: query_one(router, reset, PATIENCE_S, said))
     assert (code, "not the command that was asked for" in why) == ("bad_request", True)
     assert not there.bench.entries("command")
 
@@ -187,11 +189,11 @@ def test_what_comes_through_a_door_for_everybody_is_denied(tmp_path: Path, door:
     port = free_port()
     wide = ZenohConfig(embedded_router=True, listen=(f"{door}:{port}",), insecure=True)
     beside = ZenohConfig(connect=(f"tcp/127.0.0.1:{port}",))
-    with open_session(wide, LIMITS) as open_router, serving(tmp_path / "beside", beside):
+    with open_session(wide, VEHICLE_LIMITS) as open_router, serving(tmp_path / "beside", beside):
         wait_until(lambda: bool(list(open_router.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
         code, why = refusal(lambda: plainly(open_router))
         assert (code, f"port {port} is open at" in why) == ("not_allowed", True)
-    with serving(tmp_path / "within", wide), open_session(beside, LIMITS) as client:
+    with serving(tmp_path / "within", wide), open_session(beside, VEHICLE_LIMITS) as client:
         wait_until(lambda: bool(list(client.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
         code, why = refusal(lambda: plainly(client))
         assert (code, "it listens at" in why) == ("not_allowed", True)
@@ -207,7 +209,7 @@ class HangingDisk:
         sys.addaudithook(self._hang)  # for good: it does nothing any more once it is let go
 
     def _hang(self, event: str, _: object) -> None:
-        if event in self.EVENTS and threading.current_thread().name == f"{Lane.FILES.value}-queries":
+        if event in self.EVENTS and threading.current_thread().name == f"{QueryLane.FILES.value}-queries":
             self.entered.set()
             assert self.let_go.wait(PATIENCE_S)
 
@@ -223,19 +225,21 @@ def test_a_command_does_not_wait_for_a_window_that_is_read(
     window.write_bytes(b"a window")
     waiting = [router.get(KEYS.window(PAIR, "front-1"), timeout=PATIENCE_S)]
     assert disk.entered.wait(PATIENCE_S)
-    waiting += [router.get(KEYS.window(PAIR, "front-1"), timeout=PATIENCE_S) for _ in range(WAITING[Lane.FILES] + 5)]
+    waiting += [
+        router.get(KEYS.window(PAIR, "front-1"), timeout=PATIENCE_S) for _ in range(WAITING[QueryLane.FILES] + 5)
+    ]
     times_s = []
     for payload in (None, RELEASE) * 5:
         began_s = time.monotonic()
         assert plainly(router, payload)["accepted"]
         times_s.append(time.monotonic() - began_s)
     for at_once in (KEYS.extrinsic(PAIR), KEYS.health(PAIR), KEYS.status):
-        assert ask_one(router, at_once, PATIENCE_S).payload
+        assert query_one(router, at_once, PATIENCE_S).payload
     disk.let_go.set()
     answers = [reply for replies in waiting for reply in replies]
     assert len(answers) == len(waiting)
     read = [reply.ok.payload.to_bytes() for reply in answers if reply.ok is not None]
-    assert read == [b"a window"] * (WAITING[Lane.FILES] + 1), "the others were told that it is busy"
+    assert read == [b"a window"] * (WAITING[QueryLane.FILES] + 1), "the others were told that it is busy"
     record_property("figure", f"median {sorted(times_s)[5] * 1e3:.0f} ms, longest {max(times_s) * 1e3:.0f} ms")
 
 
@@ -250,7 +254,7 @@ def test_beginnings_without_end_hold_up_no_proven_command(
     record_property: Callable[[str, object], None],
 ) -> None:
     there = vehicle(authority.of_service(OPERATOR))
-    hello = Speaker(authority.credentials("viewer"), "vehicle").hello()
+    hello = CommandSender(authority.credentials("viewer"), "vehicle").first_flight()
     stop, ended, begun = threading.Event(), threading.Event(), [0]
 
     def flood() -> None:

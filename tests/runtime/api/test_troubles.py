@@ -6,8 +6,8 @@ import pytest
 
 from coec.calibration.lifecycle import Health, HealthState
 from coec.calibration.types import Reason
-from coec.runtime.api.health import HARMLESS, with_troubles
-from coec.runtime.api.troubles import TROUBLES
+from coec.runtime.api.health import HARMLESS, with_problems
+from coec.runtime.api.troubles import PROBLEMS
 
 HEALTHY = Health(HealthState.HEALTHY, ())
 
@@ -17,13 +17,13 @@ HEALTHY = Health(HealthState.HEALTHY, ())
 )
 def test_what_says_nothing_about_the_calibration_leaves_a_pair_healthy() -> None:
     for code in HARMLESS:
-        assert code in TROUBLES
-        health = with_troubles(HEALTHY, (Reason(code, "It is so."),))
+        assert code in PROBLEMS
+        health = with_problems(HEALTHY, (Reason(code, "It is so."),))
         assert (health.state, [reason.code for reason in health.reasons]) == (HealthState.HEALTHY, [code])
 
 
 def test_every_other_trouble_degrades_a_healthy_pair_and_no_other() -> None:
-    for code in TROUBLES.keys() - HARMLESS:
+    for code in PROBLEMS.keys() - HARMLESS:
         reason = Reason(code, "It is so.")
-        assert with_troubles(HEALTHY, (reason,)).state is HealthState.DEGRADED
-        assert with_troubles(Health(HealthState.STALE, ()), (reason,)).state is HealthState.STALE
+        assert with_problems(HEALTHY, (reason,)).state is HealthState.DEGRADED
+        assert with_problems(Health(HealthState.STALE, ()), (reason,)).state is HealthState.STALE

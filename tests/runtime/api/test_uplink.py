@@ -47,6 +47,6 @@ def test_a_new_rate_holds_at_once_and_gives_nothing_for_the_time_before() -> Non
     uplink = Uplink(UplinkConfig(evidence_bytes_per_s=RATE), lambda: now_s)
     uplink.metered("windows", lambda: Answer(bytes(BURST_BYTES + 10 * RATE), ""))
     now_s = 5.0
-    uplink.use(UplinkConfig(evidence_bytes_per_s=5 * RATE))
+    uplink.reconfigure(UplinkConfig(evidence_bytes_per_s=5 * RATE))
     with pytest.raises(UplinkBusyError, match=r"1\.0 s"):
         uplink.metered("windows", lambda: Answer(b"", ""))

@@ -8,25 +8,25 @@ import numpy as np
 
 from coec.config import CalibrationConfig, WorkerConfig
 from coec.runtime.api import metrics
-from coec.runtime.api.metrics import View
+from coec.runtime.api.metrics import MetricsInput
 from coec.runtime.api.status import worker_status_of
 from coec.runtime.worker import jobs
 from coec.runtime.worker.queue import WAITING, Lane
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.replies import WorkerStatus
-from statuses import a_status
+from statuses import status_reply
 
 
 def lines_of(worker: WorkerStatus) -> list[str]:
-    status = a_status(worker=worker)
-    return metrics.render(View(status, {})).decode().splitlines()
+    status = status_reply(worker=worker)
+    return metrics.render(MetricsInput(status, {})).decode().splitlines()
 
 
 def test_every_end_is_counted_by_fate_and_cause_and_what_waits_by_kind() -> None:
     worker = Worker(WorkerConfig(), "{}")
     for number in range(WAITING[Lane.CHECK] + 1):
-        worker.ask(jobs.check("front", CalibrationConfig(), np.eye(4), (), lambda _: None))
-        worker.ask(jobs.solve("front", Path(f"w{number}"), f"w{number}", lambda _: None, live=False))
+        worker.submit(jobs.check("front", CalibrationConfig(), np.eye(4), (), lambda _: None))
+        worker.submit(jobs.solve("front", Path(f"w{number}"), f"w{number}", lambda _: None, live=False))
     status = worker_status_of(worker)
     assert (status.state, status.queued, status.job, status.job_age_s) == ("starting", 9, None, None)
     assert status.waiting == {"check": 4, "backlog": 5}

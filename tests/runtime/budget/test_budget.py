@@ -6,14 +6,14 @@ import pytest
 
 from coec.config import BudgetConfig, MonitorConfig, WindowConfig
 from coec.runtime.api import metrics
-from coec.runtime.api.metrics import View
+from coec.runtime.api.metrics import MetricsInput
 from coec.runtime.api.status import budget_status_of
 from coec.runtime.budget.budget import Budget
-from coec.runtime.budget.prices import KEPT, Price
-from coec.runtime.budget.spending import BIN_S, OVER_S, Spending
+from coec.runtime.budget.prices import COST_SAMPLES, CostModel
+from coec.runtime.budget.spending import USAGE_BIN_S, USAGE_OVER_S, CpuUsage
 from coec.runtime.worker import jobs
 from coec.runtime.worker.costs import START, Cost
-from statuses import a_status
+from statuses import status_reply
 
 S = 1_000_000_000
 
@@ -44,9 +44,9 @@ def budget(clock: Clock) -> Budget:
 def test_what_everything_would_take_is_told_with_what_it_stretches(budget: Budget, clock: Clock) -> None:
     clock.now_s = 100.0
     for pair in ("front", "rear"):
-        assert budget.affords(pair, S, suspected=False)
+        assert budget.try_acquire(pair, S, suspected=False)
         budget.pay(Cost(jobs.Kind.CHECK, pair, 2.0))
-        budget.ended(pair)
+        budget.release(pair)
     for _ in range(25):
         budget.pay(Cost(jobs.PREFETCH, "front", 0.1))
     budget.pay(Cost(jobs.Kind.SOLVE, "front", 6.5))
@@ -62,8 +62,8 @@ def test_what_everything_would_take_is_told_with_what_it_stretches(budget: Budge
     assert told.pairs["front"].window_s == pytest.approx(9.0)
     assert told.pairs["rear"].window_s is None
     assert told.pairs["rear"].unseen_s == pytest.approx(3.0)
-    status = a_status(budget=told)
-    lines = metrics.render(View(status, {})).decode().splitlines()
+    status = status_reply(budget=told)
+    lines = metrics.render(MetricsInput(status, {})).decode().splitlines()
     assert 'coec_worker_processor_seconds_total{kind="solve"} 6.5' in lines
     assert "coec_budget_cores 0.5" in lines
     assert "coec_budget_store_seconds 1" in lines
@@ -73,21 +73,21 @@ def test_what_everything_would_take_is_told_with_what_it_stretches(budget: Budge
 def test_pictures_and_windows_of_earlier_runs_keep_nobody_waiting(budget: Budget) -> None:
     for kind in ("overlay", "picture", "commission", "backlog", "idle"):
         budget.pay(Cost(kind, "front", 1000.0))
-    assert budget.affords("front", S, suspected=False)
+    assert budget.try_acquire("front", S, suspected=False)
     report = budget.report()
-    assert report.wanted == 0.0
+    assert report.demand == 0.0
     assert sum(report.totals_s.values()) == 5000.0, "but they are told"
 
 
 def test_what_has_begun_counts_until_it_has_ended(budget: Budget) -> None:
     for pair in ("front", "rear"):
-        assert budget.affords(pair, S, suspected=False)
+        assert budget.try_acquire(pair, S, suspected=False)
         budget.pay(Cost(jobs.Kind.CHECK, pair, 2.0))
-        budget.ended(pair)
-    assert budget.affords("front", S, suspected=False), "1 s lies in store"
-    assert not budget.affords("rear", S, suspected=False), "2 s of which are spoken for"
-    budget.ended("front")
-    assert budget.affords("rear", S, suspected=False)
+        budget.release(pair)
+    assert budget.try_acquire("front", S, suspected=False), "1 s lies in store"
+    assert not budget.try_acquire("rear", S, suspected=False), "2 s of which are spoken for"
+    budget.release("front")
+    assert budget.try_acquire("rear", S, suspected=False)
 
 
 def test_first_slices_end_apart_and_none_is_too_short_for_a_window(budget: Budget) -> None:
@@ -98,13 +98,13 @@ def test_first_slices_end_apart_and_none_is_too_short_for_a_window(budget: Budge
 
 
 def test_one_measurement_in_a_hurry_moves_no_price() -> None:
-    price = Price()
+    price = CostModel()
     assert (price.cpu_s, price.known) == (0.0, False)
     price.add(30.0)
     assert price.cpu_s == 30.0
     price.add(0.2)
     assert price.cpu_s == 0.2, "a first look in a process that is new costs more than others"
-    for _ in range(KEPT):
+    for _ in range(COST_SAMPLES):
         price.add(0.1)
     price.add(1e9)
     price.add(-1.0)
@@ -112,12 +112,12 @@ def test_one_measurement_in_a_hurry_moves_no_price() -> None:
 
 
 def test_spending_is_told_over_the_last_minutes() -> None:
-    spending = Spending(1000.0)
+    spending = CpuUsage(1000.0)
     spending.add("check", "front", 1.0, 1001.0)
-    assert spending.cores(1001.0) == pytest.approx(1.0 / BIN_S), "not over less than it is counted in"
+    assert spending.cores(1001.0) == pytest.approx(1.0 / USAGE_BIN_S), "not over less than it is counted in"
     assert spending.cores(1010.0) == pytest.approx(0.1)
     for second in range(1010, 2000, 10):
         spending.add("check", "front", 4.0, float(second))
     assert spending.cores(2000.0) == pytest.approx(0.4, rel=0.1)
-    assert spending.cores(2000.0 + OVER_S + BIN_S) == 0.0
+    assert spending.cores(2000.0 + USAGE_OVER_S + USAGE_BIN_S) == 0.0
     assert spending.totals_s == {("check", "front"): pytest.approx(1.0 + 99 * 4.0)}

@@ -11,8 +11,8 @@ from statistics import mean
 import pytest
 
 from coec.config import BudgetConfig
-from coec.runtime.budget.store import DEPTH_S, LOOKS_SHARE, Debt, Store
-from coec.runtime.budget.turns import Turns
+from coec.runtime.budget.store import BUCKET_DEPTH_S, CHECKS_SHARE, Debt, TokenBucket
+from coec.runtime.budget.turns import CheckScheduler
 
 S = 1_000_000_000
 FRAME_S = 0.5
@@ -34,7 +34,7 @@ class Drive:
     a worker that does one thing after the other, a check before a window. A pair with a window in work asks for no
     check. `begun` and `ended` are the checks by pair, s; `spent_s` is what the worker took."""
 
-    turns: Turns
+    turns: CheckScheduler
     look_s: Mapping[str, float]
     window_s: float
     suspected: Suspicion = nobody
@@ -74,7 +74,7 @@ class Drive:
                     ready.add(name)
                 if name not in ready or name in in_work:
                     continue
-                if self.turns.affords(name, round(now_s * S), suspected=self.suspected(name, now_s)):
+                if self.turns.try_acquire(name, round(now_s * S), suspected=self.suspected(name, now_s)):
                     ready.remove(name)
                     self.begun[name].append(now_s)
                     heapq.heappush(waiting, (0, now_s, f"check {name}"))
@@ -87,12 +87,12 @@ class Drive:
     def _end(self, kind: str, name: str, now_s: float) -> None:
         if kind == "check":
             self.spent_s += self.look_s[name]
-            self.turns.looked(name, self.look_s[name])
-            self.turns.ended(name)
+            self.turns.record_check(name, self.look_s[name])
+            self.turns.release(name)
             self.ended[name].append(now_s)
         else:
             self.spent_s += self.window_s
-            self.turns.solved(name, self.window_s)
+            self.turns.record_solve(name, self.window_s)
 
     def longest_unseen_s(self, name: str) -> float:
         times = [0.0, *self.ended[name]]
@@ -118,11 +118,11 @@ def four(look_s: float) -> dict[str, float]:
 def test_four_pairs_that_fit_are_seen_every_15_s(
     look_s: float, window_s: float, record_property: Callable[[str, object], None]
 ) -> None:
-    turns = Turns(0.5)
+    turns = CheckScheduler(0.5)
     drive = Drive(turns, four(look_s), window_s).run(1080.0)
     unseen_s = max(drive.longest_unseen_s(name) for name in NAMES)
     record_property("figure", f"{unseen_s:.1f} s")
-    assert turns.wanted <= 0.5
+    assert turns.demand <= 0.5
     assert turns.stretch == 1.0
     assert unseen_s <= LONGEST_UNSEEN_S
     assert drive.spent_s / 1080.0 <= 0.5
@@ -130,7 +130,7 @@ def test_four_pairs_that_fit_are_seen_every_15_s(
 
 def test_where_the_budget_suffices_every_check_is_made_with_the_frame_that_asks_for_it() -> None:
     """The windows are apart by more than they take, so a check waits for its pair's own window alone."""
-    drive = Drive(Turns(0.5), four(0.12), 1.5).run(720.0)
+    drive = Drive(CheckScheduler(0.5), four(0.12), 1.5).run(720.0)
     for name in NAMES:
         late = [at for at in drive.begun[name] if at % PERIOD_S > 1e-6]
         ends = [at for each, at in drive.windows if each == name]
@@ -139,9 +139,9 @@ def test_where_the_budget_suffices_every_check_is_made_with_the_frame_that_asks_
 
 
 def test_where_it_does_not_all_periods_stretch_alike() -> None:
-    turns = Turns(0.2)
+    turns = CheckScheduler(0.2)
     drive = Drive(turns, four(0.7), 6.0).run(3600.0)
-    assert turns.wanted == pytest.approx(4 * 0.7 / PERIOD_S + 4 * 6.0 / SLICE_S)
+    assert turns.demand == pytest.approx(4 * 0.7 / PERIOD_S + 4 * 6.0 / SLICE_S)
     counts = [len(drive.begun[name]) for name in NAMES]
     assert max(counts) - min(counts) <= 0.05 * mean(counts)
     stretched = 3600.0 / mean(counts) / PERIOD_S
@@ -159,14 +159,14 @@ def test_sixteen_pairs_are_looked_at_in_turn_and_what_they_lack_is_told(
 ) -> None:
     """Those of `deploy/examples/rig.yaml`, at the prices of a slow core."""
     names = [str(number) for number in range(16)]
-    turns = Turns(BudgetConfig().cores)
+    turns = CheckScheduler(BudgetConfig().cores)
     drive = Drive(turns, dict.fromkeys(names, 0.3), 6.0, frame_s=0.1).run(720.0)
     counts = [len(drive.ended[name]) for name in names]
     unseen_s = max(drive.longest_unseen_s(name) for name in names)
-    record_property("figure", f"{turns.wanted:.2f} cores wanted, unseen {unseen_s:.0f} s, periods × {turns.stretch:g}")
+    record_property("figure", f"{turns.demand:.2f} cores wanted, unseen {unseen_s:.0f} s, periods × {turns.stretch:g}")
     assert max(counts) - min(counts) <= 2, "in turn"
-    assert turns.wanted == pytest.approx(16 * (0.3 / PERIOD_S + 6.0 / SLICE_S))
-    assert turns.stretch == pytest.approx(turns.wanted / BudgetConfig().cores, abs=0.05)
+    assert turns.demand == pytest.approx(16 * (0.3 / PERIOD_S + 6.0 / SLICE_S))
+    assert turns.stretch == pytest.approx(turns.demand / BudgetConfig().cores, abs=0.05)
     assert unseen_s <= 3.0 * turns.stretch * PERIOD_S
     assert drive.late <= 0.1, "the worker keeps up with what it is asked"
 
@@ -174,13 +174,13 @@ def test_sixteen_pairs_are_looked_at_in_turn_and_what_they_lack_is_told(
 def test_a_budget_beyond_what_one_worker_does_makes_answers_late() -> None:
     """Which is why it is the budget that has to be set, not the checks that have to wait."""
     names = [str(number) for number in range(16)]
-    drive = Drive(Turns(64.0), dict.fromkeys(names, 0.3), 6.0, frame_s=0.1).run(720.0)
+    drive = Drive(CheckScheduler(64.0), dict.fromkeys(names, 0.3), 6.0, frame_s=0.1).run(720.0)
     assert drive.spent_s / 720.0 > 0.9, "it does what it can"
     assert drive.late > 0.2
 
 
 def test_a_dear_pair_takes_no_more_turns_than_a_cheap_one() -> None:
-    drive = Drive(Turns(0.1), {"front": 1.0, "rear": 0.1}, 0.5).run(1800.0)
+    drive = Drive(CheckScheduler(0.1), {"front": 1.0, "rear": 0.1}, 0.5).run(1800.0)
     front, rear = (len(drive.begun[name]) for name in ("front", "rear"))
     assert front == pytest.approx(rear, rel=0.2)
 
@@ -191,7 +191,7 @@ def test_a_suspicion_comes_first_borrows_and_pays_back() -> None:
     def suspected(name: str, now_s: float) -> bool:
         return name == "left" and begin_s <= now_s < end_s
 
-    turns = Turns(0.2)
+    turns = CheckScheduler(0.2)
     drive = Drive(turns, four(0.7), 2.0, suspected).run(2000.0)
     during = [at for at in drive.begun["left"] if begin_s + PERIOD_S <= at < end_s]
     gaps = [later - earlier for earlier, later in pairwise(during)]
@@ -204,23 +204,23 @@ def test_a_suspicion_comes_first_borrows_and_pays_back() -> None:
 
 
 def test_what_may_be_borrowed_is_bounded() -> None:
-    turns = Turns(0.1)
+    turns = CheckScheduler(0.1)
     turns.join("front", PERIOD_S, SLICE_S)
     begun = 0
     for _ in range(100):  # within one instant: nothing is earned
-        if not turns.affords("front", S, suspected=True):
+        if not turns.try_acquire("front", S, suspected=True):
             break
-        turns.looked("front", 0.5)
-        turns.ended("front")
+        turns.record_check("front", 0.5)
+        turns.release("front")
         begun += 1
-    assert turns.in_store_s == pytest.approx(-DEPTH_S * 0.1, abs=0.5)
+    assert turns.in_store_s == pytest.approx(-BUCKET_DEPTH_S * 0.1, abs=0.5)
     assert begun == 5, "what lies in store, as much again, and the one that goes below"
-    assert not turns.affords("front", 2 * S, suspected=False)
+    assert not turns.try_acquire("front", 2 * S, suspected=False)
 
 
 def test_all_that_are_suspected_share_like_the_others() -> None:
     """A LiDAR that is knocked makes every camera suspect."""
-    drive = Drive(Turns(0.2), four(0.7), 2.0, lambda *_: True).run(1200.0)
+    drive = Drive(CheckScheduler(0.2), four(0.7), 2.0, lambda *_: True).run(1200.0)
     counts = [len(drive.begun[name]) for name in NAMES]
     assert max(counts) - min(counts) <= 2
     assert drive.spent_s / 1200.0 == pytest.approx(0.2, rel=0.05), "beyond what lay in store and what is owed, nothing"
@@ -228,13 +228,13 @@ def test_all_that_are_suspected_share_like_the_others() -> None:
 
 def test_windows_never_take_everything() -> None:
     """One window that costs as much as two minutes of the budget."""
-    drive = Drive(Turns(0.1), four(0.1), 12.0).run(3600.0)
+    drive = Drive(CheckScheduler(0.1), four(0.1), 12.0).run(3600.0)
     assert all(drive.longest_unseen_s(name) <= 60.0 for name in NAMES)
     assert drive.spent_s / 3600.0 == pytest.approx(0.1, rel=0.25)
 
 
 def test_a_camera_that_is_off_leaves_its_share_to_the_others() -> None:
-    turns = Turns(0.1)
+    turns = CheckScheduler(0.1)
     drive = Drive(turns, four(0.4), 0.1, silent=lambda name, now_s: name == "left" and now_s > 600.0).run(1800.0)
     before = sum(at < 600.0 for at in drive.begun["front"]) / 600.0
     after = sum(at > 900.0 for at in drive.begun["front"]) / 900.0
@@ -246,14 +246,14 @@ def test_a_camera_that_is_off_leaves_its_share_to_the_others() -> None:
 
 def test_the_same_drive_has_the_same_turns_at_any_rate() -> None:
     """Only stamps pass: how fast they come is nobody's business."""
-    once, again = (Drive(Turns(0.2), four(0.7), 6.0).run(900.0).begun for _ in range(2))
+    once, again = (Drive(CheckScheduler(0.2), four(0.7), 6.0).run(900.0).begun for _ in range(2))
     assert once == again
 
 
 @pytest.mark.fault("a clock that jumps by hours", "the budget neither stands still nor is lost")
 @pytest.mark.parametrize("jump_s", [-7200.0, 7200.0])
 def test_a_clock_that_jumps_earns_nothing_and_stops_nobody(jump_s: float) -> None:
-    turns = Turns(0.1)
+    turns = CheckScheduler(0.1)
     for name in ("front", "rear"):
         turns.join(name, PERIOD_S, SLICE_S)
     begun = {"front": [0, 0], "rear": [0, 0]}
@@ -261,27 +261,27 @@ def test_a_clock_that_jumps_earns_nothing_and_stops_nobody(jump_s: float) -> Non
         now_s = step * FRAME_S
         for name in begun:
             jumped_s = jump_s if name == "front" and now_s >= 1200.0 else 0.0
-            if turns.affords(name, round((100_000.0 + now_s + jumped_s) * S), suspected=False):
-                turns.looked(name, 1.0)
-                turns.ended(name)
+            if turns.try_acquire(name, round((100_000.0 + now_s + jumped_s) * S), suspected=False):
+                turns.record_check(name, 1.0)
+                turns.release(name)
                 begun[name][now_s >= 1200.0] += 1
     for before, after in begun.values():
         assert after == pytest.approx(before, rel=0.1)
 
 
 def test_a_freak_is_no_debt_for_an_hour() -> None:
-    store = Store(0.5)
+    store = TokenBucket(0.5)
     store.pay(500.0, usual_s=0.1)
-    assert store.level_s == pytest.approx(-2 * DEPTH_S * 0.5)
+    assert store.level_s == pytest.approx(-2 * BUCKET_DEPTH_S * 0.5)
     store.pay(1.0, usual_s=0.1)
-    assert store.level_s == pytest.approx(-2 * DEPTH_S * 0.5), "nor does the next one make it larger"
-    dear = Store(0.1)
+    assert store.level_s == pytest.approx(-2 * BUCKET_DEPTH_S * 0.5), "nor does the next one make it larger"
+    dear = TokenBucket(0.1)
     dear.pay(30.0, usual_s=30.0)
     assert dear.level_s == pytest.approx(1.0 - 30.0), "what is usual is paid in full"
 
 
 def test_windows_are_paid_in_instalments() -> None:
-    store, debt = Store(0.5), Debt(over_s=100.0, owed_s=10.0)
+    store, debt = TokenBucket(0.5), Debt(over_s=100.0, owed_s=10.0)
     store.level_s = 0.0
     store.earn(1.0, [debt])
     assert store.level_s == pytest.approx(0.4, abs=0.01)
@@ -292,14 +292,14 @@ def test_windows_are_paid_in_instalments() -> None:
 
 
 def test_another_budget_holds_at_once() -> None:
-    turns = Turns(10.0)
-    turns.use(0.1)
+    turns = CheckScheduler(10.0)
+    turns.reconfigure(0.1)
     assert turns.cores == 0.1
-    assert turns.in_store_s == pytest.approx(DEPTH_S * 0.1)
+    assert turns.in_store_s == pytest.approx(BUCKET_DEPTH_S * 0.1)
 
 
 def test_first_windows_of_many_pairs_lie_apart() -> None:
-    turns = Turns(0.5)
+    turns = CheckScheduler(0.5)
     phases = [turns.join(str(index), PERIOD_S, SLICE_S) for index in range(8)]
     assert phases[:4] == [0.0, 0.5, 0.25, 0.75]
     assert sorted(phases) == [index / 8 for index in range(8)]
@@ -311,28 +311,28 @@ def test_first_windows_of_many_pairs_lie_apart() -> None:
 def test_windows_of_the_first_minutes_come_out_of_the_budget(record_property: Callable[[str, object], None]) -> None:
     """At the prices that were measured for eight cameras of 700×700 and three LiDARs."""
     names = [str(number) for number in range(24)]
-    drive = Drive(Turns(0.5), dict.fromkeys(names, 0.1), 2.0, frame_s=0.1).run(SLICE_S)
+    drive = Drive(CheckScheduler(0.5), dict.fromkeys(names, 0.1), 2.0, frame_s=0.1).run(SLICE_S)
     assert len(drive.windows) >= 20, "nearly each pair has had its first"
-    lay_in_store = DEPTH_S * 0.5
+    lay_in_store = BUCKET_DEPTH_S * 0.5
     record_property("figure", f"{drive.spent_s / SLICE_S:.2f} cores")
     assert drive.spent_s <= 0.5 * SLICE_S + 2.0 * lay_in_store
     assert all(drive.longest_unseen_s(name) <= LONGEST_UNSEEN_S for name in names)
 
 
 def test_what_one_window_costs_is_expected_of_the_others() -> None:
-    turns = Turns(0.5)
+    turns = CheckScheduler(0.5)
     for name in NAMES:
         turns.join(name, PERIOD_S, SLICE_S)
-        assert turns.affords(name, S, suspected=False)
-        turns.ended(name)
-    assert turns.wanted == 0.0
-    turns.solved("left", 9.0)
-    turns.looked("rear", 0.5)
-    assert turns.wanted == pytest.approx(4 * (0.5 / PERIOD_S + 9.0 / SLICE_S))
+        assert turns.try_acquire(name, S, suspected=False)
+        turns.release(name)
+    assert turns.demand == 0.0
+    turns.record_solve("left", 9.0)
+    turns.record_check("rear", 0.5)
+    assert turns.demand == pytest.approx(4 * (0.5 / PERIOD_S + 9.0 / SLICE_S))
     assert turns.shares()["front"].window_s is None, "but nobody says that it was measured"
-    turns.join_looks("roof to flank", 15.0)
-    assert turns.affords("roof to flank", S, suspected=False)
-    assert turns.wanted == pytest.approx(4 * (0.5 / PERIOD_S + 9.0 / SLICE_S)), "who has other looks, and no windows"
+    turns.join_checks("roof to flank", 15.0)
+    assert turns.try_acquire("roof to flank", S, suspected=False)
+    assert turns.demand == pytest.approx(4 * (0.5 / PERIOD_S + 9.0 / SLICE_S)), "who has other looks, and no windows"
 
 
 @pytest.mark.fault(
@@ -340,15 +340,15 @@ def test_what_one_window_costs_is_expected_of_the_others() -> None:
 )
 def test_windows_that_the_rig_wants_follow_each_other_as_the_budget_earns_them() -> None:
     names = [str(number) for number in range(8)]
-    turns = Turns(0.5)
+    turns = CheckScheduler(0.5)
     for name in names:
         turns.join(name, PERIOD_S, SLICE_S)
-        turns.solved(name, 3.0)
+        turns.record_solve(name, 3.0)
     later_s = [turns.window_turn_s(name, 100 * S) for name in names]
-    apart_s = 3.0 / (0.5 * (1.0 - LOOKS_SHARE))
+    apart_s = 3.0 / (0.5 * (1.0 - CHECKS_SHARE))
     assert later_s == pytest.approx([apart_s * place for place in range(8)])
-    turns.affords(names[0], 130 * S, suspected=False)
+    turns.try_acquire(names[0], 130 * S, suspected=False)
     assert turns.window_turn_s(names[0], 130 * S) == pytest.approx(8 * apart_s - 30.0)
-    turns.affords(names[0], 160 * S, suspected=False)
-    turns.affords(names[0], 180 * S, suspected=False)
+    turns.try_acquire(names[0], 160 * S, suspected=False)
+    turns.try_acquire(names[0], 180 * S, suspected=False)
     assert turns.window_turn_s(names[0], 200 * S) == 0.0, "what was long ago keeps nobody waiting"

@@ -12,23 +12,23 @@ import pytest
 from coec.adapters.files.conversions import result_of
 from coec.adapters.files.state_file import StateFile
 from coec.errors import StateError
-from coec.runtime.decisions.chain import GENESIS, Chain
+from coec.runtime.decisions.chain import GENESIS, HashChain
 from coec.schemas.base import SCHEMA_VERSION, to_json
 from coec.schemas.replies import CalibrationResult, HistoryEntry
-from disks import EVERYTHING, Disk
-from estimates import RIG, estimate
+from disks import EVERY_OPERATION, Disk
+from estimates import ESTIMATE_RIG, estimate
 
 
 def result(window: int) -> CalibrationResult:
-    return result_of(estimate(window), RIG, "test")
+    return result_of(estimate(window), ESTIMATE_RIG, "test")
 
 
 def entry(text: str = "something") -> HistoryEntry:
     return HistoryEntry(sequence=0, previous_sha256="", kind="command", code="hold", text=text, wall_ns=1)
 
 
-def written(path: Path, count: int, limit: int = 100) -> Chain:
-    history = Chain(path, limit)
+def written(path: Path, count: int, limit: int = 100) -> HashChain:
+    history = HashChain(path, limit)
     for window in range(count):
         history.append(entry(str(window)), result(window) if window % 2 else None)
         history.flush()
@@ -48,7 +48,7 @@ def test_every_entry_holds_the_hash_of_the_one_before(tmp_path: Path) -> None:
 
 def test_a_restart_finds_the_same_chain_and_goes_on(tmp_path: Path) -> None:
     before = written(tmp_path / "h", 4)
-    again = Chain(tmp_path / "h", 100, before.durable_head)
+    again = HashChain(tmp_path / "h", 100, before.durable_head)
     assert again.damage is None
     assert again.entries() == before.entries()
     assert [kept.result for kept in again.entries()] == [None, result(1), None, result(3)]
@@ -59,7 +59,7 @@ def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
     history = written(tmp_path / "h", 20, limit=3)
     assert [item.entry.sequence for item in history.entries()] == [17, 18, 19]
     assert len((tmp_path / "h").read_bytes().splitlines()) <= 6
-    again = Chain(tmp_path / "h", 3, history.durable_head)
+    again = HashChain(tmp_path / "h", 3, history.durable_head)
     assert again.damage is None
     assert again.entries() == history.entries()
 
@@ -81,12 +81,12 @@ def test_any_change_is_noticed_and_the_file_kept_aside(tmp_path: Path, what: str
         "inserted": [*lines[:2], lines[1], *lines[2:]],
     }[what]
     path.write_bytes(b"".join(changed))
-    again = Chain(path, 100, head)
+    again = HashChain(path, 100, head)
     assert again.damage is not None
     good = 3 if what == "result" else 2
     assert [item.entry.text for item in again.entries()] == [str(i) for i in range(good)]
     assert (tmp_path / "h.broken").read_bytes() == b"".join(changed)
-    assert Chain(path, 100).damage is None, "what is left is sound"
+    assert HashChain(path, 100).damage is None, "what is left is sound"
 
 
 @pytest.mark.fault("the end of the history cut off", "it is noticed")
@@ -94,9 +94,9 @@ def test_an_end_that_was_cut_off_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "h"
     head = written(path, 5).durable_head
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:3]))
-    assert Chain(path, 100).damage is None, "the chain alone cannot tell"
+    assert HashChain(path, 100).damage is None, "the chain alone cannot tell"
     path.write_bytes(path.read_bytes())
-    cut = Chain(path, 100, head)
+    cut = HashChain(path, 100, head)
     assert cut.damage is not None
     assert "cut off" in cut.damage
     assert len(cut.entries()) == 3
@@ -107,40 +107,40 @@ def test_a_torn_last_line_of_a_power_cut_is_no_tampering(tmp_path: Path) -> None
     path = tmp_path / "h"
     before = written(path, 3)
     path.write_bytes(path.read_bytes() + b"0123 half a li")
-    again = Chain(path, 100, before.durable_head)
+    again = HashChain(path, 100, before.durable_head)
     assert again.damage is None
     assert again.entries() == before.entries()
     again.append(entry())
     again.flush()
-    assert Chain(path, 100).damage is None
+    assert HashChain(path, 100).damage is None
 
 
 def test_two_broken_chains_do_not_overwrite_each_other(tmp_path: Path) -> None:
     path = tmp_path / "h"
     for _ in range(2):
         path.write_bytes(b"junk\n")
-        assert Chain(path, 100).damage is not None
+        assert HashChain(path, 100).damage is not None
     assert {item.name for item in tmp_path.iterdir()} >= {"h.broken", "h.broken-1"}
 
 
 def test_a_head_that_was_dropped_for_its_age_is_no_tampering(tmp_path: Path) -> None:
     path = tmp_path / "h"
     head = written(path, 1, limit=2).durable_head
-    history = Chain(path, 2, head)
+    history = HashChain(path, 2, head)
     for number in range(1, 9):
         history.append(entry(str(number)))
         history.flush()
-    assert Chain(path, 2, head).damage is None
+    assert HashChain(path, 2, head).damage is None
 
 
 def test_another_entry_at_the_place_of_the_head_is_noticed(tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     head = written(tmp_path / "other" / "h", 3).durable_head
-    history = Chain(tmp_path / "h", 100)
+    history = HashChain(tmp_path / "h", 100)
     for number in range(5):
         history.append(entry(f"forged {number}"))
         history.flush()
-    assert Chain(tmp_path / "h", 100, head).damage is not None
+    assert HashChain(tmp_path / "h", 100, head).damage is not None
 
 
 # --- entries of other versions --------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def test_an_entry_that_a_newer_version_wrote_stays_in_its_place(tmp_path: Path) 
     path = tmp_path / "h"
     written(path, 3, limit=6)
     line = append_line(path, NEWER)
-    again = Chain(path, 6)
+    again = HashChain(path, 6)
     assert again.damage is None
     assert again.entries()[-1].line == line
     assert again.entries()[-1].entry.sequence == 3
@@ -183,7 +183,7 @@ def test_an_entry_that_a_newer_version_wrote_stays_in_its_place(tmp_path: Path) 
         again.flush()
         if number == 3:
             assert line in path.read_bytes().splitlines()
-    assert Chain(path, 6, again.durable_head).damage is None
+    assert HashChain(path, 6, again.durable_head).damage is None
 
 
 def test_a_result_that_another_version_wrote_does_not_break_the_chain(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_a_result_that_another_version_wrote_does_not_break_the_chain(tmp_path: 
     written(path, 2)
     of_window = {"kind": "estimate", "code": "accepted", "text": "", "wall_ns": 1, "window_id": "front-9"}
     line = append_line(path, of_window, {"schema_version": 3, "sigma_rad_m": [0.1]})
-    again = Chain(path, 100)
+    again = HashChain(path, 100)
     assert again.damage is None
     assert (again.entries()[-1].entry.window_id, again.entries()[-1].result) == ("front-9", None)
     assert again.entries()[-1].line == line
@@ -202,7 +202,7 @@ def test_an_entry_that_this_version_cannot_have_written_breaks_the_chain(tmp_pat
     path = tmp_path / "h"
     written(path, 2)
     append_line(path, NEWER | {"schema_version": SCHEMA_VERSION})
-    assert Chain(path, 100).damage is not None
+    assert HashChain(path, 100).damage is not None
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_an_entry_of_another_version_without_its_place_breaks_the_chain(
     path = tmp_path / "h"
     written(path, 2)
     append_line(path, NEWER | fields)
-    assert Chain(path, 100).damage is not None
+    assert HashChain(path, 100).damage is not None
 
 
 # --- disks ----------------------------------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ class Life:
     """A history and the state file that knows its head, as the service writes them."""
 
     def __init__(self, root: Path) -> None:
-        self.history = Chain(root / "h", LIMIT)
+        self.history = HashChain(root / "h", LIMIT)
         self.state = StateFile(root / "state.json")
         self.said = 0
 
@@ -247,7 +247,7 @@ class Life:
 def assert_restarts(root: Path, safe: int) -> None:
     """Nothing is called tampered with, and entry `safe` (-1: none) and those kept before it are there."""
     body = StateFile(root / "state.json").load().body
-    again = Chain(root / "h", LIMIT, body["head"] if body else None)
+    again = HashChain(root / "h", LIMIT, body["head"] if body else None)
     assert again.damage is None
     found = [int(kept.entry.text) for kept in again.entries()]
     assert found == list(range(found[0], found[-1] + 1)) if found else safe == -1
@@ -291,7 +291,7 @@ def test_what_waits_is_written_without_another_entry_and_the_head_follows(
     disk = Disk(tmp_path, monkeypatch)
     history = written(tmp_path / "h", 2)
     before = history.durable_head
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     history.append(entry("third"))
     for _ in range(2):
         with pytest.raises(StateError, match="No space"):
@@ -301,7 +301,7 @@ def test_what_waits_is_written_without_another_entry_and_the_head_follows(
     disk.refuses = ()
     history.flush()
     assert history.durable_head != before
-    again = Chain(tmp_path / "h", 100, history.durable_head)
+    again = HashChain(tmp_path / "h", 100, history.durable_head)
     assert again.damage is None
     assert again.entries() == history.entries()
 
@@ -312,20 +312,20 @@ def test_a_broken_chain_is_kept_aside_once_the_disk_takes_it(tmp_path: Path, mon
     written(path, 3)
     broken = path.read_bytes().replace(b'"text":"1"', b'"text":"9"')
     path.write_bytes(broken)
-    disk.refuses = EVERYTHING
-    history = Chain(path, 100)
+    disk.refuses = EVERY_OPERATION
+    history = HashChain(path, 100)
     assert history.damage is not None
     assert path.read_bytes() == broken
     disk.refuses = ()
     history.append(entry("on"))
     history.flush()
     assert (tmp_path / "h.broken").read_bytes() == broken
-    assert [kept.entry.text for kept in Chain(path, 100, history.durable_head).entries()] == ["0", "on"]
+    assert [kept.entry.text for kept in HashChain(path, 100, history.durable_head).entries()] == ["0", "on"]
 
 
 def test_a_history_that_cannot_be_read_is_damage(tmp_path: Path) -> None:
     (tmp_path / "h").mkdir()
-    history = Chain(tmp_path / "h", 100)
+    history = HashChain(tmp_path / "h", 100)
     assert history.damage is not None
     assert "cannot be read" in history.damage
     history.append(entry())
@@ -351,5 +351,5 @@ def test_a_power_cut_at_any_byte_loses_nothing_and_is_no_tampering(
                 disk.acknowledge(number)
     count = 0
     for count, cut in enumerate(disk.power_cuts()):
-        assert_restarts(cut.put(tmp_path / str(count)), max(cut.acknowledged, default=-1))
+        assert_restarts(cut.restore(tmp_path / str(count)), max(cut.acknowledged, default=-1))
     assert count > 3000

@@ -9,7 +9,7 @@ import pytest
 from coec.errors import StateError
 from coec.runtime.decisions.check_log import CheckLog
 from coec.schemas.replies import CheckReply, MetricReply
-from disks import EVERYTHING, Disk
+from disks import EVERY_OPERATION, Disk
 
 NONE = (None,) * 6
 
@@ -77,7 +77,7 @@ def test_a_full_disk_costs_no_check_but_those_that_a_restart_comes_before(
     log = CheckLog(tmp_path / "checks", 10)
     log.append(check(0))
     log.flush()
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     log.append(check(1))
     with pytest.raises(StateError, match="No space"):
         log.flush()

@@ -11,10 +11,10 @@ import pytest
 from coec.adapters.files.conversions import result_of, transform_of
 from coec.adapters.files.state_file import StateFile
 from coec.errors import StateError
-from coec.runtime.decisions.history import History
+from coec.runtime.decisions.history import PairHistory
 from coec.schemas.replies import CalibrationResult, HistoryEntry
-from disks import EVERYTHING, Disk
-from estimates import RIG, estimate
+from disks import EVERY_OPERATION, Disk
+from estimates import ESTIMATE_RIG, estimate
 
 LIMIT = 4
 
@@ -25,14 +25,14 @@ def entry(kind: str, code: str = "", **fields: Any) -> HistoryEntry:
     )
 
 
-def solved(history: History, window: int) -> CalibrationResult:
-    result = result_of(estimate(window), RIG, "test")
+def solved(history: PairHistory, window: int) -> CalibrationResult:
+    result = result_of(estimate(window), ESTIMATE_RIG, "test")
     history.append(entry("estimate", "accepted", window_id=result.window_id), result)
     return result
 
 
-def filled(folder: Path) -> tuple[History, CalibrationResult]:
-    history = History(folder, "front", LIMIT, {})
+def filled(folder: Path) -> tuple[PairHistory, CalibrationResult]:
+    history = PairHistory(folder, "front", LIMIT, {})
     result = solved(history, 1)
     history.append(
         entry("extrinsic", "estimated", window_id=result.window_id, camera_from_lidar=result.camera_from_lidar)
@@ -58,7 +58,7 @@ def test_no_flood_pushes_a_result_or_what_it_put_in_place_out(tmp_path: Path, fl
     for _ in range(5 * LIMIT):
         history.append(flood)
     history.flush()
-    for one in (history, History(tmp_path, "front", LIMIT, history.durable_heads)):
+    for one in (history, PairHistory(tmp_path, "front", LIMIT, history.durable_heads)):
         assert one.damage is None
         assert one.results() == (result,)
         assert [kept.entry.code for kept in one.entries()] == ["accepted", "estimated", *[flood.code] * LIMIT]
@@ -81,7 +81,7 @@ def test_entries_are_numbered_together_in_the_order_in_which_they_came(tmp_path:
     for kind in kinds[:3]:
         history.append(entry(kind))
     history.flush()
-    history = History(tmp_path, "front", LIMIT, history.durable_heads)
+    history = PairHistory(tmp_path, "front", LIMIT, history.durable_heads)
     for kind in kinds[3:]:
         history.append(entry(kind))
     told = [(kept.entry.sequence, kept.entry.kind) for kept in history.entries()]
@@ -95,7 +95,7 @@ def test_a_book_that_was_cut_or_removed_is_noticed(tmp_path: Path, book: str) ->
         history.append(entry(kind))
     history.flush()
     (tmp_path / f"{book}-front.jsonl").unlink()
-    assert "cut off" in str(History(tmp_path, "front", LIMIT, history.durable_heads).damage)
+    assert "cut off" in str(PairHistory(tmp_path, "front", LIMIT, history.durable_heads).damage)
 
 
 @pytest.mark.fault("a forged pose in the history, hashes right", "it is damage, and not used")
@@ -104,7 +104,7 @@ def test_a_forged_pose_in_a_book_is_damage_whatever_its_hash(tmp_path: Path) -> 
     zero = transform_of(np.eye(4)).model_copy(update={"matrix": ((0.0,) * 4,) * 4})
     history.append(entry("extrinsic", "estimated", window_id=result.window_id, camera_from_lidar=zero))
     history.flush()
-    again = History(tmp_path, "front", LIMIT, {})
+    again = PairHistory(tmp_path, "front", LIMIT, {})
     assert again.damage is not None
     assert [kept.entry.code for kept in again.entries()] == ["accepted", "estimated"]
 
@@ -113,7 +113,7 @@ def test_a_forged_pose_in_a_book_is_damage_whatever_its_hash(tmp_path: Path) -> 
 def test_every_book_waits_for_a_full_disk_and_is_written_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(tmp_path, monkeypatch)
     history, _ = filled(tmp_path)
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     for kind in ("state", "command"):
         history.append(entry(kind))
     with pytest.raises(StateError, match=r"No space.*commands-front\.jsonl: No space"):
@@ -124,6 +124,6 @@ def test_every_book_waits_for_a_full_disk_and_is_written_then(tmp_path: Path, mo
     state.save({"heads": history.durable_heads})
     body = StateFile(tmp_path / "state.json").load().body
     assert body is not None
-    again = History(tmp_path, "front", LIMIT, body["heads"])
+    again = PairHistory(tmp_path, "front", LIMIT, body["heads"])
     assert again.damage is None
     assert again.entries() == history.entries()

@@ -11,9 +11,9 @@ import pytest
 
 from coec.adapters.files.conversions import transform_of
 from coec.errors import NotFoundError, StateError
-from coec.runtime.decisions.incidents import POINTS_AFTER, POINTS_KEPT, Incidents
+from coec.runtime.decisions.incidents import POINTS_AFTER, POINTS_BEFORE, Incidents
 from coec.schemas.replies import EvidenceEvent, MetricsPoint, Reason
-from disks import EVERYTHING, Disk
+from disks import EVERY_OPERATION, Disk
 
 
 def event(stamp: int, before: str | None = "front-1") -> EvidenceEvent:
@@ -40,13 +40,13 @@ def found(evidence: Incidents, event_id: str) -> EvidenceEvent:
 
 def test_an_event_holds_the_figures_before_and_after_it(tmp_path: Path) -> None:
     evidence = Incidents(tmp_path, "front", 3)
-    for stamp in range(POINTS_KEPT + 10):
+    for stamp in range(POINTS_BEFORE + 10):
         evidence.note(point(stamp))
     evidence.begin(event(1000))
     for stamp in range(1001, 1001 + POINTS_AFTER + 20):
         evidence.note(point(stamp))
     stamps = [p.stamp_ns for p in found(evidence, "front-1000").metrics]
-    assert stamps == [*range(10, POINTS_KEPT + 10), *range(1001, 1001 + POINTS_AFTER)]
+    assert stamps == [*range(10, POINTS_BEFORE + 10), *range(1001, 1001 + POINTS_AFTER)]
 
 
 def test_windows_pictures_and_the_end_are_added_and_survive_a_restart(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_an_event_that_could_not_be_written_is_written_later_however_late(
 ) -> None:
     disk = Disk(tmp_path, monkeypatch)
     evidence = Incidents(tmp_path, "front", 2)
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     evidence.begin(event(1000))
     for stamp in range(POINTS_AFTER):
         evidence.note(point(stamp))
@@ -163,7 +163,7 @@ def test_a_power_cut_at_any_byte_takes_no_evidence_that_was_written(
             disk.acknowledge(number)
     count = 0
     for count, cut in enumerate(disk.power_cuts()):
-        again = Incidents(cut.put(tmp_path / str(count)), "front", 2)
+        again = Incidents(cut.restore(tmp_path / str(count)), "front", 2)
         done = len(cut.acknowledged)
         found = {each.event_id: each for each in again.events()}
         wanted = {"front-1": 0 < done < 5, "front-2": done >= 5, "front-3": done >= 6}

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from coec.calibration.types import Reason
-from coec.runtime.decisions.progress import Attempts, Progress
-from coec.runtime.ingest.chooser import Chosen
+from coec.runtime.decisions.progress import Attempts, CheckProgress
+from coec.runtime.ingest.chooser import SelectionStatistics
 from coec.runtime.ingest.decoder import CAMERA, LIDAR, StreamCounts
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 
@@ -26,16 +26,16 @@ def report(
     unanswered: int = 0,
 ) -> StreamStatistics:
     streams = {CAMERA: StreamCounts(camera, camera - refused), LIDAR: StreamCounts(lidar, lidar)}
-    chosen = Chosen(checks=checks, not_afforded=not_afforded, unanswered=unanswered, last_ns=1000 * S)
-    return StreamStatistics(streams=streams, pairs=pairs, chosen=chosen, pace=1.0)
+    chosen = SelectionStatistics(checks=checks, not_afforded=not_afforded, unanswered=unanswered, last_ns=1000 * S)
+    return StreamStatistics(streams=streams, pairs=pairs, selection=chosen, pace=1.0)
 
 
 BEGIN = report()
 ALL = report(camera=100, lidar=100, pairs=100, checks=3)
 
 
-def begun() -> Progress:
-    progress = Progress(PERIOD_S, 0.0, BEGIN)
+def begun() -> CheckProgress:
+    progress = CheckProgress(PERIOD_S, 0.0, BEGIN)
     progress.completed(1000 * S, 100.0, BEGIN, acquits=True)
     return progress
 
@@ -66,9 +66,9 @@ def test_checks_that_do_not_acquit_renew_nothing() -> None:
 
 def test_on_the_clock_of_the_sensors_a_replay_may_run_ahead_of_the_answers_by_a_period_more() -> None:
     progress = begun()
-    ahead = replace(ALL, pace=10.0, chosen=replace(ALL.chosen, last_ns=1020 * S))
+    ahead = replace(ALL, pace=10.0, selection=replace(ALL.selection, last_ns=1020 * S))
     assert progress.overdue(ahead, 101.0, at_rest=False) is None
-    late = replace(ahead, chosen=replace(ahead.chosen, last_ns=1020 * S + 1))
+    late = replace(ahead, selection=replace(ahead.selection, last_ns=1020 * S + 1))
     assert progress.overdue(late, 101.0, at_rest=False) is not None
     progress.time_stepped_back()
     assert progress.overdue(late, 101.0, at_rest=False) is None, "stamps of before tell nothing any more"
@@ -125,10 +125,10 @@ def test_three_attempts_in_a_row_that_come_to_nothing_are_a_trouble_and_one_that
     attempts = Attempts("windows", "windows_in_vain")
     for text in ("No edges.", "No edges."):
         attempts.failed(Reason("range_edges", text))
-    assert attempts.trouble is None
+    assert attempts.problem is None
     attempts.failed(Reason("overlap", "Too little in view."))
-    assert attempts.trouble == Reason("windows_in_vain", "The last 3 windows came to nothing. Too little in view.")
+    assert attempts.problem == Reason("windows_in_vain", "The last 3 windows came to nothing. Too little in view.")
     attempts.succeeded()
-    assert attempts.trouble is None
+    assert attempts.problem is None
     attempts.failed(Reason("overlap", "Too little in view."))
-    assert attempts.trouble is None, "it is counted from the beginning again"
+    assert attempts.problem is None, "it is counted from the beginning again"

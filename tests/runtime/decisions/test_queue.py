@@ -6,15 +6,15 @@ from itertools import permutations
 
 import pytest
 
-from coec.runtime.decisions.queue import DecisionQueue, Effect
+from coec.runtime.decisions.queue import Effect, ResultSchedule
 
 
 @pytest.mark.parametrize("order", list(permutations(range(4))))
 def test_answers_are_taken_in_the_order_of_the_questions_and_act_when_they_are_due(order: tuple[int, ...]) -> None:
-    decisions = DecisionQueue()
+    decisions = ResultSchedule()
     taken: list[int] = []
     acted: list[int] = []
-    questions = [decisions.ask(due_ns, expires_s=1.0) for due_ns in (50, 40, 60, 60)]
+    questions = [decisions.submit(due_ns, expires_s=1.0) for due_ns in (50, 40, 60, 60)]
 
     def answer(number: int) -> Effect:
         taken.append(number)
@@ -36,9 +36,9 @@ def test_answers_are_taken_in_the_order_of_the_questions_and_act_when_they_are_d
 
 
 def test_only_what_is_due_is_waited_for() -> None:
-    decisions = DecisionQueue()
+    decisions = ResultSchedule()
     assert not decisions.waits(10**18)
-    question = decisions.ask(50, expires_s=1.0)
+    question = decisions.submit(50, expires_s=1.0)
     assert not decisions.waits(49)
     assert decisions.waits(50)
     decisions.answer(question, lambda: None)
@@ -46,9 +46,9 @@ def test_only_what_is_due_is_waited_for() -> None:
 
 
 def test_an_answer_that_was_not_awaited_acts_on_the_next_pair() -> None:
-    decisions = DecisionQueue()
+    decisions = ResultSchedule()
     acted: list[int] = []
-    question = decisions.ask(50, expires_s=1.0)
+    question = decisions.submit(50, expires_s=1.0)
     decisions.settle(55)
     decisions.answer(question, lambda: lambda: acted.append(1))
     assert acted == []
@@ -58,9 +58,9 @@ def test_an_answer_that_was_not_awaited_acts_on_the_next_pair() -> None:
 
 
 def test_a_question_without_an_answer_does_not_hold_up_those_behind_it() -> None:
-    decisions = DecisionQueue()
+    decisions = ResultSchedule()
     acted: list[str] = []
-    lost, other = decisions.ask(50, expires_s=10.0, name="w-1"), decisions.ask(60, expires_s=90.0)
+    lost, other = decisions.submit(50, expires_s=10.0, name="w-1"), decisions.submit(60, expires_s=90.0)
     decisions.answer(other, lambda: lambda: acted.append("other"))
     assert decisions.waits(60)
     assert decisions.expire(9.9, lambda _: lambda: None) == 0
@@ -76,8 +76,8 @@ def test_a_question_without_an_answer_does_not_hold_up_those_behind_it() -> None
 
 
 def test_the_question_about_a_window_is_found_until_it_is_answered() -> None:
-    decisions = DecisionQueue()
-    question = decisions.ask(50, 1.0, "w-1")
+    decisions = ResultSchedule()
+    question = decisions.submit(50, 1.0, "w-1")
     assert decisions.about("w-1") is question
     assert decisions.about("w-2") is None
     decisions.answer(question, lambda: None)
@@ -85,9 +85,9 @@ def test_the_question_about_a_window_is_found_until_it_is_answered() -> None:
 
 
 def test_when_sensor_time_steps_back_whatever_waits_is_due_at_once() -> None:
-    decisions = DecisionQueue()
+    decisions = ResultSchedule()
     acted: list[int] = []
-    questions = [decisions.ask(due_ns, expires_s=1.0) for due_ns in (1000, 2000)]
+    questions = [decisions.submit(due_ns, expires_s=1.0) for due_ns in (1000, 2000)]
     assert not decisions.waits(10)
     decisions.bring_forward(10)
     assert decisions.waits(10)
@@ -95,4 +95,4 @@ def test_when_sensor_time_steps_back_whatever_waits_is_due_at_once() -> None:
         decisions.answer(question, lambda number=number: lambda: acted.append(number))  # type: ignore[misc]
     decisions.settle(10)
     assert acted == [0, 1]
-    assert decisions.ask(20, 1.0).due_ns == 20
+    assert decisions.submit(20, 1.0).due_ns == 20

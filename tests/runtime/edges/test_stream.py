@@ -11,12 +11,12 @@ import pytest
 from coec.calibration.lidar_to_lidar.types import LidarRig, RangeBias
 from coec.calibration.types import Reason
 from coec.geometry import se3
-from coec.runtime.edges.stream import COUNTS_AFTER_NS, LOOKS_WAITING, RESTS, LidarEdgeStream
+from coec.runtime.edges.stream import COUNTS_AFTER_NS, RESTS, SWEEP_SETS_WAITING, LidarPairStream
 from coec.runtime.worker.costs import Cost
 from coec.runtime.worker.jobs import Answer, Kind, Registered
 from coec.schemas.base import from_json, to_json
 from coec.schemas.rig_state import RigReply
-from lidar_bench import LIDARS, MOUNTED, LidarBench, registered, true, where, with_extra
+from lidar_bench import LIDAR_POSES, LIDARS, LidarBench, registration, relative_pose, true_registration, with_extra
 from rigs import NS
 
 pytestmark = pytest.mark.usefixtures("with_extra")
@@ -28,10 +28,10 @@ TURN = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.0, 0.0])
 
 
 def knocked(name: str) -> Callable[[LidarRig, int], Answer | Reason]:
-    moved = {**MOUNTED, name: se3.perturb(MOUNTED[name], TURN)}
+    moved = {**LIDAR_POSES, name: se3.perturb(LIDAR_POSES[name], TURN)}
 
     def answers(rig: LidarRig, stamp_ns: int) -> Answer:
-        return registered(rig, where(moved if stamp_ns >= KNOCKED_S * NS else MOUNTED, rig), stamp_ns)
+        return registration(rig, relative_pose(moved if stamp_ns >= KNOCKED_S * NS else LIDAR_POSES, rig), stamp_ns)
 
     return answers
 
@@ -46,12 +46,12 @@ def test_every_two_lidars_are_told_with_their_age_and_uncertainty(tmp_path: Path
         ("roof to bumper", "roof to trunk", "bumper to trunk"), "waiting"
     )
     bench.drive(0.0, 40.0)
-    found = bench.between(EDGE)
+    found = bench.reply_between(EDGE)
     assert (found.state, found.looks, found.losses) == ("measured", 2, {})
     assert found.measured_ns == found.stamp_ns == 17 * NS
     assert found.a_from_b is not None
     pose = np.array(found.a_from_b.matrix)
-    truth = MOUNTED["roof"] @ se3.inverse(MOUNTED["bumper"])
+    truth = LIDAR_POSES["roof"] @ se3.inverse(LIDAR_POSES["bumper"])
     assert np.abs(se3.difference(pose, truth)).max() < 0.03
     assert found.sigma is not None
     assert 0.01 < found.sigma[0] < 0.1
@@ -110,12 +110,12 @@ def test_what_waits_is_bounded_and_losses_are_counted(tmp_path: Path) -> None:
     bench.drive(0.0, 130.0)
     assert len(bench.worker.waiting) <= 2
     (stream,) = bench.intake._pairs
-    assert isinstance(stream, LidarEdgeStream)
-    assert len(stream._looks) <= LOOKS_WAITING
+    assert isinstance(stream, LidarPairStream)
+    assert len(stream._sweep_sets) <= SWEEP_SETS_WAITING
     bench.slow = 1.0
     bench.drive(130.0, 170.0)
-    assert bench.between(EDGE).losses["superseded"] >= 4
-    assert bench.between(EDGE).state == "measured"
+    assert bench.reply_between(EDGE).losses["superseded"] >= 4
+    assert bench.reply_between(EDGE).state == "measured"
 
 
 @pytest.mark.fault("the worker dies of a registration", "the request is refused with words; the next look is taken")
@@ -123,15 +123,15 @@ def test_a_worker_that_fails_is_a_reason_and_no_end(tmp_path: Path) -> None:
     failing = Reason("worker_failed", "The worker was ended by signal 9.")
 
     def answers(rig: LidarRig, stamp_ns: int) -> Answer | Reason:
-        return failing if stamp_ns < 20 * NS else true(rig, stamp_ns)
+        return failing if stamp_ns < 20 * NS else true_registration(rig, stamp_ns)
 
     bench = LidarBench(tmp_path, answers)
     bench.drive(0.0, 30.0)
-    found = bench.between(EDGE)
+    found = bench.reply_between(EDGE)
     assert (found.state, [reason.code for reason in found.reasons]) == ("refused", ["worker_failed"])
     bench.drive(30.0, 60.0)
-    assert bench.between(EDGE).state == "measured"
-    assert bench.between(EDGE).reasons == ()
+    assert bench.reply_between(EDGE).state == "measured"
+    assert bench.reply_between(EDGE).reasons == ()
 
 
 @pytest.mark.fault("two LiDARs see nothing in common", "this is reported, and tried an eighth as often")
@@ -144,10 +144,10 @@ def test_lidars_that_do_not_overlap_are_let_rest(tmp_path: Path) -> None:
 
     bench = LidarBench(tmp_path, answers, lidars=("roof", "bumper"))
     bench.drive(0.0, 15.0 * (2 * RESTS + 5))
-    assert bench.between(EDGE).state == "refused"
+    assert bench.reply_between(EDGE).state == "refused"
     looks = [stamp_ns // (15 * NS) for _, stamp_ns in bench.worker.stamps]
     assert looks == [0, RESTS + 1, 2 * RESTS + 2]
-    rig = bench.told[-1].rig
+    rig = bench.states[-1].rig
     assert rig is not None
     assert EDGE not in rig.graph.edge
 
@@ -158,23 +158,23 @@ def test_sweeps_that_tell_nothing_are_refused_in_words(
 ) -> None:
     bench = LidarBench(tmp_path)
     bench.drive(0.0, 30.0, speed_mps=speed_mps, timed=timed)
-    found = bench.between(EDGE)
+    found = bench.reply_between(EDGE)
     assert (found.state, [reason.code for reason in found.reasons]) == ("refused", [code])
     assert bench.worker.stamps == []
-    assert bench.told[-1].rig is not None
+    assert bench.states[-1].rig is not None
     bench.drive(30.0, 60.0)
-    assert bench.between(EDGE).state == "measured"
+    assert bench.reply_between(EDGE).state == "measured"
 
 
 def test_featureless_ground_is_refused_and_weak_directions_are_not_told(tmp_path: Path) -> None:
     def nothing(rig: LidarRig, stamp_ns: int) -> Answer:
         wide = np.diag([*np.radians([5.0] * 3), 0.5, 0.5, 0.5]) ** 2
-        told = registered(rig, rig.T_a_b_nominal, stamp_ns)
+        told = registration(rig, rig.T_a_b_nominal, stamp_ns)
         return Registered(told.T_a_b, wide, told.range_bias, 0.02, 2000, 0.3, 2, ())
 
     bench = LidarBench(tmp_path, nothing)
     bench.drive(0.0, 30.0)
-    found = bench.between(EDGE)
+    found = bench.reply_between(EDGE)
     assert [reason.code for reason in found.reasons] == ["surroundings_tell_nothing"]
     assert found.looks == 0
 
@@ -185,10 +185,10 @@ def test_what_cannot_be_afforded_is_said(tmp_path: Path) -> None:
         bench.budget.pay(Cost(Kind.REGISTER.value, EDGE, 0.6))
     bench.drive(0.0, 120.0)
     share = bench.budget.report().pairs[EDGE]
-    assert share.look_s == 0.6
+    assert share.check_s == 0.6
     assert share.active
     assert 1 <= len(bench.worker.stamps) < 8
-    assert bench.between(EDGE).losses["not_afforded"] > 0
+    assert bench.reply_between(EDGE).losses["not_afforded"] > 0
 
 
 @pytest.mark.fault("the clock of the sensors steps back", "what was asked before tells nothing after it")
@@ -201,17 +201,17 @@ def test_the_clock_of_the_sensors_steps_back(tmp_path: Path) -> None:
         pair.time_stepped_back(10 * NS)
     bench.slow = 1.0
     bench.drive(10.0, 50.0)
-    found = bench.between(EDGE)
+    found = bench.reply_between(EDGE)
     assert found.losses["time_stepped_back"] == 1
     assert found.measured_ns == 32 * NS
-    assert bench.keeper._order.taken_ns >= 32 * NS + COUNTS_AFTER_NS
+    assert bench.estimator._schedule.taken_ns >= 32 * NS + COUNTS_AFTER_NS
 
 
 def test_edges_outlive_a_restart_and_a_lidar_that_was_knocked_meanwhile_is_named(tmp_path: Path) -> None:
     bench = LidarBench(tmp_path)
     bench.drive(0.0, KNOCKED_S)
-    bench.keeper.finish()
-    bench.keeper._scribe.write_due()
+    bench.estimator.finish()
+    bench.estimator._disk_writer.write_due()
     again = LidarBench(tmp_path, knocked("bumper"))
     again.drive(KNOCKED_S, KNOCKED_S + 60.0)
     assert states(again)["bumper"] == "lidar_moved"

@@ -9,7 +9,7 @@ import pytest
 
 from coec.adapters.ros import outgoing
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.inputs import InputSample
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig, PairConfig
 from coec.runtime.ingest.decoder import CAMERA, Decoder
@@ -44,8 +44,8 @@ class Desk:
         self.losses = LossCounter(logging.getLogger("test"), "front")
         self.decoder = Decoder(CAMERA, PAIR.camera, LimitsConfig(), self.losses)
 
-    def sample(self, attachment: bytes, payload: bytes | None = None, encoding: str = IMAGE) -> Sample:
-        return Sample(payload or image(), encoding, attachment)
+    def sample(self, attachment: bytes, payload: bytes | None = None, encoding: str = IMAGE) -> InputSample:
+        return InputSample(payload or image(), encoding, attachment)
 
     def take(self, attachment: bytes, payload: bytes | None = None, encoding: str = IMAGE) -> CameraFrame | None:
         frame = self.decoder.frame(self.sample(attachment, payload, encoding))

@@ -12,8 +12,8 @@ import pytest
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import outgoing
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import Sample
-from coec.adapters.zenoh.ros_topics import Topics
+from coec.adapters.zenoh.inputs import InputSample
+from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import (
@@ -27,14 +27,14 @@ from coec.config import (
     PairingConfig,
     PointTimeConfig,
 )
-from coec.runtime.api.streams import troubles_of
+from coec.runtime.api.streams import stream_problems
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame
 from coec.runtime.ingest.frame_budget import FrameBudget
 from coec.runtime.ingest.inbox import Call, Inbox, Parcel
 from coec.runtime.ingest.senders import RECENT
 from coec.runtime.ingest.sensor import SensorStream
-from ros_messages import packed, transforms
-from sweeps import ROOF, a_sweep, in_frame
+from ros_messages import packed_cloud, transforms
+from sweeps import ROOF_POSE, sweep_in_frame, turning_sweep
 
 MSGPACK, CDR = "application/msgpack", "application/cdr"
 PAIR = PairConfig(
@@ -67,7 +67,7 @@ class Desk:
         }
 
     def take(self, stream: str, payload: bytes, encoding: str = "zenoh/bytes") -> object:
-        return self.decoders[stream].frame(Sample(payload, encoding))
+        return self.decoders[stream].frame(InputSample(payload, encoding))
 
 
 @pytest.fixture
@@ -102,14 +102,17 @@ def test_clouds_in_another_frame_come_back_to_the_lidars() -> None:
     "refused as `cloud_origin`, and the log says from where it looks measured",
 )
 def test_a_cloud_that_contradicts_its_origin_is_refused(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
-    cloud = replace(in_frame(a_sweep(), ROOF), frame_id="lidar")
+    cloud = replace(sweep_in_frame(turning_sweep(), ROOF_POSE), frame_id="lidar")
     assert desk.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is None
     assert desk.losses.snapshot() == {(LIDAR, "cloud_origin"): 1}
     assert "look as if measured from" in caplog.text
 
 
 def test_where_points_come_from_is_looked_at_once_a_second_and_always_while_it_is_wrong(desk: Desk) -> None:
-    true, moved = replace(a_sweep(), frame_id="lidar"), replace(in_frame(a_sweep(), ROOF), frame_id="lidar")
+    true, moved = (
+        replace(turning_sweep(), frame_id="lidar"),
+        replace(sweep_in_frame(turning_sweep(), ROOF_POSE), frame_id="lidar"),
+    )
 
     def taken(sweep: LidarFrame, stamp_s: float) -> bool:
         stamped = replace(sweep, stamp_ns=round(stamp_s * 1e9))
@@ -124,7 +127,7 @@ def test_where_points_come_from_is_looked_at_once_a_second_and_always_while_it_i
     "refused as `cloud_concatenated`, and the log says from where they look measured",
 )
 def test_a_cloud_of_two_lidars_is_refused(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
-    here, there = a_sweep(1), in_frame(a_sweep(2), ROOF)
+    here, there = turning_sweep(1), sweep_in_frame(turning_sweep(2), ROOF_POSE)
     assert here.ring is not None
     assert there.ring is not None
     xyz_m, ring = np.concatenate([here.xyz_m, there.xyz_m]), np.concatenate([here.ring, there.ring])
@@ -181,17 +184,17 @@ def test_times_that_may_mean_two_things_are_counted_and_the_log_says_what_to_do(
     desk: Desk, caplog: pytest.LogCaptureFixture
 ) -> None:
     columns = [*((axis, "<f4", [1.0, 2.0]) for axis in "xyz"), ("time", "<f4", [0.0, 5.0])]
-    assert desk.take(LIDAR, packed(columns), CDR) is None
+    assert desk.take(LIDAR, packed_cloud(columns), CDR) is None
     assert desk.losses.snapshot() == {(LIDAR, "cloud_time_ambiguous"): 1}
     assert "lidar.time: {field: time, unit: s, base: stamp}" in caplog.text
 
     said = Desk(PAIR.model_copy(update={"lidar": LidarConfig(key="l", time=PointTimeConfig(field="time", unit="ms"))}))
-    frame = said.take(LIDAR, packed(columns), CDR)
+    frame = said.take(LIDAR, packed_cloud(columns), CDR)
     assert isinstance(frame, LidarFrame)
     assert frame.time_offset_s is not None
     assert frame.time_offset_s.tolist() == pytest.approx([0.0, 0.005])
     assert said.decoders[LIDAR].timed_by == "time: float32, ms since the stamp; 0.0 to 5.0 ms, stamped at its begin"
-    assert said.take(LIDAR, packed(columns[:3]), CDR) is None, "a field that was named has to be there"
+    assert said.take(LIDAR, packed_cloud(columns[:3]), CDR) is None, "a field that was named has to be there"
     assert said.losses.snapshot() == {(LIDAR, "cloud_fields"): 1}
 
 
@@ -239,7 +242,7 @@ def test_frames_of_another_sensor_are_not_mixed_in(desk: Desk, odd: CameraFrame)
     counts = desk.decoders[CAMERA].counts()
     assert (None in frames, counts.foreign, counts.taking_turns) == (False, True, ())
     assert {reason for _, reason in desk.losses.snapshot()} <= {"frame_id", "image_size"}
-    (trouble,) = troubles_of({CAMERA: counts}, PAIR, Topics())
+    (trouble,) = stream_problems({CAMERA: counts}, PAIR, RosTopicList())
     assert trouble.code == "foreign_frames"
     for number in range(20, 20 + RECENT):
         desk.take(CAMERA, msgpack_frames.encode_camera(camera(number)), MSGPACK)
@@ -268,7 +271,7 @@ def test_frames_of_two_vehicles_are_not_mixed() -> None:
 
     def put(number: int, stamp_ns: int) -> None:
         frame = replace(camera(number), stamp_ns=stamp_ns)
-        stream.take(Sample(msgpack_frames.encode_camera(frame), MSGPACK), budget)
+        stream.take(InputSample(msgpack_frames.encode_camera(frame), MSGPACK), budget)
 
     for index in range(30):
         put(index, index * 10**8)
@@ -280,7 +283,7 @@ def test_frames_of_two_vehicles_are_not_mixed() -> None:
         put(6971 + index, index * 10**8 + 10**7)
     counts = stream.decoder.counts()
     assert (len(counts.taking_turns), len(used)) == (2, 30)
-    (trouble,) = troubles_of({CAMERA: counts}, PAIR, Topics())
+    (trouble,) = stream_problems({CAMERA: counts}, PAIR, RosTopicList())
     assert (trouble.code, "refused until only one sends" in trouble.text) == ("two_senders", True)
     assert stream.losses.snapshot() == {(CAMERA, "two_senders"): 61}
     for index in range(60, 60 + RECENT + 10):
@@ -296,7 +299,7 @@ def test_a_sensor_that_is_started_again_loses_no_frame() -> None:
     stream.takers = (used.append,)
     for number in (*range(1000, 1030), *range(30)):
         payload = msgpack_frames.encode_camera(replace(camera(number), stamp_ns=5 + len(used)))
-        stream.take(Sample(payload, MSGPACK), FrameBudget(2**30))
+        stream.take(InputSample(payload, MSGPACK), FrameBudget(2**30))
     assert [frame.sequence for frame in used] == [*range(1000, 1030), *range(30)]
     assert stream.losses.snapshot() == {}
 
@@ -331,7 +334,7 @@ def test_samples_are_taken_in_the_order_of_arrival_and_the_oldest_go_first() -> 
     overruns: list[str] = []
     inbox = Inbox({CAMERA: 2, EGO: 8}, 100, lambda parcel: overruns.append(parcel.stream))
     for number, stream in enumerate([CAMERA, EGO, CAMERA, EGO, CAMERA]):
-        inbox.put(stream, Sample(bytes([number]), ""))
+        inbox.put(stream, InputSample(bytes([number]), ""))
     taken = [inbox.take(0.0) for _ in range(5)]
     assert [item.sample.payload[0] for item in taken if isinstance(item, Parcel)] == [1, 2, 3, 4]
     assert taken[-1] is None
@@ -342,10 +345,10 @@ def test_too_many_bytes_take_from_the_stream_that_holds_most() -> None:
     overruns: list[str] = []
     inbox = Inbox({CAMERA: 16, LIDAR: 16, EGO: 16}, 100, lambda parcel: overruns.append(parcel.stream))
     for number in range(3):
-        inbox.put(LIDAR, Sample(bytes([number]) * 20, ""))
-    inbox.put(EGO, Sample(b"e", ""))
+        inbox.put(LIDAR, InputSample(bytes([number]) * 20, ""))
+    inbox.put(EGO, InputSample(b"e", ""))
     for number in range(4):
-        inbox.put(CAMERA, Sample(bytes([number]) * 30, ""))
+        inbox.put(CAMERA, InputSample(bytes([number]) * 30, ""))
     # One camera frame fits beside the three sweeps; of the others each makes room for itself.
     assert overruns == [CAMERA] * 3
     taken = [inbox.take(0.0) for _ in range(6)]
@@ -356,10 +359,10 @@ def test_too_many_bytes_take_from_the_stream_that_holds_most() -> None:
 def test_a_sample_larger_than_all_that_may_wait_is_taken_alone() -> None:
     overruns: list[str] = []
     inbox = Inbox({CAMERA: 16, LIDAR: 16}, 100, lambda parcel: overruns.append(parcel.stream))
-    inbox.put(LIDAR, Sample(b"sweep", ""))
-    inbox.put(CAMERA, Sample(bytes(200), ""))
+    inbox.put(LIDAR, InputSample(b"sweep", ""))
+    inbox.put(CAMERA, InputSample(bytes(200), ""))
     assert overruns == [LIDAR]
-    inbox.put(CAMERA, Sample(b"next", ""))
+    inbox.put(CAMERA, InputSample(b"next", ""))
     assert overruns == [LIDAR, CAMERA]
     taken = inbox.take(0.0)
     assert isinstance(taken, Parcel)
@@ -368,14 +371,14 @@ def test_a_sample_larger_than_all_that_may_wait_is_taken_alone() -> None:
 
 def test_a_call_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
     inbox = Inbox({CAMERA: 2}, 100, lambda _: None)
-    inbox.put(CAMERA, Sample(b"", ""))
+    inbox.put(CAMERA, InputSample(b"", ""))
     inbox.call(lambda: None)
     assert isinstance(inbox.take(0.0), Call)
     assert isinstance(inbox.take(0.0), Parcel)
     got: list[object] = []
     reader = threading.Thread(target=lambda: got.append(inbox.take(60.0)))
     reader.start()
-    inbox.put(CAMERA, Sample(b"x", ""))
+    inbox.put(CAMERA, InputSample(b"x", ""))
     reader.join(20.0)
     assert len(got) == 1
     assert isinstance(got[0], Parcel)
@@ -383,7 +386,7 @@ def test_a_call_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
 
 @pytest.mark.fault("a driver that fills `ring` with one number", "the field is ignored, and the log says so once")
 def test_a_ring_that_tells_no_beams_apart_is_said_once(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
-    sweep = a_sweep()
+    sweep = turning_sweep()
     for number, ring in enumerate((sweep.ring, np.full(len(sweep.xyz_m), 7, np.uint16)) * 3):
         told = replace(sweep, stamp_ns=(1 + 3600 * number) * 10**9, ring=ring)
         assert desk.take(LIDAR, msgpack_frames.encode_lidar(told), MSGPACK) is not None

@@ -114,11 +114,11 @@ def test_a_step_of_time_ends_what_is_open_and_forgets_what_was() -> None:
 def test_silence_ends_an_event() -> None:
     bench = Bench()
     bench.drive(0, 10)
-    bench.ring.look(100.0)
+    bench.ring.tick(100.0)
     bench.ring.event("stale", POSE)
-    bench.ring.look(9.0 + SILENT_S)
+    bench.ring.tick(9.0 + SILENT_S)
     assert bench.delivered == []
-    bench.ring.look(9.1 + SILENT_S)
+    bench.ring.tick(9.1 + SILENT_S)
     assert bench.seconds == [5, 6, 7, 8, 9]
 
 

@@ -15,16 +15,16 @@ import pytest
 
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.inputs import InputSample
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame
 from coec.config import Config, KnownStreamConfig
 from coec.runtime.ingest import pair_stream
-from coec.runtime.ingest.chooser import Chooser, Chosen
+from coec.runtime.ingest.chooser import FrameSelector, SelectionStatistics
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.runtime.ingest.intake import Intake
 from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.ingest.sensor import FRAMES_WAITING, read_alike
-from pair_bench import HEIGHT, WIDTH, configuration
+from pair_bench import HEIGHT, WIDTH, pair_configuration
 
 HZ10_NS = 100_000_000
 BEGIN_NS = 10**18
@@ -34,7 +34,7 @@ MB = 2**20
 
 def rig_of(cameras: int, lidars: int, **limits: int) -> Config:
     """Every camera with every LiDAR, and one ego-motion for all; nobody waits for it."""
-    document = configuration(Path("state")).pairs[0].model_dump(exclude={"ego"}, exclude_none=True)
+    document = pair_configuration(Path("state")).pairs[0].model_dump(exclude={"ego"}, exclude_none=True)
     pairs = [
         {
             **document,
@@ -52,7 +52,7 @@ def rig_of(cameras: int, lidars: int, **limits: int) -> Config:
 class Looks:
     """In place of the chooser: what it was given, and when it ended a slice."""
 
-    chosen: Chosen = field(default_factory=Chosen)
+    statistics: SelectionStatistics = field(default_factory=SelectionStatistics)
     slice_end_ns: int | None = None
     pairs: list[FramePair] = field(default_factory=list)
     ended: list[int] = field(default_factory=list)
@@ -64,7 +64,7 @@ class Looks:
         return self.waits
 
     def choose(self, pair: FramePair) -> None:
-        self.chosen = replace(self.chosen, last_ns=pair.stamp_ns)
+        self.statistics = replace(self.statistics, last_ns=pair.stamp_ns)
         if self.keeps:
             self.pairs.append(pair)
 
@@ -84,20 +84,20 @@ class Vehicle:
         self.streams: dict[str, PairStream] = {}
         for pair in config.pairs:
             self.join(pair.name)
-        self.heard: dict[str, Callable[[Sample], None]] = {}
+        self.heard: dict[str, Callable[[InputSample], None]] = {}
         self.listen()
 
     def join(self, name: str) -> None:
         (pair,) = [one for one in self.config.pairs if one.name == name]
         self.looks[name] = Looks()
         losses = LossCounter(logging.getLogger("test"), name)
-        chooser = cast("Chooser", self.looks[name])
+        chooser = cast("FrameSelector", self.looks[name])
         self.streams[name] = PairStream(pair, self.config, self.intake, chooser, lambda: True, losses)
 
     def listen(self) -> list[str]:
         subscribed: list[str] = []
 
-        def subscribe(stream: KnownStreamConfig, take: Callable[[Sample], None]) -> None:
+        def subscribe(stream: KnownStreamConfig, take: Callable[[InputSample], None]) -> None:
             subscribed.append(stream.place)
             self.heard[stream.place] = take
 
@@ -114,13 +114,13 @@ class Vehicle:
                 payload = encode_ego(frame)
             case bytes():
                 payload = frame
-        self.heard[key](Sample(payload, ENCODING))
+        self.heard[key](InputSample(payload, ENCODING))
 
     def settle(self) -> None:
         while self.intake.turn(0.0):
             pass
         for stream in self.streams.values():
-            stream.tell()
+            stream.renew_report()
 
     def drive(self, numbers: Sequence[int], cameras: int, lidars: int) -> None:
         for number in numbers:

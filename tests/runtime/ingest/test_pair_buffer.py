@@ -31,7 +31,7 @@ def test_the_oldest_goes_first_and_waits_for_so_many_seconds_and_bytes() -> None
     assert not held.has_waited(100.0)
     assert not held.has_waited(110.0)
     assert held.has_waited(110.5)
-    held.may_go()
+    held.stop_waiting()
     assert not held.has_waited(111.0)
     held.add(pair(4))
     assert held.has_waited(111.0)

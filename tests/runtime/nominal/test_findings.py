@@ -9,15 +9,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.ros.camera_info import Info
-from coec.adapters.ros.static_transforms import Joint, StaticTransforms
+from coec.adapters.ros.camera_info import CameraInfoContent
+from coec.adapters.ros.static_transforms import StaticTransform, StaticTransforms
 from coec.config import OpenPairConfig
 from coec.geometry import se3
-from coec.runtime.nominal.findings import Found, Heard, Image, changed, found_of, info_topic_of, needs_transforms
+from coec.runtime.nominal.findings import (
+    DiscoveredPair,
+    ReceivedImage,
+    ReceivedMetadata,
+    change_since,
+    discover,
+    info_topic_of,
+    needs_transforms,
+)
 
 EYE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 K = (50.0, 0.0, 31.5, 0.0, 51.0, 23.5, 0.0, 0.0, 1.0)
-INFO = Info("cam", (64, 48), "plumb_bob", (), K, EYE, (0.0,) * 12, (1, 1), (0, 0, 0, 0))
+INFO = CameraInfoContent("cam", (64, 48), "plumb_bob", (), K, EYE, (0.0,) * 12, (1, 1), (0, 0, 0, 0))
 
 T_BASE_CAMERA = se3.exp(np.array([1.2, -1.2, 1.2, 1.5, 0.0, 1.4]))
 T_BASE_TOP = se3.exp(np.array([0.0, 0.0, 0.3, 1.0, 0.0, 1.9]))
@@ -28,29 +36,33 @@ def pair(**of: Any) -> OpenPairConfig:
     return OpenPairConfig.model_validate({"name": "front", "camera": "/front/image_raw", "points": "/top/points", **of})
 
 
-def heard(**of: Any) -> Heard:
-    given: dict[str, Any] = {"image": Image("cam", 64, 48), "cloud": "top", "ego": "base", "info": INFO}
-    return Heard(**given | of)
+def heard(**of: Any) -> ReceivedMetadata:
+    given: dict[str, Any] = {"image": ReceivedImage("cam", 64, 48), "cloud": "top", "ego": "base", "info": INFO}
+    return ReceivedMetadata(**given | of)
 
 
 def tree(*joints: tuple[str, str, NDArray[np.float64]]) -> StaticTransforms:
     transforms = StaticTransforms()
-    transforms.take(tuple(Joint(*joint) for joint in joints))
+    transforms.add(tuple(StaticTransform(*joint) for joint in joints))
     return transforms
 
 
 VEHICLE = (("base", "cam", T_BASE_CAMERA), ("base", "top", T_BASE_TOP))
 
 
-def found(asked: OpenPairConfig, told: Heard | None = None, transforms: StaticTransforms | None = None) -> Found:
-    result = found_of(asked, told or heard(), transforms or tree(*VEHICLE))
-    assert isinstance(result, Found), result
+def found(
+    asked: OpenPairConfig, told: ReceivedMetadata | None = None, transforms: StaticTransforms | None = None
+) -> DiscoveredPair:
+    result = discover(asked, told or heard(), transforms or tree(*VEHICLE))
+    assert isinstance(result, DiscoveredPair), result
     return result
 
 
-def missing(asked: OpenPairConfig, told: Heard | None = None, transforms: StaticTransforms | None = None) -> list[str]:
-    result = found_of(asked, told or heard(), tree(*VEHICLE) if transforms is None else transforms)
-    assert not isinstance(result, Found)
+def missing(
+    asked: OpenPairConfig, told: ReceivedMetadata | None = None, transforms: StaticTransforms | None = None
+) -> list[str]:
+    result = discover(asked, told or heard(), tree(*VEHICLE) if transforms is None else transforms)
+    assert not isinstance(result, DiscoveredPair)
     return [reason.code for reason in result]
 
 
@@ -99,7 +111,7 @@ def test_rectified_images_take_their_own_matrix() -> None:
 @pytest.mark.parametrize(
     ("told", "joints", "codes"),
     [
-        (Heard(), (), ["no_camera_info", "no_image", "no_cloud"]),
+        (ReceivedMetadata(), (), ["no_camera_info", "no_image", "no_cloud"]),
         (heard(info=None), VEHICLE, ["no_camera_info"]),
         (heard(image=None), VEHICLE, ["no_image"]),
         (heard(cloud=None), VEHICLE, ["no_cloud"]),
@@ -107,22 +119,22 @@ def test_rectified_images_take_their_own_matrix() -> None:
         (heard(), (), ["tf_static", "tf_static"]),
         (heard(), VEHICLE[:1], ["tf_static", "tf_static"]),
         (heard(), (*VEHICLE, ("roof", "top", T_BASE_TOP)), ["tf_static_no_tree", "tf_static_no_tree"]),
-        (heard(image=Image("cam", 64, 40)), VEHICLE, ["camera_info_size"]),
-        (heard(image=Image("", 64, 48)), VEHICLE, ["no_frame_id"]),
+        (heard(image=ReceivedImage("cam", 64, 40)), VEHICLE, ["camera_info_size"]),
+        (heard(image=ReceivedImage("", 64, 48)), VEHICLE, ["no_frame_id"]),
         (heard(cloud=""), VEHICLE, ["no_frame_id"]),
         (heard(info=replace(INFO, k=(0.0,) * 9)), VEHICLE, ["camera_info_refused"]),
         (heard(refused={"info": "message_malformed"}), VEHICLE, ["camera_info_refused"]),
     ],
 )
-def test_what_is_missing_is_said(told: Heard, joints: Any, codes: list[str]) -> None:
+def test_what_is_missing_is_said(told: ReceivedMetadata, joints: Any, codes: list[str]) -> None:
     assert missing(pair(ego="/odometry"), told, tree(*joints)) == codes
 
 
 def test_the_frames_that_are_there_are_listed_and_no_others_words() -> None:
     joints = [("base", f"f{index}", np.eye(4)) for index in range(40)]
     transforms = tree(*joints, ("base", "\x1b[2Jevil", np.eye(4)))
-    result = found_of(pair(), heard(cloud="\x1b[31m"), transforms)
-    assert not isinstance(result, Found)
+    result = discover(pair(), heard(cloud="\x1b[31m"), transforms)
+    assert not isinstance(result, DiscoveredPair)
     (text,) = (reason.text for reason in result)
     assert "'cam' and (a frame whose name is not plain)" in text
     assert "there are base, f0" in text
@@ -134,15 +146,15 @@ def test_the_frames_that_are_there_are_listed_and_no_others_words() -> None:
 def test_what_the_bus_says_otherwise_is_told() -> None:
     asked, told = pair(ego="/odometry"), heard()
     built = found(asked, told)
-    assert changed(built, asked, told, tree(*VEHICLE)) is None
-    assert changed(built, asked, Heard(), StaticTransforms()) is None, "silence says nothing"
+    assert change_since(built, asked, told, tree(*VEHICLE)) is None
+    assert change_since(built, asked, ReceivedMetadata(), StaticTransforms()) is None, "silence says nothing"
     moved = tree(VEHICLE[0], ("base", "top", se3.perturb(T_BASE_TOP, np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]))))
-    reason = changed(built, asked, told, moved)
+    reason = change_since(built, asked, told, moved)
     assert reason is not None
     assert reason.code == "nominal_changed"
     assert "/tf_static, for T_camera_lidar" in reason.text
     assert "CameraInfo" not in reason.text
     for other in (replace(INFO, k=(50.1, *K[1:])), replace(INFO, k=(0.0,) * 9)):
-        reason = changed(built, asked, heard(info=other), tree(*VEHICLE))
+        reason = change_since(built, asked, heard(info=other), tree(*VEHICLE))
         assert reason is not None
         assert "CameraInfo on /front/camera_info" in reason.text

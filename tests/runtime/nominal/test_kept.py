@@ -9,8 +9,8 @@ import pytest
 
 from coec.adapters.files.state_file import StateFile
 from coec.config import Config, PairConfig
-from coec.runtime.nominal.findings import Found
-from coec.runtime.nominal.kept import NOMINAL_FILE, KeptNominals, completed
+from coec.runtime.nominal.findings import DiscoveredPair
+from coec.runtime.nominal.kept import NOMINAL_FILE, DiscoveryStore, completed
 
 INTRINSICS = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0}
 TRANSFORM = [[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, 1 / 3], [1.0, 0.0, 0.0, -0.7], [0.0, 0.0, 0.0, 1.0]]
@@ -22,26 +22,28 @@ def configured(ros: dict[str, Any] | None = None, **of: Any) -> Config:
     return Config.model_validate({"middleware": "rmw_zenoh", "ros": ros or {}, "pairs": [pair]})
 
 
-def found() -> Found:
+def found() -> DiscoveredPair:
     document = {
         "name": "front",
         "camera": {"topic": "/front/image", "frame_id": "cam", "intrinsics": INTRINSICS},
         "lidar": {"topic": "/top/points", "frame_id": "top"},
         "T_camera_lidar": TRANSFORM,
     }
-    return Found(PairConfig.model_validate(document), {"T_camera_lidar": "/tf_static, between 'cam' and 'top'"})
+    return DiscoveredPair(
+        PairConfig.model_validate(document), {"T_camera_lidar": "/tf_static, between 'cam' and 'top'"}
+    )
 
 
 def keep(folder: Path, config: Config) -> None:
-    kept = KeptNominals(folder)
-    kept.keep(found(), config.awaited[0], config, 1_700_000_000 * 10**9)
+    kept = DiscoveryStore(folder)
+    kept.update(found(), config.awaited[0], config, 1_700_000_000 * 10**9)
     kept.flush()
 
 
 def test_a_restart_has_the_same_to_the_bit_and_says_since_when(tmp_path: Path) -> None:
     config = configured()
     keep(tmp_path, config)
-    again = KeptNominals(tmp_path).found(config)["front"]
+    again = DiscoveryStore(tmp_path).load(config)["front"]
     assert again.pair == found().pair
     assert again.origins["T_camera_lidar"].endswith("kept since 2023-11-14 22:13:20 UTC")
     whole = completed(config, {"front": again.pair})
@@ -53,7 +55,7 @@ def test_other_settings_are_taken_and_other_questions_are_not_answered(tmp_path:
     keep(tmp_path, configured())
     lidar = {"topic": "/top/points", "sweep": {"period_s": 0.05}}
     other = configured(window={"pairs": 12, "min_pairs": 4}, points=None, lidar=lidar)
-    again = KeptNominals(tmp_path).found(other)["front"].pair
+    again = DiscoveryStore(tmp_path).load(other)["front"].pair
     assert again.window.pairs == 12
     assert again.lidar.sweep is not None
     assert again.T_camera_lidar == found().pair.T_camera_lidar
@@ -64,7 +66,7 @@ def test_other_settings_are_taken_and_other_questions_are_not_answered(tmp_path:
         configured(ego="/odometry"),
         configured(ros={"domain": 7}),
     ):
-        assert KeptNominals(tmp_path).found(asked) == {}
+        assert DiscoveryStore(tmp_path).load(asked) == {}
 
 
 @pytest.mark.parametrize("damage", [b"", b"{}", b"\x00" * 100, b'{"body":{"pairs":{"front":{}}}}'])
@@ -72,11 +74,11 @@ def test_what_is_damaged_is_searched_anew(tmp_path: Path, damage: bytes) -> None
     config = configured()
     keep(tmp_path, config)
     (tmp_path / NOMINAL_FILE).write_bytes(damage)
-    kept = KeptNominals(tmp_path)
-    assert kept.found(config) == {}
-    kept.keep(found(), config.awaited[0], config, 5)
+    kept = DiscoveryStore(tmp_path)
+    assert kept.load(config) == {}
+    kept.update(found(), config.awaited[0], config, 5)
     kept.flush()
-    assert KeptNominals(tmp_path).found(config)["front"].pair == found().pair
+    assert DiscoveryStore(tmp_path).load(config)["front"].pair == found().pair
 
 
 @pytest.mark.fault("a kept nominal calibration with settings that only another version has", "it is used all the same")
@@ -91,7 +93,7 @@ def test_settings_of_another_version_beside_what_was_found_are_ignored(tmp_path:
     pair["camera"]["shutter"] = "rolling"
     del pair["monitor"]
     file.save(body)
-    kept = KeptNominals(tmp_path)
-    assert kept.found(config)["front"].pair == found().pair
+    kept = DiscoveryStore(tmp_path)
+    assert kept.load(config)["front"].pair == found().pair
     kept.flush()
     assert StateFile(tmp_path / NOMINAL_FILE).load().body == body

@@ -9,19 +9,19 @@ import pytest
 from numpy.typing import NDArray
 from rosbags.typesys.stores import ros2_humble as ros
 
-from bags import STORE, a_joint, an_info
+from bags import STORE, camera_info_message, transform_message
 from coec.adapters.ros import messages
-from coec.adapters.zenoh.inputs import CDR, Sample
+from coec.adapters.zenoh.inputs import CDR, InputSample
 from coec.calibration.types import Reason
 from coec.config import Config
 from coec.geometry import se3
 from coec.runtime.ingest.decoder import CAMERA, LIDAR
-from coec.runtime.nominal.findings import Found
-from coec.runtime.nominal.watch import TRANSFORMS_A_TURN, TRANSFORMS_WAITING, NominalWatch
-from ros_messages import compressed, packed
+from coec.runtime.nominal.findings import DiscoveredPair
+from coec.runtime.nominal.watch import TRANSFORMS_A_TURN, TRANSFORMS_WAITING, DiscoveryListener
+from ros_messages import compressed_image, packed_cloud
 
 T_BASE_TOP = se3.exp(np.array([0.0, 0.0, 0.3, 1.0, 0.0, 1.9]))
-CLOUD = packed([("x", "<f4", [1.0, 2.0]), ("y", "<f4", [0.0, 1.0]), ("z", "<f4", [0.0, 1.0])])
+CLOUD = packed_cloud([("x", "<f4", [1.0, 2.0]), ("y", "<f4", [0.0, 1.0]), ("z", "<f4", [0.0, 1.0])])
 
 CONFIG = Config.model_validate(
     {
@@ -32,22 +32,22 @@ CONFIG = Config.model_validate(
 
 
 def transforms_of(*joints: tuple[str, str, NDArray[np.float64]]) -> bytes:
-    message = ros.tf2_msgs__msg__TFMessage([a_joint(*joint) for joint in joints])
+    message = ros.tf2_msgs__msg__TFMessage([transform_message(*joint) for joint in joints])
     return bytes(STORE.serialize_cdr(message, "tf2_msgs/msg/TFMessage"))
 
 
-def cdr(payload: bytes, type_name: str) -> Sample:
-    return Sample(payload, f"{CDR};{type_name}")
+def cdr(payload: bytes, type_name: str) -> InputSample:
+    return InputSample(payload, f"{CDR};{type_name}")
 
 
-IMAGE = cdr(compressed(), messages.COMPRESSED_IMAGE)
+IMAGE = cdr(compressed_image(), messages.COMPRESSED_IMAGE)
 POINTS = cdr(CLOUD, messages.POINT_CLOUD)
-INFO = cdr(messages.serialized(an_info("plumb_bob", []), messages.CAMERA_INFO), messages.CAMERA_INFO)
+INFO = cdr(messages.serialized(camera_info_message("plumb_bob", []), messages.CAMERA_INFO), messages.CAMERA_INFO)
 TREE = cdr(transforms_of(("camera", "lidar", T_BASE_TOP)), messages.TF)
 
 
-def heard_all() -> NominalWatch:
-    watch = NominalWatch(CONFIG, {})
+def heard_all() -> DiscoveryListener:
+    watch = DiscoveryListener(CONFIG, {})
     watch.take_frame("front", CAMERA, IMAGE)
     watch.take_frame("front", LIDAR, POINTS)
     watch.take_info("front", INFO)
@@ -55,30 +55,30 @@ def heard_all() -> NominalWatch:
     return watch
 
 
-def codes(watch: NominalWatch) -> list[str]:
+def codes(watch: DiscoveryListener) -> list[str]:
     return [reason.code for reason in watch.nominal("front").awaits]
 
 
 def test_in_any_order_a_pair_is_ready_once() -> None:
-    watch = NominalWatch(CONFIG, {})
+    watch = DiscoveryListener(CONFIG, {})
     assert codes(watch) == ["no_look_yet"]
-    watch.look()
+    watch.update()
     assert codes(watch) == ["no_camera_info", "no_image", "no_cloud"]
     watch.take_transforms(TREE)
     watch.take_info("front", INFO)
-    watch.look()
+    watch.update()
     assert codes(watch) == ["no_image", "no_cloud"]
     watch.take_frame("front", LIDAR, POINTS)
     watch.take_frame("front", CAMERA, IMAGE)
-    watch.look()
+    watch.update()
     assert codes(watch) == ["being_built"]
     ready = watch.ready()
     assert list(ready) == ["front"]
     watch.take_info("front", INFO)
-    watch.look()
+    watch.update()
     assert watch.ready() == {}
     watch.end("front", ready["front"])
-    watch.look()
+    watch.update()
     assert watch.nominal("front").awaits == ()
     assert set(watch.nominal("front").origins) == {
         "camera.intrinsics", "camera.frame_id", "lidar.frame_id", "T_camera_lidar",
@@ -87,59 +87,59 @@ def test_in_any_order_a_pair_is_ready_once() -> None:
 
 def test_what_cannot_be_built_is_awaited_until_something_else_is_heard() -> None:
     watch = heard_all()
-    watch.look()
+    watch.update()
     watch.ready()
     watch.end("front", Reason("cannot_be_built", "No."))
-    watch.look()
+    watch.update()
     assert codes(watch) == ["cannot_be_built"]
     watch.take_info("front", INFO)
-    watch.look()
+    watch.update()
     assert (codes(watch), watch.ready()) == (["cannot_be_built"], {})
     watch.take_transforms(cdr(transforms_of(("camera", "lidar", np.eye(4))), messages.TF))
-    watch.look()
+    watch.update()
     assert codes(watch) == ["being_built"]
     np.testing.assert_array_equal(watch.ready()["front"].pair.T_camera_lidar, np.eye(4))
 
 
 def test_what_changes_after_it_was_built_is_told_and_changes_nothing() -> None:
     watch = heard_all()
-    watch.look()
+    watch.update()
     found = watch.ready()["front"]
     watch.end("front", found)
-    watch.look()
+    watch.update()
     watch.take_transforms(cdr(transforms_of(("camera", "lidar", np.eye(4))), messages.TF))
-    watch.look()
+    watch.update()
     changed = watch.nominal("front").changed
     assert changed is not None
     assert watch.ready() == {}
     watch.take_transforms(TREE)
-    watch.look()
+    watch.update()
     assert watch.nominal("front").changed is None
 
 
 def test_a_pair_that_was_found_before_the_start_is_only_watched() -> None:
     first = heard_all()
-    first.look()
+    first.update()
     earlier = first.ready()
-    watch = NominalWatch(CONFIG, earlier)
+    watch = DiscoveryListener(CONFIG, earlier)
     assert watch.nominal("front").awaits == ()
     watch.take_frame("front", CAMERA, cdr(b"nonsense", messages.COMPRESSED_IMAGE))
-    watch.look()
+    watch.update()
     assert (watch.ready(), watch.nominal("front").losses) == ({}, {})
-    assert isinstance(earlier["front"], Found)
+    assert isinstance(earlier["front"], DiscoveredPair)
 
 
 @pytest.mark.fault("rubbish on /tf_static, CameraInfo, images and clouds while a pair is awaited", "counted by cause")
 def test_rubbish_is_counted_by_its_cause_and_what_comes_after_it_is_taken() -> None:
-    watch = NominalWatch(CONFIG, {})
+    watch = DiscoveryListener(CONFIG, {})
     for rubbish in (b"", b"\x00\x01\x00\x00", bytes(100), b"\xff" * 1000):
         watch.take_transforms(cdr(rubbish, messages.TF))
         watch.take_info("front", cdr(rubbish, messages.CAMERA_INFO))
         watch.take_frame("front", CAMERA, cdr(rubbish, messages.COMPRESSED_IMAGE))
         watch.take_frame("front", LIDAR, cdr(rubbish, messages.POINT_CLOUD))
-        watch.look()
+        watch.update()
     watch.take_info("front", cdr(CLOUD, messages.POINT_CLOUD))
-    watch.look()
+    watch.update()
     assert codes(watch) == ["camera_info_refused", "no_image", "no_cloud"]
     losses = watch.nominal("front").losses
     assert (losses["tf_static_message_malformed"], losses["info_wrong_type"]) == (4, 1)
@@ -148,14 +148,14 @@ def test_rubbish_is_counted_by_its_cause_and_what_comes_after_it_is_taken() -> N
     watch.take_info("front", INFO)
     watch.take_frame("front", CAMERA, IMAGE)
     watch.take_frame("front", LIDAR, POINTS)
-    watch.look()
+    watch.update()
     assert codes(watch) == ["being_built"]
 
 
 @pytest.mark.fault("messages of 32 MB on /tf_static and CameraInfo", "none is kept; they are counted by cause")
 def test_messages_larger_than_any_are_not_kept() -> None:
     watch = heard_all()
-    watch.look()
+    watch.update()
     watch.ready()
     tracemalloc.start()
     for _ in range(100):
@@ -165,7 +165,7 @@ def test_messages_larger_than_any_are_not_kept() -> None:
     held_bytes, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert held_bytes < 20 * 2**20
-    watch.look()
+    watch.update()
     losses = watch.nominal("front").losses
     assert (losses["tf_static_message_too_large"], losses["tf_static_overrun"]) == (100, 92)
     assert losses["info_message_too_large"] == 1
@@ -179,8 +179,8 @@ def test_a_decoder_that_fails_costs_its_sample(monkeypatch: pytest.MonkeyPatch) 
     watch = heard_all()
     with monkeypatch.context() as patched:
         patched.setattr("coec.runtime.ingest.decoder.SampleReader.frame", broken)
-        patched.setattr("coec.runtime.nominal.watch.decode_joints", broken)
-        watch.look()
+        patched.setattr("coec.runtime.nominal.watch.decode_static_transforms", broken)
+        watch.update()
     assert codes(watch) == ["no_image", "no_cloud"]
     assert watch.nominal("front").losses == {
         "camera_decoder_fault": 1, "lidar_decoder_fault": 1, "tf_static_decoder_fault": 1,
@@ -194,6 +194,6 @@ def test_a_flood_of_transforms_is_bounded_and_the_newest_count() -> None:
         watch.take_transforms(cdr(transforms_of((f"p{step}", f"c{step}", np.eye(4))), messages.TF))
     watch.take_transforms(TREE)
     for _ in range(TRANSFORMS_WAITING // TRANSFORMS_A_TURN):
-        watch.look()
+        watch.update()
     assert watch.nominal("front").losses == {"tf_static_overrun": 2 * TRANSFORMS_WAITING + 2}
     assert codes(watch) == ["being_built"]

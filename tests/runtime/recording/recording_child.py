@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from coec.adapters.system.logs import LossCounter
-from coec.calibration.frames.window import SliceEnded
+from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
@@ -65,8 +65,8 @@ def run(folder: Path, life: int) -> None:
         pairs = [pair(begin_ns + index) for index in range(PAIRS)]
         for one in pairs:
             recorder.add(name, one, NOMINAL)
-        recorder.end(SliceEnded(name, PAIRS, True))
-        beside.give(
+        recorder.end(SliceClosed(name, PAIRS, True))
+        beside.submit(
             Snippet("suspect", begin_ns, NOMINAL, tuple(frame for one in pairs for frame in (one.lidar, one.camera)))
         )
         wait_until(lambda: len(ended) > before, "the end of the window")  # noqa: B023 - called at once

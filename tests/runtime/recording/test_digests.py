@@ -51,7 +51,7 @@ def sha256(path: Path) -> str:
 def test_every_window_is_read_in_pieces_the_latest_first(store: WindowStore) -> None:
     paths = [put(store, number) for number in (1, 2, 3)]
     reader = DigestReader(store, "front")
-    store.look()
+    store.scan()
     for _ in range(4):  # three pieces, and the end
         assert digests(store)["front-3"] is None
         assert reader.read(PIECE)
@@ -127,7 +127,7 @@ def test_on_a_slow_disk_a_round_is_short_and_the_list_is_there_at_once(
     monkeypatch.setattr(Path, "open", lambda path, mode="r": Slow(cast(BinaryIO, real(path, mode))))
     reader = DigestReader(store, "front", lambda: now_s[0])
     longest_s = 0.0
-    store.look()
+    store.scan()
     while True:
         before_s, told = now_s[0], digests(store)
         if not reader.read(4 * 2**20):

@@ -13,7 +13,7 @@ import pytest
 
 from coec.adapters.mcap.windows import read_window
 from coec.adapters.system.logs import LossCounter
-from coec.calibration.frames.window import SliceEnded
+from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
@@ -58,7 +58,7 @@ class Life:
         name, before = f"front-{start_ns}", len(self.recorded) + len(self.lost)
         for stamp_ns in range(start_ns, start_ns + 3):
             self.recorder.add(name, pair(stamp_ns), NOMINAL)
-        self.recorder.end(SliceEnded(name, 3, True))
+        self.recorder.end(SliceClosed(name, 3, True))
         wait_until(lambda: len(self.recorded) + len(self.lost) > before, "the end of the window")
         return name in self.recorded
 
@@ -91,10 +91,10 @@ def test_a_disk_that_refuses_at_any_point_costs_that_window_only(
             disk.refuses = range(first, first + length)
             whole = life.window(10)
             refused = disk.operations > first
-            trouble = life.recorder.trouble
+            trouble = life.recorder.problem
             disk.refuses = ()
             assert life.window(50), f"the next window, after operation {first}"
-            assert life.recorder.trouble is None
+            assert life.recorder.problem is None
             life.stop()
         assert whole or (trouble is not None and os.strerror(error) in trouble.text)
         assert whole or not refused or life.losses.snapshot()["window", "recording_failed"] == 1

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 
 from coec.adapters.mcap.windows import WindowWriter, read_window
 from coec.adapters.system.logs import LossCounter
-from coec.calibration.frames.window import KeptPairs, SliceEnded
+from coec.calibration.frames.window import CarriedOverPairs, SliceClosed
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, StateConfig
 from coec.errors import RecordingError
@@ -87,7 +87,7 @@ class Bench:
     def window(self, name: str, stamps: list[int]) -> None:
         for stamp_ns in stamps:
             self.recorder.add(name, pair(stamp_ns), NOMINAL)
-        self.recorder.end(SliceEnded(name, len(stamps), len(stamps) >= MIN_PAIRS))
+        self.recorder.end(SliceClosed(name, len(stamps), len(stamps) >= MIN_PAIRS))
 
     def files(self) -> list[str]:
         return sorted(path.name for path in self.store.path("x").parent.iterdir())
@@ -115,9 +115,9 @@ def test_a_window_is_written_and_reported(bench: Bench) -> None:
 def test_a_window_is_calibrated_by_what_held_when_it_began(bench: Bench) -> None:
     later = CalibrationConfig(motion_compensation=False)
     bench.recorder.add("front-10", pair(10), NOMINAL)
-    bench.recorder.use(later)
+    bench.recorder.reconfigure(later)
     bench.recorder.add("front-10", pair(20), NOMINAL)
-    bench.recorder.end(SliceEnded("front-10", 2, True))
+    bench.recorder.end(SliceClosed("front-10", 2, True))
     bench.window("front-30", [30, 40])
     with bench.running():
         paths = [bench.recorded.get(timeout=DEADLINE_S)[1] for _ in range(2)]
@@ -160,11 +160,11 @@ def test_too_few_pairs_leave_no_file(bench: Bench) -> None:
 
 
 def test_a_window_takes_what_an_earlier_one_keeps_for_it_from_the_disk(bench: Bench) -> None:
-    kept = KeptPairs("front-10", 20, 30, 2)
+    kept = CarriedOverPairs("front-10", 20, 30, 2)
     with bench.running():
         bench.window("front-10", [10, 20, 30])
         bench.recorder.add("front-50", pair(50), NOMINAL)
-        bench.recorder.end(SliceEnded("front-50", 3, True, kept))
+        bench.recorder.end(SliceClosed("front-50", 3, True, kept))
         names = [bench.recorded.get(timeout=DEADLINE_S)[0] for _ in range(2)]
         assert names == ["front-10", "front-50"]
     window, _ = read_window(bench.store.path("front-50"))
@@ -179,10 +179,10 @@ def test_pairs_between_are_recorded_beside_those_of_the_open_window_and_do_not_c
         bench.recorder.add_between("front-10", pair(15))
         bench.recorder.add("front-10", pair(20), NOMINAL)
         bench.recorder.add_between("front-10", pair(25))
-        bench.recorder.end(SliceEnded("front-10", 2, True))
+        bench.recorder.end(SliceClosed("front-10", 2, True))
         bench.recorder.add("front-40", pair(40), NOMINAL)
         bench.recorder.add_between("front-40", pair(45))
-        bench.recorder.end(SliceEnded("front-40", 1, False))
+        bench.recorder.end(SliceClosed("front-40", 1, False))
         assert bench.recorded.get(timeout=DEADLINE_S)[0] == "front-10"
     window, _ = read_window(bench.store.path("front-10"))
     assert [one.stamp_ns for one in window.pairs] == [10, 20]
@@ -198,7 +198,7 @@ def test_kept_pairs_that_are_gone_are_counted_and_cost_no_window(bench: Bench) -
         for name, stamps in (("front-50", [50, 60]), ("front-70", [70])):
             for stamp_ns in stamps:
                 bench.recorder.add(name, pair(stamp_ns), NOMINAL)
-            bench.recorder.end(SliceEnded(name, len(stamps) + 3, True, KeptPairs("front-10", 20, 30, 3)))
+            bench.recorder.end(SliceClosed(name, len(stamps) + 3, True, CarriedOverPairs("front-10", 20, 30, 3)))
         assert bench.recorded.get(timeout=DEADLINE_S)[0] == "front-50"
     assert bench.files() == ["front-50.mcap"]
     assert bench.lost == ["front-70"], "without them it is none"
@@ -240,7 +240,7 @@ def test_pairs_between_take_no_place_of_those_of_a_window_in_the_queue(bench: Be
     bench.recorder.add_between("front-1", pair(100))
     assert bench.losses.snapshot() == {("window", "recorder_overrun"): 1}
     bench.recorder.add("front-1", pair(200), NOMINAL)
-    bench.recorder.end(SliceEnded("front-1", 2, True))
+    bench.recorder.end(SliceClosed("front-1", 2, True))
     with bench.running():
         _, path, _ = bench.recorded.get(timeout=DEADLINE_S)
         assert bench.recorder.has_room
@@ -261,12 +261,12 @@ def test_a_full_disk_costs_one_window_and_the_next_is_tried(bench: Bench, monkey
     monkeypatch.setattr(WindowWriter, "add", failing)
     with bench.running() as recorder:
         bench.window("front-10", [10, 20, 30])
-        wait_until(lambda: recorder.trouble is not None, "the trouble")
-        assert recorder.trouble is not None
-        assert "no space left" in recorder.trouble.text
+        wait_until(lambda: recorder.problem is not None, "the trouble")
+        assert recorder.problem is not None
+        assert "no space left" in recorder.problem.text
         bench.window("front-50", [50, 60])
         assert bench.recorded.get(timeout=DEADLINE_S)[0] == "front-50"
-        assert recorder.trouble is None
+        assert recorder.problem is None
     assert bench.losses.snapshot() == {("window", "recording_failed"): 1}
     assert bench.files() == ["front-50.mcap"]
     assert bench.lost == ["front-10"]
@@ -323,14 +323,14 @@ def test_trouble_is_told_in_the_words_of_the_disk_until_what_follows_can_be_writ
         monkeypatch.setattr(os, "fdatasync", refusing)
         bench.window("front-10", [10, 20])
         wait_until(lambda: bench.lost == ["front-10"], "the loss")
-        assert recorder.trouble is not None
-        assert recorder.trouble.code == "recording_failed"
-        assert "Input/output error" in recorder.trouble.text
+        assert recorder.problem is not None
+        assert recorder.problem.code == "recording_failed"
+        assert "Input/output error" in recorder.problem.text
         assert bench.files() == []
         monkeypatch.setattr(os, "fdatasync", real)
         bench.window("front-50", [50])  # too short to be kept, but what there was of it went to the disk
         wait_until(lambda: bench.lost == ["front-10", "front-50"], "the end of the second window")
-        assert recorder.trouble is None
+        assert recorder.problem is None
 
 
 def test_a_window_cannot_be_removed_while_it_is_handed_over(tmp_path: Path) -> None:
@@ -367,7 +367,7 @@ def test_windows_that_nobody_reported_are_read_beside_the_work(tmp_path: Path) -
         writer.add(pair(start, points=600_000))  # more than is read in one round
         writer.finish()
     bench = Bench(store)
-    store.look()
+    store.scan()
     assert [info.sha256 for info in store.listing("front")] == [None, None]
     with bench.running():
         wait_until(lambda: not store.unread("front"), "the digests")
@@ -390,9 +390,9 @@ def test_a_stop_does_not_wait_for_windows_that_are_being_read(tmp_path: Path) ->
 @pytest.mark.fault("a disk that never lets go of the recorder", "this is reported, and the stop goes on")
 def test_a_thread_that_the_disk_does_not_let_go_is_told(tmp_path: Path) -> None:
     recorder = Bench(store_of(tmp_path)).recorder
-    assert recorder.trouble is None
+    assert recorder.problem is None
     recorder.thread._beat_s -= STUCK_S + 1.0  # since the last sign of life
-    assert recorder.trouble is not None
-    assert (recorder.trouble.code, "3 s" in recorder.trouble.text) == ("recording_stuck", True)
+    assert recorder.problem is not None
+    assert (recorder.problem.code, "3 s" in recorder.problem.text) == ("recording_stuck", True)
     recorder.thread.beat()
-    assert recorder.trouble is None
+    assert recorder.problem is None

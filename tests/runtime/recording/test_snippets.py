@@ -26,7 +26,7 @@ from coec.runtime.recording.snippets import SnippetRecorder
 from coec.sources.bag.recording import open_bag
 from coec.sources.spec import parse_spec
 from disks import FullDisk
-from readers import opened
+from readers import read_recording
 
 S = 1_000_000_000
 BEGIN_NS = 1_700_000_000 * S
@@ -65,7 +65,7 @@ class Bench:
         self.recorder = SnippetRecorder(RIG, {"vehicle": "v7"}, self.store, self.losses, packed=True)
 
     def record(self, one: Snippet) -> None:
-        self.recorder.give(one)
+        self.recorder.submit(one)
         while self.recorder.write():
             pass
 
@@ -87,7 +87,7 @@ def test_it_opens_everywhere_is_listed_and_is_a_source(tmp_path: Path) -> None:
     assert (info.event, info.stamp_ns, info.size_bytes) == ("suspect", BEGIN_NS, len(data))
     assert info.sha256 == hashlib.sha256(data).hexdigest()
     assert bench.store.listing("rear") == ()
-    bag = opened(path)
+    bag = read_recording(path)
     assert bag.types == {
         "/front/lidar/points": "sensor_msgs/msg/PointCloud2",
         "/front/odometry": "nav_msgs/msg/Odometry",
@@ -110,8 +110,8 @@ def test_it_opens_everywhere_is_listed_and_is_a_source(tmp_path: Path) -> None:
 
 def test_while_one_is_written_another_is_counted_and_then_there_is_room_again(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    bench.recorder.give(snippet())
-    bench.recorder.give(snippet(1))
+    bench.recorder.submit(snippet())
+    bench.recorder.submit(snippet(1))
     bench.record(snippet(2))
     assert bench.losses.snapshot() == {("window", "snippet_overrun"): 2}
     bench.record(snippet(3))
@@ -120,7 +120,7 @@ def test_while_one_is_written_another_is_counted_and_then_there_is_room_again(tm
 
 def test_a_large_one_is_written_in_rounds(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    bench.recorder.give(snippet(count=10, points=150_000))
+    bench.recorder.submit(snippet(count=10, points=150_000))
     rounds = 0
     while bench.recorder.write():
         rounds += 1
@@ -160,7 +160,7 @@ def test_what_a_killed_service_left_is_taken_up(tmp_path: Path, record_property:
     for share in (0.0, 0.3, 0.6, 1.0):
         part.write_bytes(killed_here[: round(share * len(killed_here))])
         again = Bench(tmp_path)
-        again.recorder.take_up(lambda: None)
+        again.recorder.resume(lambda: None)
         assert not part.exists()
         told = {info.snippet_id: info for info in again.store.listing("front")}
         assert told.pop(untold.snippet_id) == untold
@@ -169,7 +169,7 @@ def test_what_a_killed_service_left_is_taken_up(tmp_path: Path, record_property:
             continue
         (info,) = told.values()
         assert info.event == "degraded"
-        found.append(opened(path).counts["/front/lidar/points"])
+        found.append(read_recording(path).counts["/front/lidar/points"])
         assert Bench(tmp_path).store.listing("front") == again.store.listing("front"), "now it is told"
         path.unlink()
         (bench.folder / f"{info.snippet_id}.json").unlink()
@@ -199,7 +199,7 @@ def test_a_full_disk_costs_the_snippet(
         }
         assert bench.ids[-1] == f"front-{BEGIN_NS + S}.snippet"
         again = Bench(folder)
-        again.recorder.take_up(lambda: None)
+        again.recorder.resume(lambda: None)
         assert set(again.ids) >= set(bench.ids)
         assert not [name for name in again.files if name.endswith(".part")]
         for name in again.ids:
@@ -215,12 +215,12 @@ def test_a_stop_keeps_what_can_be_written_in_time(
     monkeypatch.setattr("coec.runtime.recording.snippets.STOP_S", stop_s)
     monkeypatch.setattr("coec.runtime.recording.snippets.ROUND_S", 60.0)
     bench = Bench(tmp_path)
-    bench.recorder.give(snippet(count=10, points=200_000))  # a round are two sweeps
+    bench.recorder.submit(snippet(count=10, points=200_000))  # a round are two sweeps
     bench.recorder.write()
     bench.recorder.close()
     assert bench.losses.snapshot() == ({("window", "snippet_cut_short"): 1} if sweeps < 10 else {})
     (name,) = bench.ids
-    assert opened(bench.store.path(name)).counts["/front/lidar/points"] == sweeps
+    assert read_recording(bench.store.path(name)).counts["/front/lidar/points"] == sweeps
 
 
 @pytest.mark.fault(

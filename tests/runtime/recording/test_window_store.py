@@ -19,7 +19,7 @@ from coec.errors import NotFoundError, RecordingError, UsageError
 from coec.runtime.recording import window_store
 from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import EXPIRED_AT_ONCE, WindowStore
-from disks import EVERYTHING, Disk
+from disks import EVERY_OPERATION, Disk
 
 DEADLINE_S = 20.0
 DAY_NS = 86_400 * 10**9
@@ -202,7 +202,7 @@ def test_what_is_kept_is_said_and_bounded_the_oldest_first(tmp_path: Path) -> No
     assert kept_for() == [None, "commissioning", "red_event", None, None]
     make_room(store)
     assert stems(store) == [at(1), at(2), at(400)], "what is kept beyond the bound goes for its age like any other"
-    store.use(StateConfig(max_protected_bytes=0, min_free_bytes=0))
+    store.reconfigure(StateConfig(max_protected_bytes=0, min_free_bytes=0))
     assert kept_for() == [None, None, None]
 
 
@@ -220,7 +220,7 @@ def test_a_folder_that_somebody_removed_is_made_again(tmp_path: Path) -> None:
     store = store_of(tmp_path)
     record(store, at(0)).unlink()
     (tmp_path / "windows").rmdir()
-    store.look()
+    store.scan()
     assert store.usage().used == 0
     assert store.listing("front") == ()
     make_room(store)
@@ -308,7 +308,7 @@ def test_a_window_that_was_written_again_has_no_digest_until_it_is_noted(tmp_pat
     with_result = path.with_suffix(".tmp")
     with_result.write_bytes(b"window with result")
     with_result.replace(path)
-    store.look()
+    store.scan()
     (info,) = store.listing("front")
     assert (info.sha256, info.size_bytes, info.pairs) == (None, 18, 3)
     assert store.unread("front") == (path.stem,)
@@ -322,7 +322,7 @@ def test_a_window_that_was_written_again_has_no_digest_until_it_is_noted(tmp_pat
 
 
 def test_what_is_gone_is_forgotten_and_the_index_stays_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.runtime.recording.window_index.LINES", 10)
+    monkeypatch.setattr("coec.runtime.recording.window_index.INDEX_LINES", 10)
     store = store_of(tmp_path)
     for day in range(60):
         record(store, at(day))
@@ -347,7 +347,7 @@ def test_an_index_that_is_damaged_or_cannot_be_written_costs_reading_only(
     assert stems(again) == [at(0), at(1)]
     assert again.unread("front") == (at(1),)
     disk = Disk(tmp_path, monkeypatch)
-    disk.refuses = EVERYTHING
+    disk.refuses = EVERY_OPERATION
     again.note(at(1), version_of(again.path(at(1))))
     assert again.unread("front") == ()
     disk.refuses = ()
@@ -377,12 +377,12 @@ def test_a_list_of_thousands_reads_the_folder_once_and_no_file(
     store.listing("front")
     record_property("figure", f"first list after {time.monotonic() - began_s:.2f} s")
     for _ in range(50):
-        store.look()
+        store.scan()
         assert len(store.listing("front")) == 5000
         store.usage()
     assert scans <= 1
     (tmp_path / "windows" / "front-7.mcap").unlink()
-    store.look()
+    store.scan()
     assert len(store.listing("front")) == 4999
     assert scans <= 2
 

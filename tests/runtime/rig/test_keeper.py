@@ -12,20 +12,29 @@ import pytest
 
 from coec.adapters.files.state_file import StateFile
 from coec.runtime.api.rig import RigAnswers, reply_of
-from coec.runtime.api.rig_troubles import INCONSISTENT, troubles_of
+from coec.runtime.api.rig_troubles import INCONSISTENT, rig_problems
 from coec.runtime.rig.keeper import LAG_NS, QUIET_TICKS
-from coec.runtime.rig.rig_file import FILE, RigFile
+from coec.runtime.rig.rig_file import RIG_FILE, RigStore
 from coec.schemas.base import from_json, to_json
 from coec.schemas.keys import Keys
 from coec.schemas.rig_state import RigReply
-from rig_said import CAMERAS, SaidRig, look, pair_config, pose, serves, state, window
-from rigs import NS, POSES, SIGMA, with_moved
+from rig_said import (
+    CAMERAS,
+    RigEstimatorBench,
+    pair_check,
+    pair_config,
+    pair_pose,
+    pair_state,
+    pair_window,
+    served_extrinsic,
+)
+from rigs import NS, POSES, SIGMA, moved_poses
 
 KNOCKED_S = 45.0
-AFTER = with_moved("roof")
+AFTER = moved_poses("roof")
 
 
-def drive(said: SaidRig, until_s: float, seed: int | None = None, begin_s: float = 0.0) -> None:
+def drive(said: RigEstimatorBench, until_s: float, seed: int | None = None, begin_s: float = 0.0) -> None:
     """Checks every 5 s, the LiDAR knocked at `KNOCKED_S`, a window of each pair 12 s after it. A seed draws which of
     the pairs comes first, and how long it is in front."""
     errors, rng = np.random.default_rng(5), random.Random(seed)
@@ -38,23 +47,23 @@ def drive(said: SaidRig, until_s: float, seed: int | None = None, begin_s: float
         for camera in cameras:
             poses = POSES if at_s - 5.0 < KNOCKED_S else AFTER
             due = at_s >= 5.0 and at_s % 5.0 == CAMERAS.index(camera)
-            said.at(camera, at_s, waits=due)
+            said.must_wait(camera, at_s, waits=due)
             if due:
-                said.put(camera, at_s, look(camera, poses, at_s - 5.0, drawn[camera]))
+                said.put(camera, at_s, pair_check(camera, poses, at_s - 5.0, drawn[camera]))
             if at_s == KNOCKED_S + 30.0:
-                said.put(camera, at_s, window(camera, AFTER, KNOCKED_S + 12.0))
-                said.put(camera, at_s, serves(camera, AFTER, KNOCKED_S + 12.0))
-            said.at(camera, at_s)
+                said.put(camera, at_s, pair_window(camera, AFTER, KNOCKED_S + 12.0))
+                said.put(camera, at_s, served_extrinsic(camera, AFTER, KNOCKED_S + 12.0))
+            said.must_wait(camera, at_s)
             if seed is None or rng.random() < 0.5:
                 said.settle()
     said.settle()
 
 
-def reply(said: SaidRig) -> RigReply:
+def reply(said: RigEstimatorBench) -> RigReply:
     return reply_of("vehicle", said.known)
 
 
-def states(said: SaidRig) -> dict[str, str]:
+def states(said: RigEstimatorBench) -> dict[str, str]:
     return {sensor.name: sensor.state for sensor in reply(said).sensors}
 
 
@@ -62,7 +71,7 @@ def states(said: SaidRig) -> dict[str, str]:
 def test_a_correction_comes_to_all_pairs_at_one_sensor_time(
     tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     drive(said, KNOCKED_S + 25.0)
     assert states(said) == {"front": "calibrated", "left": "calibrated", "rear": "calibrated", "roof": "lidar_moved"}
     drive(said, KNOCKED_S + 32.0, begin_s=KNOCKED_S + 25.0)
@@ -74,86 +83,86 @@ def test_a_correction_comes_to_all_pairs_at_one_sensor_time(
         assert said.pairs[camera].corrections(last.from_ns - 1) == []
         (correction,) = said.pairs[camera].corrections(last.from_ns)
         assert "roof" in correction.text
-        assert correction.told.T_a_b == pytest.approx(pose(camera, AFTER), abs=1e-4)
+        assert correction.joint_pose.T_a_b == pytest.approx(pair_pose(camera, AFTER), abs=1e-4)
         assert said.pairs[camera].corrections(last.from_ns) == []
     record_property("figure", f"{LAG_NS / NS:.0f} s")
 
 
 def test_windows_of_a_named_sensor_are_wanted_of_all_its_pairs_from_one_sensor_time_on(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     drive(said, KNOCKED_S + 25.0)
     move = reply(said).move
     assert move is not None
     from_ns = move.since_ns + 5 * NS + LAG_NS  # a look counts five seconds later
     for camera in CAMERAS:
-        assert said.pairs[camera].window_wanted(from_ns - 1) is None
-        since_ns = said.pairs[camera].window_wanted(from_ns)
+        assert said.pairs[camera].pop_window_request(from_ns - 1) is None
+        since_ns = said.pairs[camera].pop_window_request(from_ns)
         assert since_ns is not None
         assert KNOCKED_S * NS <= since_ns <= move.since_ns, "of no frames from before the knock"
-        assert said.pairs[camera].window_wanted(from_ns) is None, "once"
+        assert said.pairs[camera].pop_window_request(from_ns) is None, "once"
 
 
 def test_what_was_wanted_of_another_time_is_forgotten(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     drive(said, KNOCKED_S + 25.0)
     said.pairs["left"].time_stepped_back(round(1.0 * NS))
     said.settle()
-    assert all(said.pairs[camera].window_wanted(2**62) is None for camera in CAMERAS)
+    assert all(said.pairs[camera].pop_window_request(2**62) is None for camera in CAMERAS)
 
 
 @pytest.mark.fault("pairs of a rig are known in another order in a replay", "the same reply, to the byte")
 def test_a_replay_says_the_same_to_the_byte(tmp_path: Path) -> None:
     told = set()
     for seed in (None, 1):
-        said = SaidRig(tmp_path / str(seed))
+        said = RigEstimatorBench(tmp_path / str(seed))
         drive(said, KNOCKED_S + 40.0, seed)
         told.add(to_json(reply(said)))
     assert len(told) == 1
 
 
 def test_frames_wait_until_the_rig_has_decided_what_counts_for_them(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     for camera in CAMERAS:
-        said.at(camera, 10.0)
-    said.at("left", 11.0, waits=True)
-    assert not said.at("front", 10.0 + LAG_NS / NS)
-    assert said.at("front", 10.1 + LAG_NS / NS)
-    said.at("rear", 20.0)
-    said.put("left", 11.0, look("left", POSES, 6.0, np.zeros(6)))
-    said.at("left", 11.0)
-    said.at("left", 20.0)
+        said.must_wait(camera, 10.0)
+    said.must_wait("left", 11.0, waits=True)
+    assert not said.must_wait("front", 10.0 + LAG_NS / NS)
+    assert said.must_wait("front", 10.1 + LAG_NS / NS)
+    said.must_wait("rear", 20.0)
+    said.put("left", 11.0, pair_check("left", POSES, 6.0, np.zeros(6)))
+    said.must_wait("left", 11.0)
+    said.must_wait("left", 20.0)
     said.settle()
-    assert not said.at("front", 10.1 + LAG_NS / NS)
+    assert not said.must_wait("front", 10.1 + LAG_NS / NS)
 
 
 def test_a_vehicle_of_one_pair_has_no_rig_and_waits_for_none(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path, ("front",))
-    assert not said.at("front", 10.0)
-    assert not said.at("front", 1000.0)
-    said.put("front", 5.0, look("front", POSES, 5.0, np.zeros(6)))
+    said = RigEstimatorBench(tmp_path, ("front",))
+    assert not said.must_wait("front", 10.0)
+    assert not said.must_wait("front", 1000.0)
+    said.put("front", 5.0, pair_check("front", POSES, 5.0, np.zeros(6)))
     said.settle()
-    assert len(said.told) == 2
+    assert len(said.states) == 2
     assert states(said) == {"front": "undecided", "roof": "undecided"}
     assert [sensor.probability for sensor in reply(said).sensors] == [None, None]
 
 
 @pytest.mark.fault("a LiDAR is knocked while the service is down", "named by the first checks after the restart")
 def test_what_was_known_outlives_a_restart(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     drive(said, 44.0)
-    said.keeper.finish()
-    said.scribe.write_due()
-    again = SaidRig(tmp_path)
+    said.estimator.finish()
+    said.disk_writer.write_due()
+    again = RigEstimatorBench(tmp_path)
     drive(again, KNOCKED_S + 25.0, begin_s=KNOCKED_S + 5.0)
     assert states(again)["roof"] == "lidar_moved"
 
 
 def test_a_sensor_that_had_moved_is_so_after_a_restart(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     drive(said, KNOCKED_S + 25.0)
-    said.keeper.finish()
-    said.scribe.write_due()
-    again = SaidRig(tmp_path)
+    said.estimator.finish()
+    said.disk_writer.write_due()
+    again = RigEstimatorBench(tmp_path)
     assert states(again) == {"front": "unknown", "left": "unknown", "rear": "unknown", "roof": "lidar_moved"}
     (sensor,) = [one for one in reply(again).sensors if one.name == "roof"]
     assert [reason.code for reason in sensor.reasons] == ["last_known"]
@@ -203,14 +212,14 @@ def after(before: dict[str, object]) -> dict[str, object]:
     ],
 )
 def test_a_hostile_file_is_refused(tmp_path: Path, body: dict[str, object]) -> None:
-    StateFile(tmp_path / FILE).save(body)
-    said = SaidRig(tmp_path)
+    StateFile(tmp_path / RIG_FILE).save(body)
+    said = RigEstimatorBench(tmp_path)
     assert [reason.code for reason in said.known.why] == ["rig_state_damaged"]
     assert said.known.losses == {"state_damaged": 1}
-    said.keeper.finish()
-    said.scribe.write_due()
-    assert (tmp_path / f"{FILE}.broken").exists()
-    assert SaidRig(tmp_path).known.why == ()
+    said.estimator.finish()
+    said.disk_writer.write_due()
+    assert (tmp_path / f"{RIG_FILE}.broken").exists()
+    assert RigEstimatorBench(tmp_path).known.why == ()
 
 
 @pytest.mark.fault("an edge, or a move, in the file of the rig that cannot be read", "the other edges are kept")
@@ -224,8 +233,8 @@ def test_a_hostile_file_is_refused(tmp_path: Path, body: dict[str, object]) -> N
 )
 def test_an_edge_that_cannot_be_read_falls_back_alone(tmp_path: Path, name: str, value: object, kept: set[str]) -> None:
     body: dict[str, object] = {"edges": {"front-roof": GOOD_EDGE, "rear-roof": GOOD_EDGE}, "event": GOOD_EVENT}
-    StateFile(tmp_path / FILE).save(body | {name: value})
-    file = RigFile(tmp_path)
+    StateFile(tmp_path / RIG_FILE).save(body | {name: value})
+    file = RigStore(tmp_path)
     assert [reason.code for reason in file.damage] == ["rig_state_damaged"]
     assert set(file._edges) == kept
     assert (file._event is None) == (name == "event")
@@ -233,8 +242,8 @@ def test_an_edge_that_cannot_be_read_falls_back_alone(tmp_path: Path, name: str,
 
 def test_fields_that_a_newer_version_added_to_the_file_of_the_rig_are_ignored(tmp_path: Path) -> None:
     edges = {"front-roof": {**GOOD_EDGE, "trust": 3}}
-    StateFile(tmp_path / FILE).save({"edges": edges, "event": {**GOOD_EVENT, "who": {}}, "links": []})
-    file = RigFile(tmp_path)
+    StateFile(tmp_path / RIG_FILE).save({"edges": edges, "event": {**GOOD_EVENT, "who": {}}, "links": []})
+    file = RigStore(tmp_path)
     assert file.damage == ()
     assert set(file._edges) == {"front-roof"}
 
@@ -245,11 +254,11 @@ def test_fields_that_a_newer_version_added_to_the_file_of_the_rig_are_ignored(tm
 def test_a_file_that_lies_within_its_form_harms_nothing(tmp_path: Path) -> None:
     far = np.eye(4)
     far[0, 3] = 1000.0
-    edges = {f"{camera}-roof": {"nominal": pose(camera, POSES).tolist(), "T_camera_lidar": far.tolist(),
+    edges = {f"{camera}-roof": {"nominal": pair_pose(camera, POSES).tolist(), "T_camera_lidar": far.tolist(),
                                 "sigma": [9.0] * 6} for camera in CAMERAS}  # fmt: skip
     event = {"sensors": ["front"], "since_ns": 2**62, "stepped_ns": 2**62, "named": ["front"]}
-    StateFile(tmp_path / FILE).save({"edges": edges, "event": event})
-    said = SaidRig(tmp_path)
+    StateFile(tmp_path / RIG_FILE).save({"edges": edges, "event": event})
+    said = RigEstimatorBench(tmp_path)
     assert said.known.why == ()
     drive(said, 44.0)
     assert said.known.losses.get("refused", 0) == 0, "looks are taken as any"
@@ -258,23 +267,23 @@ def test_a_file_that_lies_within_its_form_harms_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.fault("the file of the rig is damaged", "refused, counted; learnt anew")
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / FILE).write_text(json.dumps({"body": {"edges": {}}, "checksum": "0", "schema_version": 1}))
-    assert SaidRig(tmp_path).known.losses == {"state_damaged": 1}
+    (tmp_path / RIG_FILE).write_text(json.dumps({"body": {"edges": {}}, "checksum": "0", "schema_version": 1}))
+    assert RigEstimatorBench(tmp_path).known.losses == {"state_damaged": 1}
 
 
 def test_sensors_of_an_event_that_the_vehicle_has_no_more_are_forgotten(tmp_path: Path) -> None:
     event = {"sensors": ["trunk"], "since_ns": 5, "stepped_ns": 4, "named": ["trunk"]}
-    StateFile(tmp_path / FILE).save({"edges": {}, "event": event})
-    assert set(states(SaidRig(tmp_path)).values()) == {"unknown"}
+    StateFile(tmp_path / RIG_FILE).save({"edges": {}, "event": event})
+    assert set(states(RigEstimatorBench(tmp_path)).values()) == {"unknown"}
 
 
 def test_numbers_that_are_no_evidence_are_counted_and_harm_nothing(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
-    bad = window("front", POSES, 1.0)
+    said = RigEstimatorBench(tmp_path)
+    bad = pair_window("front", POSES, 1.0)
     bad.measurement.uncertainty.noise[:] = np.ones((6, 6))
     said.put("front", 5.0, bad)
     for camera in CAMERAS:
-        said.at(camera, 6.0)
+        said.must_wait(camera, 6.0)
     said.settle()
     assert said.known.losses == {"refused": 1}
     drive(said, 30.0, begin_s=10.0)
@@ -282,7 +291,7 @@ def test_numbers_that_are_no_evidence_are_counted_and_harm_nothing(tmp_path: Pat
 
 
 def test_the_clock_of_the_sensors_steps_back_and_the_drive_goes_on(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     drive(said, 40.0)
     said.pairs["front"].time_stepped_back(0)
     said.pairs["left"].time_stepped_back(0)
@@ -295,8 +304,8 @@ def test_the_clock_of_the_sensors_steps_back_and_the_drive_goes_on(tmp_path: Pat
 def test_the_reply_survives_the_wire_and_is_published_on_change(tmp_path: Path) -> None:
     published: list[str] = []
     answers = RigAnswers(Keys("coec", "vehicle"), lambda key, _: published.append(key))
-    said = SaidRig(tmp_path)
-    said.keeper.listen(answers.hear, lambda: None)
+    said = RigEstimatorBench(tmp_path)
+    said.estimator.connect(answers.on_update, lambda: None)
     drive(said, 20.0)
     assert set(published) == {"coec/@v1/vehicle/rig"}
     count = len(published)
@@ -305,15 +314,15 @@ def test_the_reply_survives_the_wire_and_is_published_on_change(tmp_path: Path) 
     told = answers.reply
     assert from_json(RigReply, to_json(told)) == told
     assert told.looks == {"front-roof": 7, "left-roof": 7, "rear-roof": 7}
-    assert answers.troubles("front-roof") == ()
+    assert answers.problems("front-roof") == ()
 
 
 def test_a_single_lidar_closes_no_loop_and_no_pair_is_inconsistent(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     drive(said, KNOCKED_S + 40.0)
     rig = said.known.rig
     assert rig is not None
-    assert troubles_of(rig) == {}
+    assert rig_problems(rig) == {}
     joint = reply(said).joint
     assert joint is not None
     assert joint.freedom == 0
@@ -322,23 +331,25 @@ def test_a_single_lidar_closes_no_loop_and_no_pair_is_inconsistent(tmp_path: Pat
 
 @pytest.mark.fault("all cameras of a vehicle stop", "what they said last is still combined")
 def test_once_all_streams_have_stopped_nothing_waits_any_more(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path)
+    said = RigEstimatorBench(tmp_path)
     for camera in CAMERAS:
-        said.at(camera, 10.0)
-        said.put(camera, 15.0, look(camera, POSES, 10.0, np.zeros(6)))
+        said.must_wait(camera, 10.0)
+        said.put(camera, 15.0, pair_check(camera, POSES, 10.0, np.zeros(6)))
     said.settle()
     assert reply(said).looks == {}
-    taken = [said.keeper.work(0.001) for _ in range(QUIET_TICKS + 2)]
+    taken = [said.estimator.work(0.001) for _ in range(QUIET_TICKS + 2)]
     assert taken == [False] * (QUIET_TICKS - 1) + [True] * 3
     assert reply(said).looks == {"front-roof": 1, "left-roof": 1, "rear-roof": 1}
 
 
 def test_a_pair_that_joins_later_finds_what_the_first_has_come_to(tmp_path: Path) -> None:
-    said = SaidRig(tmp_path, ("front",))
-    said.put("front", 5.0, window("front", POSES, 1.0))
-    said.put("front", 5.0, serves("front", POSES, 1.0))
+    said = RigEstimatorBench(tmp_path, ("front",))
+    said.put("front", 5.0, pair_window("front", POSES, 1.0))
+    said.put("front", 5.0, served_extrinsic("front", POSES, 1.0))
     said.settle()
-    said.pairs["left"] = said.keeper.join(pair_config("left"), pose("left", POSES), state("left"), lambda: True)
+    said.pairs["left"] = said.estimator.join(
+        pair_config("left"), pair_pose("left", POSES), pair_state("left"), lambda: True
+    )
     said.settle()
     rig = said.known.rig
     assert rig is not None

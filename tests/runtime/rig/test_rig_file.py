@@ -12,46 +12,46 @@ from coec.calibration.rig import vehicle
 from coec.calibration.rig.vehicle import VehicleRig
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from coec.runtime.rig.rig_file import FILE, RigFile
-from driven_rig import STAR, Drive, Poses, pose_of
-from rigs import POSES, graph, with_moved
+from coec.runtime.rig.rig_file import RIG_FILE, RigStore
+from driven_rig import STAR, RigDrive, RigPoses, pose_of
+from rigs import POSES, graph, moved_poses
 
-AFTER: Poses = with_moved("roof")
+AFTER: RigPoses = moved_poses("roof")
 BLIND = "rear-roof"
 
 
 @cache
 def _driven() -> tuple[VehicleRig, float]:
-    drive = Drive(graph(STAR))
-    drive.looks(POSES, 8)
-    drive.looks(POSES, 13, blind=(BLIND,))
-    drive.looks(AFTER, 4, blind=(BLIND,))
+    drive = RigDrive(graph(STAR))
+    drive.add_checks(POSES, 8)
+    drive.add_checks(POSES, 13, blind=(BLIND,))
+    drive.add_checks(AFTER, 4, blind=(BLIND,))
     assert drive.state.event is not None
     assert drive.state.before is not None
     return drive.state, drive.at_s
 
 
-def knocked() -> Drive:
+def knocked() -> RigDrive:
     """The LiDAR was knocked and named; one of its cameras has seen nothing for more than a minute."""
-    drive = Drive(graph(STAR))
+    drive = RigDrive(graph(STAR))
     drive.state, drive.at_s = _driven()
     return drive
 
 
 def restarted(rig: VehicleRig, folder: Path) -> VehicleRig:
-    file = RigFile(folder)
-    file.remember(rig)
+    file = RigStore(folder)
+    file.update(rig)
     file.flush()
-    found = RigFile(folder)
+    found = RigStore(folder)
     assert found.damage == ()
-    return found.recalled(vehicle.begun(rig.graph, rig.serves, rig.windows))
+    return found.restored(vehicle.initial_rig(rig.graph, rig.serves, rig.windows))
 
 
-def put_right(drive: Drive) -> Matrix4:
+def put_right(drive: RigDrive) -> Matrix4:
     """What the blind pair is told once the others have a window of after the knock."""
-    drive.looks(AFTER, 2, blind=(BLIND,))
+    drive.add_checks(AFTER, 2, blind=(BLIND,))
     for name in ("front-roof", "left-roof"):
-        drive.window(name, AFTER, drive.at_s - 12.0)
+        drive.add_window(name, AFTER, drive.at_s - 12.0)
     assert drive.state.correction is not None
     return drive.state.correction.pairs[BLIND].T_a_b
 
@@ -85,16 +85,16 @@ def test_what_was_known_is_the_same_to_the_bit(tmp_path: Path) -> None:
 
 def test_pairs_that_join_one_after_the_other_find_what_was_known_of_them(tmp_path: Path) -> None:
     rig = knocked().state
-    file = RigFile(tmp_path)
-    file.remember(rig)
+    file = RigStore(tmp_path)
+    file.update(rig)
     file.flush()
-    found = RigFile(tmp_path)
+    found = RigStore(tmp_path)
     grown: VehicleRig | None = None
     for count in (2, 3):
         part = graph(STAR[:count])
         serves = {name: rig.serves[name] for name in part.edge}
         windows = {name: one for name, one in rig.windows.items() if name in part.edge}
-        fresh = found.recalled(vehicle.begun(part, serves, windows))
+        fresh = found.restored(vehicle.initial_rig(part, serves, windows))
         grown = fresh if grown is None else vehicle.grown(grown, fresh)
     assert grown is not None
     assert grown.before is not None
@@ -103,14 +103,14 @@ def test_pairs_that_join_one_after_the_other_find_what_was_known_of_them(tmp_pat
 
 @pytest.mark.parametrize("changed", [True, False], ids=["written in this run", "read at the start"])
 def test_a_file_that_somebody_removed_is_written_again(tmp_path: Path, changed: bool) -> None:
-    file = RigFile(tmp_path)
+    file = RigStore(tmp_path)
     file.flush()
-    assert not (tmp_path / FILE).exists(), "there is nothing to remember"
-    file.remember(knocked().state)
+    assert not (tmp_path / RIG_FILE).exists(), "there is nothing to remember"
+    file.update(knocked().state)
     file.flush()
-    before = (tmp_path / FILE).read_bytes()
+    before = (tmp_path / RIG_FILE).read_bytes()
     if not changed:
-        file = RigFile(tmp_path)
-    (tmp_path / FILE).unlink()
+        file = RigStore(tmp_path)
+    (tmp_path / RIG_FILE).unlink()
     file.flush()
-    assert (tmp_path / FILE).read_bytes() == before
+    assert (tmp_path / RIG_FILE).read_bytes() == before

@@ -9,16 +9,16 @@ from typing import Any, cast
 
 import pytest
 
-from coec.adapters.ros.diagnostics import Service
+from coec.adapters.ros.diagnostics import ServicePhase
 from coec.adapters.ros.wire.qos import STATIC, Qos
 from coec.adapters.zenoh.ros_publisher import RosPublishers
 from coec.calibration.types import Rig
 from coec.config import Config, RosConfig
 from coec.geometry.cameras import build
 from coec.runtime.ros.outputs import RosOutputs
-from coec.runtime.ros.told import PairTold, View
+from coec.runtime.ros.told import PairOutput, VehicleOutput
 from fakes import wait_until
-from pair_bench import BEGIN_S, END_S, STEP_S, Bench, KnowingWorker
+from pair_bench import BEGIN_S, DRIVE_END_S, STEP_S, OracleWorker, PairBench
 from runtime.ros.topics import KeptTopic, KeptTopics
 
 OK, WARN, ERROR, STALE = range(4)
@@ -29,17 +29,19 @@ ALL = RosConfig(publish=("diagnostics", "tf_static", "camera_info", "overlay"))
 class Told:
     """Outputs on kept topics, of what a bench knows."""
 
-    def __init__(self, bench: Bench, ros: RosConfig) -> None:
+    def __init__(self, bench: PairBench, ros: RosConfig) -> None:
         self.bench = bench
-        self.service: Service = "running"
+        self.service: ServicePhase = "running"
         self.rig: Rig | None = bench.answers.rig
         self.topics = KeptTopics()
         self.config: Config = bench.config.model_copy(update={"ros": ros, "middleware": "rmw_zenoh"})
-        self.outputs = RosOutputs(cast("RosPublishers", self.topics), self.config, KnowingWorker())
+        self.outputs = RosOutputs(cast("RosPublishers", self.topics), self.config, OracleWorker())
 
-    def view(self) -> View:
+    def view(self) -> VehicleOutput:
         answers = self.bench.answers
-        return View(self.service, (PairTold(answers.health_reply, "SN-1", answers.extrinsic_reply, self.rig),))
+        return VehicleOutput(
+            self.service, (PairOutput(answers.health_reply, "SN-1", answers.extrinsic_reply, self.rig),)
+        )
 
     def topic(self, name: str) -> KeptTopic:
         wait_until(lambda: name in self.topics.topics, name)
@@ -57,7 +59,7 @@ class Told:
     def drive_until(self, state: str, second: int) -> int:
         """On from a second, to the first at which the pair is in this state."""
         while self.bench.answers.health_reply.state != state:
-            assert second < END_S, state
+            assert second < DRIVE_END_S, state
             self.bench.drive(second, second + 1)
             second += 1
         return second
@@ -68,7 +70,7 @@ class Told:
 
 @pytest.fixture
 def told(tmp_path: Path) -> Iterator[Told]:
-    told = Told(Bench(tmp_path), ALL)
+    told = Told(PairBench(tmp_path), ALL)
     told.outputs.start(told.view)
     yield told
     assert told.outputs.close(20.0)
@@ -119,7 +121,7 @@ def test_what_nobody_renews_is_stale(told: Told, monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_last_word_is_that_the_service_stops(tmp_path: Path) -> None:
-    told = Told(Bench(tmp_path), ALL)
+    told = Told(PairBench(tmp_path), ALL)
     told.outputs.start(told.view)
     told.status_that(lambda _: True)
     told.service = "stopping"
@@ -147,9 +149,9 @@ def test_intrinsics_are_said_as_they_are_or_fitted_or_not_at_all(told: Told) -> 
 
 
 def test_of_a_pair_that_is_not_known_yet_health_alone_is_told(tmp_path: Path) -> None:
-    told = Told(Bench(tmp_path), ALL)
+    told = Told(PairBench(tmp_path), ALL)
     told.outputs.start(
-        lambda: View("starting", (PairTold(told.bench.answers.health_reply, None, None, None),)),
+        lambda: VehicleOutput("starting", (PairOutput(told.bench.answers.health_reply, None, None, None),)),
     )
     status = told.status_that(lambda _: True)
     assert (status.level, status.hardware_id) == (STALE, "test/front")
@@ -158,12 +160,12 @@ def test_of_a_pair_that_is_not_known_yet_health_alone_is_told(tmp_path: Path) ->
 
 
 def test_who_wants_nothing_said_has_no_thread_and_no_topic(tmp_path: Path) -> None:
-    told = Told(Bench(tmp_path), RosConfig())
+    told = Told(PairBench(tmp_path), RosConfig())
     told.outputs.start(told.view)
     assert told.outputs.threads == ()
     assert told.outputs.close(1.0)
     assert told.topics.topics == {}
-    deaf = RosOutputs(None, told.config.model_copy(update={"ros": ALL}), KnowingWorker())
+    deaf = RosOutputs(None, told.config.model_copy(update={"ros": ALL}), OracleWorker())
     deaf.start(told.view)
     deaf.wake()
     assert deaf.threads == ()

@@ -11,14 +11,14 @@ import pytest
 from coec.adapters.ros.messages import COMPRESSED_IMAGE
 from coec.adapters.ros.wire.qos import Qos
 from coec.calibration.types import Reason
-from coec.runtime.ros.pictures import PERIOD_S, Pictures
-from coec.runtime.worker.jobs import Drawn, Fate, Job, JobOutcome, Kind
-from pair_bench import configuration, pair_at
+from coec.runtime.ros.pictures import PICTURE_PERIOD_S, CheckPictures
+from coec.runtime.worker.jobs import Fate, JobOutcome, Kind, RenderedImage, WorkerJob
+from pair_bench import frame_pair_at, pair_configuration
 from runtime.ros.topics import KeptTopic
 
 STAMP_NS = 1_700_000_000_250_000_000
-PAIR = configuration(Path("state")).pairs[0]
-DRAWN = JobOutcome(Fate.RESULT, Drawn(b"\xff\xd8picture"), None, 0.1)
+PAIR = pair_configuration(Path("state")).pairs[0]
+DRAWN = JobOutcome(Fate.RESULT, RenderedImage(b"\xff\xd8picture"), None, 0.1)
 LATE = JobOutcome(Fate.LATE, None, Reason("late", "The worker was busy."), 15.0)
 
 
@@ -26,19 +26,19 @@ LATE = JobOutcome(Fate.LATE, None, Reason("late", "The worker was busy."), 15.0)
 class Scene:
     """A worker that keeps its jobs, a topic, a clock that stands."""
 
-    jobs: list[Job] = field(default_factory=list)
+    jobs: list[WorkerJob] = field(default_factory=list)
     topic: KeptTopic = field(default_factory=lambda: KeptTopic(COMPRESSED_IMAGE, Qos()))
     now_s: float = 100.0
 
     def __post_init__(self) -> None:
-        self.pictures = Pictures(self, {"front": self.topic})
+        self.pictures = CheckPictures(self, {"front": self.topic})
 
-    def ask(self, job: Job) -> None:
+    def submit(self, job: WorkerJob) -> None:
         self.jobs.append(job)
 
     def show(self, after_s: float = 0.0) -> None:
         self.now_s += after_s
-        self.pictures.show(PAIR, pair_at(STAMP_NS), np.eye(4))
+        self.pictures.show(PAIR, frame_pair_at(STAMP_NS), np.eye(4))
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_a_picture_carries_the_stamp_and_the_frame_of_its_image(scene: Scene) ->
 
 
 def test_nothing_is_drawn_for_nobody(scene: Scene) -> None:
-    scene.topic.is_heard = False
+    scene.topic.has_subscribers = False
     scene.show()
     assert scene.jobs == []
 
@@ -72,18 +72,18 @@ def test_nothing_is_drawn_for_nobody(scene: Scene) -> None:
 @pytest.mark.parametrize("end", [DRAWN, LATE])
 def test_one_at_a_time_and_none_too_soon(scene: Scene, end: JobOutcome) -> None:
     scene.show()
-    scene.show(after_s=2 * PERIOD_S)  # the first is under way still
+    scene.show(after_s=2 * PICTURE_PERIOD_S)  # the first is under way still
     assert len(scene.jobs) == 1
 
     scene.jobs[0].done(end)
     scene.show()
     assert len(scene.jobs) == 2
     scene.jobs[1].done(end)
-    scene.show(after_s=0.9 * PERIOD_S)  # too soon
+    scene.show(after_s=0.9 * PICTURE_PERIOD_S)  # too soon
     assert len(scene.jobs) == 2
     assert len(scene.topic.rest()) == (2 if end is DRAWN else 0)
 
 
 def test_a_pair_without_a_topic_is_not_drawn(scene: Scene) -> None:
-    Pictures(scene, {}).show(PAIR, pair_at(STAMP_NS), np.eye(4))
+    CheckPictures(scene, {}).show(PAIR, frame_pair_at(STAMP_NS), np.eye(4))
     assert scene.jobs == []

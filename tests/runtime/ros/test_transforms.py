@@ -46,14 +46,14 @@ def test_the_camera_is_a_child_of_the_lidar_at_the_inverse_of_what_is_served(pro
     (placed,) = told.placed
     assert (placed.parent, placed.child) == ("lidar", "camera_calibrated")
     assert np.allclose(placed.T_parent_child @ POSE, np.eye(4), atol=1e-15)
-    assert told.words == {"front": f"camera_calibrated in lidar, {provenance}"}
+    assert told.texts == {"front": f"camera_calibrated in lidar, {provenance}"}
 
 
 def test_nothing_is_called_calibrated_while_it_is_nominal() -> None:
     told = frames().transforms([served("nominal")])
 
     assert told.placed == ()
-    assert told.words == {"front": "not published: nominal still"}
+    assert told.texts == {"front": "not published: nominal still"}
 
 
 def test_after_a_reset_whoever_heard_of_the_frame_hears_what_is_served_now() -> None:
@@ -82,7 +82,7 @@ def test_a_camera_of_two_pairs_has_a_calibrated_frame_for_each_and_none_of_its_o
         ("bumper", "camera__2nd_calibrated"),
     ]
     assert replacing.placed == ()
-    assert set(replacing.words.values()) == {
+    assert set(replacing.texts.values()) == {
         "not published: camera is the camera of several pairs, and a frame has one parent"
     }
 

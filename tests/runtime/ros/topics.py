@@ -21,7 +21,7 @@ class KeptTopic:
 
     type_name: str
     qos: Qos
-    is_heard: bool = True
+    has_subscribers: bool = True
     closed: bool = False
     _came: queue.SimpleQueue[Any] = field(default_factory=queue.SimpleQueue)
 

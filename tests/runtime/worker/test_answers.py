@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from coec.adapters.files.conversions import result_of
-from coec.calibration.commissioning.baseline import Drift
+from coec.calibration.commissioning.baseline import BaselineDrift
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import Metric, Reason
 from coec.runtime.worker.answers import MalformedAnswerError, number_of, pack_answer, pack_refusal, read_answer
-from coec.runtime.worker.jobs import Answer, Checked, Commissioned, Drawn, Kind, Solved
+from coec.runtime.worker.jobs import Answer, Checked, Commissioned, Kind, RenderedImage, Solved
 from coec.schemas.base import to_msgpack
-from estimates import RIG, estimate
+from estimates import ESTIMATE_RIG, estimate
 
 OBSERVATION = Observation(
     stamp_ns=7,
@@ -37,7 +37,7 @@ OBSERVATION = Observation(
     causes=(CAUSES["dark"],),
     first_derivative=np.arange(6) / 7,
     second_derivative=np.arange(6) / 9,
-    drift=Drift(np.arange(6) / 3, np.full(6, np.inf)),
+    drift=BaselineDrift(np.arange(6) / 3, np.full(6, np.inf)),
     dirty=(3, 575),
     textured=400,
 )
@@ -63,7 +63,7 @@ def assert_same(one: object, other: object) -> None:
         assert len(one) == len(other)
         for mine, its in zip(one, other, strict=True):
             assert_same(mine, its)
-    elif isinstance(one, Observation | Drift | Metric):
+    elif isinstance(one, Observation | BaselineDrift | Metric):
         for field in fields(one):
             assert_same(getattr(one, field.name), getattr(other, field.name))
     else:
@@ -92,7 +92,7 @@ def test_figures_of_numpy_are_plain_figures_on_the_other_side() -> None:
 
 @pytest.mark.parametrize("note", [None, Reason("recording_failed", "The disk is full.")])
 def test_a_result_survives_to_the_byte(note: Reason | None) -> None:
-    result = result_of(estimate(1), RIG, "test")
+    result = result_of(estimate(1), ESTIMATE_RIG, "test")
     back = returned(Solved(result, note), Kind.SOLVE)
     assert isinstance(back, Solved)
     assert back.note == note
@@ -105,7 +105,7 @@ def test_a_commissioning_and_a_picture_survive() -> None:
     assert isinstance(back, Commissioned)
     assert_same(back.pose, pose)
     assert (back.baseline_hash, back.windows, back.pairs) == ("hash", 8, 200)
-    assert returned(Drawn(b"\xff\xd8jpeg"), Kind.OVERLAY) == Drawn(b"\xff\xd8jpeg")
+    assert returned(RenderedImage(b"\xff\xd8jpeg"), Kind.OVERLAY) == RenderedImage(b"\xff\xd8jpeg")
 
 
 def test_a_refusal_is_told_whatever_was_asked_and_a_prefetch_is_answered_with_nothing() -> None:
@@ -160,7 +160,7 @@ def an_array(code: int, shape: object, doubles: object) -> msgpack.ExtType:
         changed(offset=msgpack.ExtType(1, b"\xc1")),
         changed(offset=msgpack.ExtType(1, b"\x07")),
         changed(drift={"value": RIGHT["observation"]["offset"], "sigma": an_array(1, [1], bytes(8))}),
-        over_the_wire(pack_answer(3, Drawn(b"")))["result"],
+        over_the_wire(pack_answer(3, RenderedImage(b"")))["result"],
     ],
 )
 def test_what_is_no_check_is_malformed(result: object) -> None:
@@ -175,7 +175,10 @@ def test_what_is_no_check_is_malformed(result: object) -> None:
         (Kind.SOLVE, {"result": b"\xc1", "note": None, "written": None}),
         (Kind.SOLVE, {"result": msgpack.packb({"pair": "front"}), "note": None, "written": None}),
         (Kind.SOLVE, {"result": msgpack.packb(7), "note": None, "written": None}),
-        (Kind.SOLVE, {"result": to_msgpack(result_of(estimate(1), RIG, "test")), "note": "text", "written": None}),
+        (
+            Kind.SOLVE,
+            {"result": to_msgpack(result_of(estimate(1), ESTIMATE_RIG, "test")), "note": "text", "written": None},
+        ),
         (Kind.OVERLAY, {"jpeg": 7}),
         (Kind.OVERLAY, {"code": "a", "text": "a reason, and no refusal"}),
         (

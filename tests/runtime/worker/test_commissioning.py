@@ -24,7 +24,7 @@ from coec.runtime.worker import tasks
 from coec.runtime.worker.jobs import DEADLINE_S, Commissioned, Kind, Underway
 from coec.runtime.worker.messages import pack_pairs, pack_pose
 from coec.runtime.worker.tasks import Solver
-from drives import drawn_source
+from drives import rendered_source
 
 CONFIG = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(reach_deg=8.0))
 
@@ -41,12 +41,12 @@ def small_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def street() -> Window:
-    return window_of(drawn_source(STREET))
+    return window_of(rendered_source(STREET))
 
 
 @pytest.fixture
 def solver(street: Window, tmp_path: Path) -> Solver:
-    pair = configuration_for(drawn_source(STREET), street.T_camera_lidar_start, None)
+    pair = configuration_for(rendered_source(STREET), street.T_camera_lidar_start, None)
     pair = pair.model_copy(update={"name": street.rig.pair, "calibration": CONFIG})
     return Solver(Config(pairs=(pair,), state=StateConfig(directory=tmp_path)), 4)
 

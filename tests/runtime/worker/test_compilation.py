@@ -109,11 +109,11 @@ def test_the_worker_reports_when_it_begins_a_kernel_at_a_bounded_rate_and_when_i
     monkeypatch.setattr(time, "monotonic", clock)
     with process._reported(cast("Link", sent), 1):
         for _ in range(3):
-            compile_news.tell("a pass")
+            compile_news.notify("a pass")
         clock.now_s += process.REPORT_S
-        compile_news.tell("a pass")
+        compile_news.notify("a pass")
         compile_news.end("kernel")
-        compile_news.tell("another kernel")
+        compile_news.notify("another kernel")
         sent.gone = True
         compile_news.end("another kernel")
     assert [message["kind"] for message in sent.messages] == ["compiling", "compiling", "compiled", "compiling"]

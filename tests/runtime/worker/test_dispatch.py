@@ -9,7 +9,7 @@ import pytest
 
 from coec.errors import CalibrationError
 from coec.runtime.worker import dispatch
-from coec.runtime.worker.jobs import Drawn
+from coec.runtime.worker.jobs import RenderedImage
 from coec.runtime.worker.tasks import Solver
 
 
@@ -39,20 +39,22 @@ SOLVE = {"id": 5, "kind": "solve", "pair": "front", "path": "w"}
 
 
 def answer(fault: Exception, message: dict[str, Any]) -> dict[str, Any]:
-    return dispatch.answer(cast("Solver", FaultySolver(fault)), message)
+    return dispatch.answer_request(cast("Solver", FaultySolver(fault)), message)
 
 
 class Painter:
     """Draws its title, and infers whatever it is given."""
 
-    def overlay(self, _path: object, _pose: object, title: str) -> Drawn:
-        return Drawn(title.encode())
+    def overlay(self, _path: object, _pose: object, title: str) -> RenderedImage:
+        return RenderedImage(title.encode())
 
-    def comparison(self, _path: object, poses: list[object], names: list[str]) -> Drawn:
-        return Drawn(f"{len(poses)} {' '.join(names)}".encode())
+    def comparison(self, _path: object, poses: list[object], names: list[str]) -> RenderedImage:
+        return RenderedImage(f"{len(poses)} {' '.join(names)}".encode())
 
-    def picture(self, pair: str, _configuration: object, _pose: object, frames: list[object], title: str) -> Drawn:
-        return Drawn(f"{pair} {len(frames)} {title}".encode())
+    def picture(
+        self, pair: str, _configuration: object, _pose: object, frames: list[object], title: str
+    ) -> RenderedImage:
+        return RenderedImage(f"{pair} {len(frames)} {title}".encode())
 
     def prefetch(self, _pair: str, _frame: bytes) -> None:
         """Nothing to tell."""
@@ -60,16 +62,16 @@ class Painter:
 
 def test_an_answer_goes_under_the_number_of_its_question() -> None:
     painter = cast("Solver", Painter())
-    assert dispatch.answer(painter, {**OVERLAY, "title": "a"}) == {"id": 4, "result": {"jpeg": b"a"}}
+    assert dispatch.answer_request(painter, {**OVERLAY, "title": "a"}) == {"id": 4, "result": {"jpeg": b"a"}}
     picture = {**CHECK, "kind": "picture", "frames": [[]], "title": "b"}
-    assert dispatch.answer(painter, picture) == {"id": 3, "result": {"jpeg": b"front 1 b"}}
-    assert dispatch.answer(painter, COMPARISON) == {"id": 7, "result": {"jpeg": b"2 a b"}}
+    assert dispatch.answer_request(painter, picture) == {"id": 3, "result": {"jpeg": b"front 1 b"}}
+    assert dispatch.answer_request(painter, COMPARISON) == {"id": 7, "result": {"jpeg": b"2 a b"}}
     prefetch = {"id": 6, "kind": "prefetch", "pair": "front", "frame": b""}
-    assert dispatch.answer(painter, prefetch) == {"id": 6, "result": None}
+    assert dispatch.answer_request(painter, prefetch) == {"id": 6, "result": None}
 
 
 def test_a_question_that_nobody_knows_is_refused() -> None:
-    told = dispatch.answer(cast("Solver", Painter()), {"id": 7, "kind": "sing", "pair": "front"})
+    told = dispatch.answer_request(cast("Solver", Painter()), {"id": 7, "kind": "sing", "pair": "front"})
     assert told["refused"]["code"] == "internal_error"
     assert "'sing'" in told["refused"]["text"]
 

@@ -6,12 +6,12 @@ import numpy as np
 from coec.calibration.frames.pairing import Pairer
 from coec.config import LimitsConfig, PairingConfig
 from coec.runtime.worker.messages import pack_pairs, unpack_pairs
-from drives import drawn_source
+from drives import rendered_source
 
 
 def test_pairs_survive() -> None:
     pairer = Pairer(PairingConfig(), expects_motion=True)
-    recording = drawn_source("sim:seconds=2&camera_hz=1&lidar_hz=1&camera=fisheye64&lidar=16&depth=yes")
+    recording = rendered_source("sim:seconds=2&camera_hz=1&lidar_hz=1&camera=fisheye64&lidar=16&depth=yes")
     pairs = [pair for message in recording.messages() for pair in pairer.push(message)]
     pairs += pairer.flush()
     back = unpack_pairs(msgpack.unpackb(msgpack.packb([*pack_pairs(pairs)]), max_bin_len=2**30), LimitsConfig())

@@ -19,20 +19,20 @@ from hypothesis.stateful import (
 )
 
 from coec.calibration.types import Reason
-from coec.runtime.worker.jobs import DEADLINE_S, Drawn, Fate, Job, JobOutcome, Kind, Prefetch, Underway
+from coec.runtime.worker.jobs import DEADLINE_S, Fate, JobOutcome, Kind, Prefetch, RenderedImage, Underway, WorkerJob
 from coec.runtime.worker.queue import BUSY, PREFETCHES_WAITING, STOPPING, SUPERSEDED, WAITING, JobQueue, Lane, Ticket
 
-ANSWER = Drawn(b"")
+ANSWER = RenderedImage(b"")
 """Stands for any: the queue does not look into answers."""
 
 
 def a_job(
     subject: str, kind: Kind = Kind.SOLVE, pair: str = "front", live: bool = True, deadline_s: float | None = None
-) -> Job:
-    return Job(kind, pair, subject, {}, lambda _: None, live, deadline_s)
+) -> WorkerJob:
+    return WorkerJob(kind, pair, subject, {}, lambda _: None, live, deadline_s)
 
 
-def check(subject: str, pair: str = "front") -> Job:
+def check(subject: str, pair: str = "front") -> WorkerJob:
     return a_job(subject, Kind.CHECK, pair)
 
 
@@ -41,10 +41,10 @@ def ends(queue: JobQueue) -> list[tuple[str, Fate, str | None]]:
     return [(job.subject, o.fate, o.reason.code if o.reason else None) for job, o in queue.drain()]
 
 
-def asked(jobs: Iterable[Job], attempts: int = 2) -> JobQueue:
+def asked(jobs: Iterable[WorkerJob], attempts: int = 2) -> JobQueue:
     queue = JobQueue(attempts)
     for job in jobs:
-        queue.ask(job, 0.0)
+        queue.submit(job, 0.0)
     return queue
 
 
@@ -58,13 +58,13 @@ def begin(queue: JobQueue, now_s: float = 0.0) -> str:
 
 def subject_of(ticket: Ticket | None) -> str:
     assert ticket is not None
-    return ticket.work.subject if isinstance(ticket.work, Job) else "prefetch"
+    return ticket.work.subject if isinstance(ticket.work, WorkerJob) else "prefetch"
 
 
 def test_a_job_ends_with_its_answer_and_the_time_since_it_was_asked() -> None:
     queue = JobQueue(2)
     job = a_job("a")
-    queue.ask(job, 10.0)
+    queue.submit(job, 10.0)
     assert queue.waiting == {"solve": 1}
     begin(queue, 11.0)
     assert queue.waiting == {}
@@ -95,7 +95,7 @@ def test_checks_go_first_then_windows_errands_prefetches_the_backlog_and_commiss
         [a_job("old", live=False), a_job("picture", Kind.OVERLAY), a_job("baseline", Kind.COMMISSION), a_job("window")]
     )
     queue.prefetch(Prefetch("front", b""))
-    queue.ask(check("check"), 0.0)
+    queue.submit(check("check"), 0.0)
     order = []
     while (ticket := queue.take(0.0)) is not None:
         order.append(subject_of(ticket))
@@ -107,7 +107,7 @@ def test_checks_go_first_then_windows_errands_prefetches_the_backlog_and_commiss
 def test_a_window_that_checks_have_kept_waiting_goes_before_them() -> None:
     queue = asked([a_job("window")])
     for second in (0.0, 4.0, 8.0):
-        queue.ask(check(f"check {second:.0f}", "rear"), second)
+        queue.submit(check(f"check {second:.0f}", "rear"), second)
     order = []
     for now_s in (4.0, 8.0, 8.0, 8.0):
         order.append(begin(queue, now_s))
@@ -123,7 +123,7 @@ def test_a_commissioning_goes_on_only_when_nothing_else_waits() -> None:
     for number in range(1, 4):
         order.append(begin(queue))
         for other in (a_job(f"window {number}"), check(f"check {number}"), a_job(f"picture {number}", Kind.OVERLAY)):
-            queue.ask(other, 0.0)
+            queue.submit(other, 0.0)
         queue.answered(Underway("spread", number, 10), 0.0)
         assert queue.commissionings == {"front": Underway("spread", number, 10)}
         for _ in range(3):
@@ -139,14 +139,14 @@ def test_a_commissioning_goes_on_only_when_nothing_else_waits() -> None:
 
 def test_a_pair_has_one_commissioning_and_those_of_several_pairs_follow_each_other() -> None:
     queue = asked([a_job("front", Kind.COMMISSION), a_job("left", Kind.COMMISSION, "left")])
-    queue.ask(a_job("waiting already", Kind.COMMISSION), 0.0)
+    queue.submit(a_job("waiting already", Kind.COMMISSION), 0.0)
     assert begin(queue) == "front"
-    queue.ask(a_job("begun already", Kind.COMMISSION), 0.0)
+    queue.submit(a_job("begun already", Kind.COMMISSION), 0.0)
     queue.answered(Underway("windows", 1, 8), 0.0)
     assert ends(queue) == [("waiting already", Fate.FAILED, "busy"), ("begun already", Fate.FAILED, "busy")]
     assert begin(queue) == "front", "it is ended before the next one begins"
     queue.answered(ANSWER, 0.0)
-    queue.ask(a_job("front again", Kind.COMMISSION), 0.0)
+    queue.submit(a_job("front again", Kind.COMMISSION), 0.0)
     assert [begin(queue), queue.commissionings] == ["left", {"front": None, "left": None}]
 
 
@@ -154,7 +154,7 @@ def test_a_commissioning_begins_again_when_the_worker_dies_of_something_else() -
     queue = asked([a_job("baseline", Kind.COMMISSION)])
     begin(queue)
     queue.answered(Underway("spread", 4, 10), 0.0)
-    queue.ask(check("deadly"), 0.0)
+    queue.submit(check("deadly"), 0.0)
     assert begin(queue) == "deadly"
     queue.died("was ended by signal 9", 0.0)
     assert queue.commissionings == {"front": None}
@@ -176,7 +176,7 @@ def test_the_newest_checks_and_windows_of_a_pair_stay_and_pairs_do_not_push_each
     queue = asked([a_job("w0"), a_job("left-0", pair="left"), a_job("w1"), a_job("w2"), check("other", "left")])
     assert ends(queue) == [("w0", Fate.SUPERSEDED, "superseded")]
     for number in range(WAITING[Lane.CHECK] + 1):
-        queue.ask(check(f"c{number}"), 0.0)
+        queue.submit(check(f"c{number}"), 0.0)
     assert ends(queue) == [("c0", Fate.SUPERSEDED, "superseded")]
     assert queue.waiting == {"check": 1 + WAITING[Lane.CHECK], "solve": 3}
 
@@ -187,7 +187,7 @@ def test_the_newest_checks_and_windows_of_a_pair_stay_and_pairs_do_not_push_each
 def test_of_the_rest_the_oldest_stay(lane: Lane, kind: Kind, live: bool) -> None:
     queue = asked(a_job(str(number), kind, live=live) for number in range(WAITING[lane] + 1))
     assert ends(queue) == [(str(WAITING[lane]), Fate.FAILED, "busy")]
-    queue.ask(a_job("left", kind, "left", live), 0.0)
+    queue.submit(a_job("left", kind, "left", live), 0.0)
     assert ends(queue) == []
 
 
@@ -249,7 +249,7 @@ def test_a_window_that_comes_back_gives_way_to_newer_ones() -> None:
     queue = asked([a_job("a")])
     begin(queue)
     for name in "bc":
-        queue.ask(a_job(name), 0.0)
+        queue.submit(a_job(name), 0.0)
     queue.died("died", 0.0)
     assert ends(queue) == [("a", Fate.SUPERSEDED, "superseded")]
 
@@ -258,7 +258,7 @@ def test_an_errand_that_comes_back_to_a_full_room_has_failed() -> None:
     queue = asked([a_job("a", Kind.OVERLAY)])
     queue.take(0.0)
     for number in range(WAITING[Lane.ERRAND]):
-        queue.ask(a_job(str(number), Kind.OVERLAY), 0.0)
+        queue.submit(a_job(str(number), Kind.OVERLAY), 0.0)
     queue.died("broke the connection", 0.0)
     assert ends(queue) == [("a", Fate.FAILED, "worker_failed")]
 
@@ -272,7 +272,7 @@ def test_checks_that_kill_let_windows_go_first_until_one_is_answered() -> None:
     assert begin(queue) == "b"
     queue.answered(ANSWER, 0.0)
     assert begin(queue) == "c1"
-    queue.ask(a_job("c"), 0.0)
+    queue.submit(a_job("c"), 0.0)
     queue.answered(Reason("too_few_pairs", "dark"), 0.0)
     assert begin(queue) == "c2"
 
@@ -315,7 +315,7 @@ def test_at_a_stop_everything_is_answered_and_nothing_more_is_done() -> None:
         (subject, Fate.FAILED, STOPPING) for subject in ("c", "a", "old", "picture")
     }
     queue.answered(ANSWER, 2.0)
-    queue.ask(a_job("too late"), 3.0)
+    queue.submit(a_job("too late"), 3.0)
     queue.prefetch(Prefetch("front", b""))
     assert ends(queue) == [("too late", Fate.FAILED, "stopping")]
     assert queue.take(4.0) is None
@@ -348,7 +348,9 @@ def test_the_worker_has_one_thing_at_a_time() -> None:
         (Fate.LATE, None, None),
     ],
 )
-def test_an_outcome_has_either_an_answer_or_a_reason(fate: Fate, answer: Drawn | None, reason: Reason | None) -> None:
+def test_an_outcome_has_either_an_answer_or_a_reason(
+    fate: Fate, answer: RenderedImage | None, reason: Reason | None
+) -> None:
     with pytest.raises(ValueError, match="either an answer or a reason"):
         JobOutcome(fate, answer, reason, 0.0)
 
@@ -360,7 +362,7 @@ def test_an_outcome_has_either_an_answer_or_a_reason(fate: Fate, answer: Drawn |
 class Followed:
     """A job as the model knows it."""
 
-    job: Job
+    job: WorkerJob
     asked_s: float
     outcomes: list[JobOutcome] = field(default_factory=list)
     begun: int = 0
@@ -414,7 +416,7 @@ class QueueMachine(RuleBasedStateMachine):
                 a_job(str(len(self.jobs)), kind, pair, live or kind is not Kind.SOLVE, deadline_s), self.now_s
             )
             self.jobs.append(made)
-            self.queue.ask(made.job, self.now_s)
+            self.queue.submit(made.job, self.now_s)
             room = [other for other in self.waiting if (other.lane, other.job.pair) == (made.lane, pair)]
             full = len(room) == WAITING[made.lane]
             hand = self.hand

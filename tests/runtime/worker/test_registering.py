@@ -16,12 +16,12 @@ from coec.errors import SourceError
 from coec.geometry import se3
 from coec.runtime.worker import tasks
 from coec.runtime.worker.answers import MalformedAnswerError, pack_answer, read_answer
-from coec.runtime.worker.dispatch import answer
+from coec.runtime.worker.dispatch import answer_request
 from coec.runtime.worker.jobs import Fate, JobOutcome, Kind, Registered, register
 from coec.runtime.worker.messages import pack_lidars, unpack_lidars, unpack_sweeps
 from coec.runtime.worker.queue import JobQueue
 from coec.runtime.worker.tasks import Solver
-from pair_bench import configuration
+from pair_bench import pair_configuration
 
 T_A_B = se3.perturbation(np.array([0.02, -0.01, 0.4, 0.3, 0.5, -0.4]))
 RIG = LidarRig("roof", "bumper", T_A_B, np.eye(4), None, SweepTiming(0.1, -1, 0.5))
@@ -53,7 +53,7 @@ def question(*pairs: SweepPair) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def solver() -> Solver:
-    return Solver(configuration(Path("state")), 1)
+    return Solver(pair_configuration(Path("state")), 1)
 
 
 def test_a_question_carries_both_lidars_and_their_sweeps() -> None:
@@ -69,7 +69,7 @@ def test_a_question_carries_both_lidars_and_their_sweeps() -> None:
 
 def test_the_worker_finds_the_pose(solver: Solver) -> None:
     pytest.importorskip("small_gicp", reason="the extra `lidars` is not installed")
-    found = read_answer(answer(solver, question(sweeps())), Kind.REGISTER)
+    found = read_answer(answer_request(solver, question(sweeps())), Kind.REGISTER)
     assert isinstance(found, Registered)
     assert found.reasons == ()
     assert np.abs(se3.difference(found.T_a_b, T_A_B)).max() < 0.02
@@ -92,7 +92,7 @@ def test_hostile_clouds_are_answered(solver: Solver, name: str) -> None:
     pytest.importorskip("small_gicp", reason="the extra `lidars` is not installed")
     with np.errstate(over="ignore"):
         for pair in (sweeps(HOSTILE[name]), replace(sweeps(), a=sweeps(HOSTILE[name]).b)):
-            found = read_answer(answer(solver, question(pair)), Kind.REGISTER)
+            found = read_answer(answer_request(solver, question(pair)), Kind.REGISTER)
             assert isinstance(found, Registered | Reason)
             assert isinstance(found, Reason) or found.reasons
 
@@ -102,7 +102,7 @@ def test_without_the_extra_the_answer_says_what_to_install(solver: Solver, monke
         raise SourceError("LiDARs are registered with the optional extra `lidars`")
 
     monkeypatch.setattr(tasks, "Trees", absent)
-    found = read_answer(answer(solver, question(sweeps())), Kind.REGISTER)
+    found = read_answer(answer_request(solver, question(sweeps())), Kind.REGISTER)
     assert isinstance(found, Reason)
     assert "extra `lidars`" in found.text
 
@@ -139,7 +139,7 @@ def test_an_answer_that_is_none_is_refused(bad: Registered) -> None:
 def test_a_worker_that_is_killed_ends_the_registration() -> None:
     ended: list[JobOutcome] = []
     queue = JobQueue(attempts=2)
-    queue.ask(register("roof to bumper", RIG, [sweeps()], ended.append), 0.0)
+    queue.submit(register("roof to bumper", RIG, [sweeps()], ended.append), 0.0)
     assert queue.take(0.0) is not None
     queue.sent(0.0)
     queue.died("was ended by signal 9", 1.0)

@@ -33,14 +33,14 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 def test_there_is_none_where_nothing_is_compiled(started: list[subprocess.Popen[bytes]]) -> None:
     with second_compiler.second_compiler(CONFIG):
         pass
-    compile_news.tell("a kernel of somebody else's")
+    compile_news.notify("a kernel of somebody else's")
     assert started == []
 
 
 def test_there_is_one_from_the_first_kernel_to_the_end_of_the_warm_up(started: list[subprocess.Popen[bytes]]) -> None:
     with second_compiler.second_compiler(CONFIG):
-        compile_news.tell("one")
-        compile_news.tell("another")
+        compile_news.notify("one")
+        compile_news.notify("another")
         (child,) = started
         assert child.poll() is None
     assert child.returncode is not None
@@ -51,7 +51,7 @@ def test_there_is_none_beside_a_single_processor(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     with second_compiler.second_compiler(CONFIG):
-        compile_news.tell("one")
+        compile_news.notify("one")
     assert started == []
 
 

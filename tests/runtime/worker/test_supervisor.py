@@ -24,12 +24,12 @@ from coec.runtime.api.status import worker_status_of
 from coec.runtime.worker import compilation, jobs, link
 from coec.runtime.worker.child import Child, ChildError, Fault
 from coec.runtime.worker.costs import Cost
-from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Fate, Job, JobOutcome, Kind, Solved
+from coec.runtime.worker.jobs import Checked, Commissioned, Fate, JobOutcome, Kind, RenderedImage, Solved, WorkerJob
 from coec.runtime.worker.queue import BUSY
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas.base import to_msgpack
-from estimates import RIG, estimate
-from fakes import LET_GO, RESULT, SETTINGS, fake_worker_command, wait_until
+from estimates import ESTIMATE_RIG, estimate
+from fakes import RELEASE_FILE, RESULT_FILE, SETTINGS_FILE, fake_worker_command, wait_until
 
 DEADLINE_S = 30.0
 LIMITS = WorkerConfig(timeout_s=3600.0, max_memory_bytes=2**28, attempts=2)
@@ -53,13 +53,13 @@ class Bench:
         return lambda outcome: self.told.put((name, outcome))
 
     def solve(self, name: str, pair: str = "front", live: bool = True) -> None:
-        self.worker.ask(jobs.solve(pair, Path("/windows") / name, name, self.done(name), live))
+        self.worker.submit(jobs.solve(pair, Path("/windows") / name, name, self.done(name), live))
 
     def check(self, name: str, pairs: Sequence[FramePair] = ()) -> None:
-        self.worker.ask(jobs.check("front", CalibrationConfig(), POSE, pairs, self.done(name)))
+        self.worker.submit(jobs.check("front", CalibrationConfig(), POSE, pairs, self.done(name)))
 
     def overlay(self, name: str, deadline_s: float | None = None) -> None:
-        self.worker.ask(jobs.overlay("front", Path("/windows/w"), POSE, name, self.done(name), deadline_s))
+        self.worker.submit(jobs.overlay("front", Path("/windows/w"), POSE, name, self.done(name), deadline_s))
 
     def outcome(self) -> tuple[str, JobOutcome]:
         """The next one that is told."""
@@ -94,7 +94,7 @@ class Bench:
 
 @contextmanager
 def bench(command: Sequence[str], folder: Path, config: WorkerConfig = LIMITS, start: bool = True) -> Iterator[Bench]:
-    (folder / RESULT).write_bytes(to_msgpack(result_of(estimate(1), RIG, "test")))
+    (folder / RESULT_FILE).write_bytes(to_msgpack(result_of(estimate(1), ESTIMATE_RIG, "test")))
     made = Bench(Worker(config, "{}", command), folder)
     if start:
         made.worker.start()
@@ -130,19 +130,19 @@ def test_jobs_after_another_configuration_are_done_by_it(tmp_path: Path) -> None
         it.overlay("a")
         assert it.answer()[0] == "a"
         pid = it.worker.pid
-        it.worker.use("another")
+        it.worker.reconfigure("another")
         it.overlay("b")
         assert it.answer()[0] == "b"
-        assert (tmp_path / SETTINGS).read_text().splitlines() == [f"{pid} {{}}", f"{pid} another"]
+        assert (tmp_path / SETTINGS_FILE).read_text().splitlines() == [f"{pid} {{}}", f"{pid} another"]
         assert it.worker.status().starts == 1
 
 
 def test_a_worker_that_takes_the_place_of_another_has_the_latest_configuration(tmp_path: Path) -> None:
     with running("crash-once", tmp_path) as it:
-        it.worker.use("another")
+        it.worker.reconfigure("another")
         it.solve("a")
         assert it.answer() == ("a", "a")
-        assert (tmp_path / SETTINGS).read_text().splitlines()[-1].endswith(" another")
+        assert (tmp_path / SETTINGS_FILE).read_text().splitlines()[-1].endswith(" another")
         assert it.worker.status().starts == 2
 
 
@@ -151,7 +151,7 @@ def test_a_worker_that_takes_the_place_of_another_has_the_latest_configuration(t
 
 def test_all_processor_time_is_told_by_what_it_was_for(tmp_path: Path) -> None:
     """Of a process that is new, of each job before its outcome, and of one that dies with its job."""
-    (tmp_path / RESULT).write_bytes(to_msgpack(result_of(estimate(1), RIG, "test")))
+    (tmp_path / RESULT_FILE).write_bytes(to_msgpack(result_of(estimate(1), ESTIMATE_RIG, "test")))
     costs: list[Cost] = []
     command = fake_worker_command("crash-once", tmp_path)
     it = Bench(Worker(LIMITS, "{}", command, costs.append), tmp_path)
@@ -187,8 +187,8 @@ def test_each_kind_comes_back_with_its_answer(tmp_path: Path) -> None:
         assert (name, type(checked), checked.observation.offset[0]) == ("c", Checked, 0.25)
         assert checked.baseline_not_used == "0 pairs"
         it.overlay("picture")
-        assert it.answer() == ("picture", Drawn(b"picture"))
-        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig")))
+        assert it.answer() == ("picture", RenderedImage(b"picture"))
+        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig")))
         name, rig = it.answer()
         assert (name, type(rig), rig.windows, rig.pairs, rig.baseline_hash) == ("rig", Commissioned, 2, 7, "b" * 16)
         np.testing.assert_array_equal(rig.pose, POSE)
@@ -204,15 +204,15 @@ def test_other_work_is_done_between_the_slices_of_a_commissioning(tmp_path: Path
         it.check("c")
         wait_until(lambda: it.worker.status().state is WorkerState.BUSY, "the check")
         windows = [Path("a"), Path("b"), Path("c")]
-        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig")))
-        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig again")))
+        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig")))
+        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig again")))
         assert it.failure() == ("rig again", BUSY)
         assert it.worker.commissioning("front") == "waiting for the worker"
         assert it.worker.commissioning("rear") is None
         assert worker_status_of(it.worker).commissioning == {"front": "waiting for the worker"}
         for name in ("w1", "w2"):
             it.solve(name)
-        (tmp_path / LET_GO).touch()
+        (tmp_path / RELEASE_FILE).touch()
         assert [it.answer()[0] for _ in range(4)] == ["c", "w1", "w2", "rig"]
         assert (it.worker.commissioning("front"), it.worker.status().starts) == (None, 1)
         assert it.worker.status().outcomes == {Fate.RESULT: 4, Fate.FAILED: 1}
@@ -221,7 +221,7 @@ def test_other_work_is_done_between_the_slices_of_a_commissioning(tmp_path: Path
 @pytest.mark.fault("the worker is replaced during a commissioning", "it begins again with the next worker")
 def test_a_commissioning_outlives_a_worker_that_dies_of_something_else(tmp_path: Path) -> None:
     with waiting("crash-once", tmp_path, at="check") as it:
-        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig")))
+        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig")))
         it.check("c")
         it.worker.start()
         name, reason = it.failure()
@@ -233,7 +233,7 @@ def test_a_commissioning_outlives_a_worker_that_dies_of_something_else(tmp_path:
 @pytest.mark.fault("the worker dies of a commissioning", "it ends with the reason; the worker is replaced")
 def test_a_commissioning_that_kills_the_worker_has_failed(tmp_path: Path) -> None:
     with running("crash-once", tmp_path, at="commission") as it:
-        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, [Path("a")], it.done("rig")))
+        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, [Path("a")], it.done("rig")))
         name, reason = it.failure()
         assert (name, reason.code) == ("rig", "worker_failed")
         it.check("c")
@@ -337,10 +337,10 @@ def test_what_is_said_twice_answers_no_other_question(tmp_path: Path) -> None:
         for name in "abc":
             it.overlay(name)
         told = dict(it.outcome() for _ in range(3))
-        assert told["a"].answer == Drawn(b"a")
+        assert told["a"].answer == RenderedImage(b"a")
         for name in "bc":
             answer, reason = told[name].answer, told[name].reason
-            assert answer == Drawn(name.encode()) or (reason is not None and reason.code == "worker_failed")
+            assert answer == RenderedImage(name.encode()) or (reason is not None and reason.code == "worker_failed")
         assert it.faults() == {Fault.STRAY_ANSWER: 1}
 
 
@@ -396,11 +396,11 @@ def test_a_check_that_a_worker_does_not_take_goes_to_the_next_one(
 
 def test_a_job_that_cannot_be_put_into_bytes_fails_alone(tmp_path: Path) -> None:
     with running("none", tmp_path) as it:
-        it.worker.ask(Job(Kind.OVERLAY, "front", "odd", {"path": object()}, it.done("odd")))
+        it.worker.submit(WorkerJob(Kind.OVERLAY, "front", "odd", {"path": object()}, it.done("odd")))
         name, reason = it.failure()
         assert (name, reason.code) == ("odd", "unsendable")
         it.overlay("next")
-        assert it.answer() == ("next", Drawn(b"next"))
+        assert it.answer() == ("next", RenderedImage(b"next"))
         assert it.faults() == {Fault.UNSENDABLE_JOB: 1}
 
 
@@ -426,9 +426,9 @@ def test_an_answer_that_is_late_is_no_fault_and_the_worker_goes_on(tmp_path: Pat
         name, outcome = it.outcome()
         assert (name, outcome.fate) == ("slow", Fate.LATE)
         assert outcome.elapsed_s >= 2.0
-        (tmp_path / LET_GO).touch()
+        (tmp_path / RELEASE_FILE).touch()
         it.overlay("next")
-        assert it.answer() == ("next", Drawn(b"next"))
+        assert it.answer() == ("next", RenderedImage(b"next"))
         assert (it.worker.status().starts, it.faults()) == (1, {})
         assert it.worker.status().losses == {"deadline_passed": 1, "late_answer": 1}
 
@@ -449,7 +449,7 @@ def test_what_waits_behind_a_worker_that_hangs_is_answered_in_time(tmp_path: Pat
 
 def test_a_worker_may_have_less_time_for_one_job_than_for_others(tmp_path: Path) -> None:
     with running("hang-once", tmp_path) as it:
-        it.worker.ask(replace(jobs.solve("front", Path("a"), "a", it.done("a")), timeout_s=0.2))
+        it.worker.submit(replace(jobs.solve("front", Path("a"), "a", it.done("a")), timeout_s=0.2))
         assert it.answer() == ("a", "a")
         assert it.faults() == {Fault.TIMED_OUT: 1}
 
@@ -496,9 +496,9 @@ def test_whoever_fails_to_take_an_outcome_harms_nobody_else(tmp_path: Path, capl
 
     with running("none", tmp_path) as it:
         it.jobs.append("a")
-        it.worker.ask(jobs.overlay("front", Path("a"), POSE, "a", fail))
+        it.worker.submit(jobs.overlay("front", Path("a"), POSE, "a", fail))
         it.overlay("b")
-        assert it.answer() == ("b", Drawn(b"b"))
+        assert it.answer() == ("b", RenderedImage(b"b"))
         assert it.worker.status().losses == {"done_raised": 1}
         assert it.worker.status().outcomes == {Fate.RESULT: 2}
     assert "nobody is at home" in caplog.text
@@ -516,8 +516,8 @@ def test_an_outcome_is_told_without_a_lock(tmp_path: Path) -> None:
             it.overlay("next")
 
         it.jobs.append("first")
-        it.worker.ask(jobs.overlay("front", Path("a"), POSE, "first", told))
-        assert it.answer() == ("next", Drawn(b"next"))
+        it.worker.submit(jobs.overlay("front", Path("a"), POSE, "first", told))
+        assert it.answer() == ("next", RenderedImage(b"next"))
     assert statuses.get_nowait() in (WorkerState.BUSY, WorkerState.READY)
 
 
@@ -546,7 +546,7 @@ def test_no_time_limit_counts_the_time_of_compiling(tmp_path: Path) -> None:
         assert (status.state, status.restarts, status.waiting) == ("starting", 0, {"solve": 1, "overlay": 1})
         assert status.compiling is not None
         assert status.compiling.elapsed_s > 2.5
-        (tmp_path / LET_GO).touch()
+        (tmp_path / RELEASE_FILE).touch()
         assert {it.answer()[0] for _ in range(2)} == {"a", "picture"}
         assert (it.worker.status().starts, it.faults(), compiling(it)) == (1, {}, None)
         assert not it.worker.warms_up
@@ -559,7 +559,7 @@ def test_a_check_is_refused_while_a_worker_that_starts_compiles_kernels(tmp_path
         name, reason = it.failure()
         assert (name, reason.code) == ("early", "compiling_kernels")
         assert "0 of 3" in reason.text
-        (tmp_path / LET_GO).touch()
+        (tmp_path / RELEASE_FILE).touch()
         wait_until(lambda: it.worker.status().state is WorkerState.READY, "ready")
         it.check("c")
         assert it.answer()[0] == "c"
@@ -584,7 +584,7 @@ def test_a_job_for_which_kernels_are_compiled_has_its_time_besides(tmp_path: Pat
         it.solve("a")
         wait_until(lambda: it.worker.compiled_s > IMPATIENT.timeout_s + 0.5, "longer than a job may take")
         assert not it.worker.warms_up, "checks wait, as they do for any job"
-        (tmp_path / LET_GO).touch()
+        (tmp_path / RELEASE_FILE).touch()
         assert it.answer() == ("a", "a")
         assert it.worker.status().starts == 1
 
@@ -596,7 +596,7 @@ def test_kernels_that_no_check_needs_are_compiled_when_nothing_else_waits(tmp_pa
         assert it.answer()[0] == "c"
         wait_until(lambda: compiling(it) == (2, 3), "the compilation")
         it.check("next")
-        (tmp_path / LET_GO).touch()
+        (tmp_path / RELEASE_FILE).touch()
         assert it.answer()[0] == "next"
         wait_until(lambda: compiling(it) is None, "the end of it")
         assert (it.worker.status().starts, it.faults()) == (1, {})

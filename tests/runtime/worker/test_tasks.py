@@ -12,7 +12,7 @@ from coec.config import Config, LidarConfig
 from coec.errors import CalibrationError
 from coec.runtime.worker import warm_up
 from coec.runtime.worker.tasks import Solver
-from warm import LENSES, pairs
+from warm import LENSES, pair_configs
 
 SCRIPT = """
 import gc
@@ -72,7 +72,7 @@ def test_pairs_that_differ_in_numbers_alone_are_warmed_up_once(monkeypatch: pyte
 
     monkeypatch.setattr(warm_up, "calibrate", calibrated)
     monkeypatch.setattr(warm_up, "diagnose", calibrated)
-    one, other = (next(iter(pairs([lens]))) for lens in LENSES[:2])
+    one, other = (next(iter(pair_configs([lens]))) for lens in LENSES[:2])
     another = one.model_copy(update={"name": "another", "lidar": LidarConfig(key="another/lidar")})
     Solver(Config(pairs=(one, another, other)), 1).warm_up()
     assert len(set(warmed)) == 2

@@ -10,24 +10,24 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 from coec.geometry.projection import unproject
 from coec.simulation.training import files, recipe
 from coec.simulation.training.augment import augment, target
-from coec.simulation.training.places import CROWDED, Hall, Jam, Street, places
-from coec.simulation.training.shown import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, Shown
+from coec.simulation.training.places import CROWDED, HallScene, JamScene, StreetScene, training_scenes
+from coec.simulation.training.shown import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, TrainingFrame
 
 
 @pytest.fixture(scope="module")
-def some() -> list[Shown]:
+def some() -> list[TrainingFrame]:
     frames = recipe.frames(5)
     return [next(frames) for _ in range(3)]
 
 
-def test_a_seed_gives_the_same_frames_again(some: list[Shown]) -> None:
+def test_a_seed_gives_the_same_frames_again(some: list[TrainingFrame]) -> None:
     again = next(recipe.frames(5))
     assert again.kind == some[0].kind
     np.testing.assert_array_equal(again.bgr, some[0].bgr)
     np.testing.assert_array_equal(again.code, some[0].code)
 
 
-def test_frames_have_their_kinds_shape_and_something_to_learn(some: list[Shown]) -> None:
+def test_frames_have_their_kinds_shape_and_something_to_learn(some: list[TrainingFrame]) -> None:
     for shown in some:
         assert shown.code.shape == SHAPES[shown.kind] == shown.bgr.shape[:2]
         surface = shown.code > SKY
@@ -37,11 +37,11 @@ def test_frames_have_their_kinds_shape_and_something_to_learn(some: list[Shown])
 
 
 def test_crowded_seeds_have_jams_and_halls_and_near_things_high_up() -> None:
-    kinds = [type(place) for place, _ in places(CROWDED)]
-    assert kinds == [Hall, Jam, Hall]
-    assert [type(place) for place, _ in places(4)] == [Street] * 3
-    (hall, rng), *_ = places(CROWDED)
-    scene, pose = hall.draw_scene(rng), hall.stand(hall.draw_spot(rng), rng)
+    kinds = [type(place) for place, _ in training_scenes(CROWDED)]
+    assert kinds == [HallScene, JamScene, HallScene]
+    assert [type(place) for place, _ in training_scenes(4)] == [StreetScene] * 3
+    (hall, rng), *_ = training_scenes(CROWDED)
+    scene, pose = hall.sample_scene(rng), hall.stand(hall.sample_spot(rng), rng)
     up = np.tile(np.array([[0.0, 0.0, 1.0]], np.float32), (5, 1))
     ceiling_m = scene.cast(pose[:3, 3] + [0.0, 0.0, 1.5], up, 0.0).range_m
     assert 0.0 < ceiling_m.max() < 7.0
@@ -51,7 +51,7 @@ def test_crowded_seeds_have_jams_and_halls_and_near_things_high_up() -> None:
 def test_drawn_cameras_see_all_that_they_should(kind: str) -> None:
     rng = np.random.default_rng(3)
     for _ in range(5):
-        eye = recipe.draw_eye(kind, rng)
+        eye = recipe.sample_camera(kind, rng)
         height, width = SHAPES[kind]
         assert (eye.camera.height, eye.camera.width) == (height, width)
         middle = np.array([[eye.camera.cx, eye.camera.cy]])
@@ -65,7 +65,7 @@ def test_shares_of_the_kinds_sum_to_one() -> None:
     assert {name for name, _ in KINDS} == set(SHAPES)
 
 
-def test_files_give_back_what_was_written(tmp_path: Path, some: list[Shown]) -> None:
+def test_files_give_back_what_was_written(tmp_path: Path, some: list[TrainingFrame]) -> None:
     path = files.write(tmp_path, 12, some)
     files.write(tmp_path, 3, some[:1])
     assert files.towns(tmp_path) == [files.path_of(tmp_path, 3), path]
@@ -85,8 +85,8 @@ def test_augmented_frames_are_seeded_and_keep_picture_and_target_together() -> N
     code[:, 200:] = 6000
     bgr = np.where(code[:, :, None] > 3000, 220, 30).astype(np.uint8).repeat(3, axis=2)
     for seed in range(20):
-        rgb, wanted = augment(Shown("wide", bgr, code), 128, 224, np.random.default_rng(seed))
-        again, _ = augment(Shown("wide", bgr, code), 128, 224, np.random.default_rng(seed))
+        rgb, wanted = augment(TrainingFrame("wide", bgr, code), 128, 224, np.random.default_rng(seed))
+        again, _ = augment(TrainingFrame("wide", bgr, code), 128, 224, np.random.default_rng(seed))
         np.testing.assert_array_equal(rgb, again)
         assert rgb.shape == (128, 224, 3)
         assert rgb.dtype == np.float32

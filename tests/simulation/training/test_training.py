@@ -14,17 +14,17 @@ from coec.simulation.training import files
 from coec.simulation.training.export import export, same
 from coec.simulation.training.loss import loss
 from coec.simulation.training.network import StreetNet
-from coec.simulation.training.shown import SHAPES, Shown
+from coec.simulation.training.shown import SHAPES, TrainingFrame
 from coec.simulation.training.train import RATE, WARM_STEPS, rate, train
 
 
-def _ramps() -> list[Shown]:
+def _ramps() -> list[TrainingFrame]:
     """Brighter is nearer: what a network learns in a few steps."""
     frames = []
     for kind, (height, width) in SHAPES.items():
         code = np.linspace(600, 20000, width, dtype=np.uint16)[None, :].repeat(height, axis=0)
         bgr = np.linspace(20, 240, width).astype(np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
-        frames.append(Shown(kind, bgr, code))
+        frames.append(TrainingFrame(kind, bgr, code))
     return frames
 
 

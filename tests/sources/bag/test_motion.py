@@ -8,30 +8,30 @@ import numpy as np
 import pytest
 from rosbags.typesys.stores import ros2_humble as ros
 
-from bags import Bag, a_drive, a_joint, a_timed_cloud, an_imu, header
+from bags import Bag, drive_messages, imu_message, ros_header, timed_cloud_message, transform_message
 from coec.calibration.types import EgoMotion, LidarFrame
 from coec.errors import SourceError, UsageError
 from coec.geometry import se3
 from coec.sources import open_source
-from coec.sources.recording import Recording
+from coec.sources.recording import RecordingSource
 
 SECOND = 10**9
 TWIST = np.array([0.0, 0.0, 0.3, 5.0, 0.0, 0.0])
 """Turning at 5 m/s, the vehicle's own."""
 
 Message = tuple[str, Any]
-WITHOUT = [message for message in a_drive() if message[0] != "/odom"]
+WITHOUT = [message for message in drive_messages() if message[0] != "/odom"]
 
 
 def poses(parent: str = "odom", child: str = "base_link", topic: str = "/tf") -> list[Message]:
     """20 ms apart, among the joints of a robot."""
-    wheel = a_joint("base_link", "wheel", np.eye(4), SECOND)
-    joints = (a_joint(parent, child, se3.exp(TWIST * k * 0.02), SECOND + k * 20_000_000) for k in range(20))
+    wheel = transform_message("base_link", "wheel", np.eye(4), SECOND)
+    joints = (transform_message(parent, child, se3.exp(TWIST * k * 0.02), SECOND + k * 20_000_000) for k in range(20))
     return [(topic, ros.tf2_msgs__msg__TFMessage([wheel, joint])) for joint in joints]
 
 
 def imus(topic: str = "/imu") -> list[Message]:
-    return [(topic, an_imu(SECOND + k * 10_000_000, 0.01 * k)) for k in range(40)]
+    return [(topic, imu_message(SECOND + k * 10_000_000, 0.01 * k)) for k in range(40)]
 
 
 def twists() -> list[Message]:
@@ -40,19 +40,19 @@ def twists() -> list[Message]:
     )
     covered = ros.geometry_msgs__msg__TwistWithCovariance(twist, np.zeros(36))
     stamped = ros.geometry_msgs__msg__TwistWithCovarianceStamped
-    return [("/twist", stamped(header(SECOND + k * 20_000_000, "base"), covered)) for k in range(20)]
+    return [("/twist", stamped(ros_header(SECOND + k * 20_000_000, "base"), covered)) for k in range(20)]
 
 
-def opened(folder: Path, messages: list[Message], query: str = "") -> Recording:
+def opened(folder: Path, messages: list[Message], query: str = "") -> RecordingSource:
     return open_source(f"{Bag(messages).write(folder / 'bag.mcap')}{query}")
 
 
-def motions(recording: Recording, cameras: list[int] | None = None) -> list[EgoMotion]:
+def motions(recording: RecordingSource, cameras: list[int] | None = None) -> list[EgoMotion]:
     return [message for message in recording.messages(cameras) if isinstance(message, EgoMotion)]
 
 
 def test_a_velocity_comes_before_transforms_and_these_before_turn_rates(tmp_path: Path) -> None:
-    everything = [*a_drive(), *poses(), *imus()]
+    everything = [*drive_messages(), *poses(), *imus()]
     assert {m.frame_id for m in motions(opened(tmp_path, everything))} == {"base"}
     assert {m.frame_id for m in motions(opened(tmp_path, [*WITHOUT, *twists(), *poses(), *imus()]))} == {"base"}
     assert {m.frame_id for m in motions(opened(tmp_path, [*WITHOUT, *imus(), *poses()]))} == {"base_link"}
@@ -73,7 +73,7 @@ def test_the_motion_in_transforms(tmp_path: Path) -> None:
 
 
 def test_any_topic_of_motion_is_taken_that_is_asked_for(tmp_path: Path) -> None:
-    everything = [*a_drive(), *poses(), *imus(), *imus("/imu2")]
+    everything = [*drive_messages(), *poses(), *imus(), *imus("/imu2")]
     turning = motions(opened(tmp_path, everything, "?odometry=/imu2"))
     assert [m.angular_radps[2] for m in turning] == pytest.approx([0.01 * k for k in range(40)])
     assert len(motions(opened(tmp_path, everything, "?odometry=/tf"))) == 19
@@ -94,7 +94,7 @@ def test_points_are_timed_as_their_values_or_a_person_say(tmp_path: Path) -> Non
     cameras = [m for m in WITHOUT if m[0] != "/points"]
 
     def sweep_of(name: str, times: list[float], query: str = "") -> LidarFrame:
-        cloud = ("/points", a_timed_cloud(SECOND + 4_000_000, name, times))
+        cloud = ("/points", timed_cloud_message(SECOND + 4_000_000, name, times))
         return next(m for m in opened(tmp_path, [*cameras, cloud], query).messages() if isinstance(m, LidarFrame))
 
     assert sweep_of("timestamp", [1.004, 1.104]).timed_by.startswith(

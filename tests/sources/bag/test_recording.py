@@ -19,14 +19,14 @@ from bags import (
     TREE,
     WIDTH,
     Bag,
-    a_cloud,
-    a_drive,
-    a_joint,
-    a_raw_image,
-    a_timed_cloud,
-    an_image,
-    an_info,
-    an_odometry,
+    camera_info_message,
+    cloud_message,
+    compressed_image_message,
+    drive_messages,
+    odometry_message,
+    raw_image_message,
+    timed_cloud_message,
+    transform_message,
 )
 from coec.adapters.mcap.windows import WindowWriter, read_window
 from coec.calibration.frames.pairing import Pairer
@@ -39,7 +39,7 @@ from coec.sources import open_source
 
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_a_bag_is_read_by_sensor_time_with_its_rig_from_the_bag(tmp_path: Path, compression: CompressionType) -> None:
-    path = Bag(a_drive(), compression).write(tmp_path / "drive one.mcap")
+    path = Bag(drive_messages(), compression).write(tmp_path / "drive one.mcap")
     recording = open_source(str(path))
     assert recording.rig.pair == "drive_one"
     assert recording.rig.camera == cameras.build("pinhole", width=WIDTH, height=HEIGHT, fx=50, fy=51, cx=31.5, cy=23.5)
@@ -58,7 +58,7 @@ def test_a_bag_is_read_by_sensor_time_with_its_rig_from_the_bag(tmp_path: Path, 
 
 
 def test_a_cloud_in_the_vehicles_frame_is_taken_back_to_the_lidars(tmp_path: Path) -> None:
-    drive = a_drive(tree=[a_joint("lidar", "roof", T_BASE_LIDAR), *TREE])
+    drive = drive_messages(tree=[transform_message("lidar", "roof", T_BASE_LIDAR), *TREE])
     recording = open_source(f"{Bag(drive).write(tmp_path / 'b.mcap')}?lidar_frame=roof")
     assert recording.rig.lidar_frame == "roof"
     T_camera_roof = se3.inverse(T_BASE_MOUNT @ T_MOUNT_OPTICAL) @ T_BASE_LIDAR @ T_BASE_LIDAR
@@ -72,7 +72,7 @@ def test_a_cloud_in_the_vehicles_frame_is_taken_back_to_the_lidars(tmp_path: Pat
 
 def numbered_cloud(stamp_ns: int) -> Any:
     """Three points of LiDAR 0 at 1 m, one of LiDAR 1 at 4 m."""
-    message = a_cloud(stamp_ns)
+    message = cloud_message(stamp_ns)
     points = np.zeros(4, [("xyz", "<f4", 3), ("lidar_id", "u1")])
     points["xyz"], points["lidar_id"] = np.array([[1], [1], [1], [4]]), [0, 0, 0, 1]
     number = ros.sensor_msgs__msg__PointField("lidar_id", 12, 2, 1)
@@ -83,7 +83,7 @@ def numbered_cloud(stamp_ns: int) -> Any:
 def test_one_lidar_of_a_cloud_of_several_is_chosen(tmp_path: Path) -> None:
     drive = [
         (topic, numbered_cloud(5 + number) if topic == "/points" else message)
-        for number, (topic, message) in enumerate(a_drive())
+        for number, (topic, message) in enumerate(drive_messages())
     ]
     path = Bag(drive).write(tmp_path / "b.mcap")
     with pytest.raises(SourceError, match=r"concatenated: its lidar_id has 0, 1; choose one"):
@@ -95,12 +95,12 @@ def test_one_lidar_of_a_cloud_of_several_is_chosen(tmp_path: Path) -> None:
 
 
 def test_a_bag_without_chunks(tmp_path: Path) -> None:
-    path = Bag(a_drive(), chunking=False).write(tmp_path / "bag.mcap")
+    path = Bag(drive_messages(), chunking=False).write(tmp_path / "bag.mcap")
     assert len(list(open_source(str(path)).messages())) == 4 + 8 + 20
 
 
 def test_chosen_frames_form_the_pairs_that_they_form_in_the_whole(tmp_path: Path) -> None:
-    recording = open_source(str(Bag(a_drive()).write(tmp_path / "bag.mcap")))
+    recording = open_source(str(Bag(drive_messages()).write(tmp_path / "bag.mcap")))
 
     def pairs(cameras: list[int] | None) -> list[tuple[int, int, EgoMotion | None]]:
         pairer = Pairer(PairingConfig(), expects_motion=True)
@@ -115,14 +115,14 @@ def test_chosen_frames_form_the_pairs_that_they_form_in_the_whole(tmp_path: Path
 
 
 def test_clouds_without_a_stamp_are_read_by_the_times_of_their_points(tmp_path: Path) -> None:
-    drive = a_drive()
+    drive = drive_messages()
     for _, message in drive[2:]:
         message.header.stamp.sec += 1_700_000_000
     stamped = open_source(str(Bag(drive).write(tmp_path / "stamped.mcap")))
 
     def unstamped(message: Any) -> Any:
         begin_s = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-        return a_timed_cloud(0, "timestamp", [begin_s, begin_s + 0.05])
+        return timed_cloud_message(0, "timestamp", [begin_s, begin_s + 0.05])
 
     messages = [(topic, unstamped(message) if topic == "/points" else message) for topic, message in drive]
     recording = open_source(str(Bag(messages).write(tmp_path / "bag.mcap")))
@@ -133,9 +133,9 @@ def test_clouds_without_a_stamp_are_read_by_the_times_of_their_points(tmp_path: 
 
 
 def test_several_topics_of_a_type_have_to_be_chosen_from(tmp_path: Path) -> None:
-    path = Bag([*a_drive(), ("/rear/image", an_image(5)), ("/imu/odom", an_odometry(5, 1.0))]).write(
-        tmp_path / "b.mcap"
-    )
+    path = Bag(
+        [*drive_messages(), ("/rear/image", compressed_image_message(5)), ("/imu/odom", odometry_message(5, 1.0))]
+    ).write(tmp_path / "b.mcap")
     with pytest.raises(
         SourceError, match=r"several topics for camera, choose one with \?camera=.*/front/image \(.*/rear"
     ):
@@ -152,28 +152,31 @@ def test_several_topics_of_a_type_have_to_be_chosen_from(tmp_path: Path) -> None
     ("info", "expected"),
     [
         (
-            an_info("plumb_bob", [0.1, 0.2, 0.3, 0.4, 0.5]),
+            camera_info_message("plumb_bob", [0.1, 0.2, 0.3, 0.4, 0.5]),
             ("radtan", {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5}),
         ),
         (
-            an_info("plumb_bob", [0.1, 0.2, 0.3, 0.4]),
+            camera_info_message("plumb_bob", [0.1, 0.2, 0.3, 0.4]),
             ("radtan", {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.0}),
         ),
         (
-            an_info("rational_polynomial", [0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0]),
+            camera_info_message("rational_polynomial", [0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0]),
             ("radtan", {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5}),
         ),
         (
-            an_info("equidistant", [0.1, 0.2, 0.3, 0.4]),
+            camera_info_message("equidistant", [0.1, 0.2, 0.3, 0.4]),
             ("kannala_brandt", {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}),
         ),
-        (an_info("fisheye", [0.1, 0.2, 0.3, 0.4]), ("kannala_brandt", {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4})),
-        (an_info("double_sphere", [-0.2, 0.6]), ("double_sphere", {"xi": -0.2, "alpha": 0.6})),
-        (an_info("", []), ("pinhole", {})),
+        (
+            camera_info_message("fisheye", [0.1, 0.2, 0.3, 0.4]),
+            ("kannala_brandt", {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}),
+        ),
+        (camera_info_message("double_sphere", [-0.2, 0.6]), ("double_sphere", {"xi": -0.2, "alpha": 0.6})),
+        (camera_info_message("", []), ("pinhole", {})),
     ],
 )
 def test_camera_info_becomes_a_camera(tmp_path: Path, info: Any, expected: tuple[str, dict[str, float]]) -> None:
-    path = Bag(a_drive(info=info)).write(tmp_path / "bag.mcap")
+    path = Bag(drive_messages(info=info)).write(tmp_path / "bag.mcap")
     model, distortion = expected
     camera = cameras.build(model, width=WIDTH, height=HEIGHT, fx=50, fy=51, cx=31.5, cy=23.5, **distortion)
     assert open_source(str(path)).rig.camera == camera
@@ -182,15 +185,15 @@ def test_camera_info_becomes_a_camera(tmp_path: Path, info: Any, expected: tuple
 @pytest.mark.parametrize(
     ("info", "complaint"),
     [
-        (an_info("rational_polynomial", [0.1] * 14), "thin prisms"),
-        (an_info("oblique", [0.1] * 4), "distortion model of this name is not known"),
-        (an_info("equidistant", [0.1] * 3), "parameters k1 k2 k3 k4; here are 3"),
-        (an_info("plumb_bob", [], width=63), "images are 64 x 48 px, the intrinsics are for 63 x 48"),
-        (an_info("plumb_bob", [float("nan")] * 5), "not finite"),
+        (camera_info_message("rational_polynomial", [0.1] * 14), "thin prisms"),
+        (camera_info_message("oblique", [0.1] * 4), "distortion model of this name is not known"),
+        (camera_info_message("equidistant", [0.1] * 3), "parameters k1 k2 k3 k4; here are 3"),
+        (camera_info_message("plumb_bob", [], width=63), "images are 64 x 48 px, the intrinsics are for 63 x 48"),
+        (camera_info_message("plumb_bob", [float("nan")] * 5), "not finite"),
     ],
 )
 def test_camera_info_that_cannot_be_used(tmp_path: Path, info: Any, complaint: str) -> None:
-    path = Bag(a_drive(info=info)).write(tmp_path / "bag.mcap")
+    path = Bag(drive_messages(info=info)).write(tmp_path / "bag.mcap")
     with pytest.raises(SourceError, match=complaint):
         open_source(str(path))
 
@@ -203,7 +206,7 @@ mask: mask.png
 
 
 def test_a_file_gives_what_the_bag_lacks(tmp_path: Path) -> None:
-    messages = [(topic, message) for topic, message in a_drive(tree=[]) if topic != "/front/camera_info"]
+    messages = [(topic, message) for topic, message in drive_messages(tree=[]) if topic != "/front/camera_info"]
     path = Bag(messages).write(tmp_path / "bag.mcap")
     with pytest.raises(SourceError, match=r"0 camera infos fit.*there: none"):
         open_source(str(path))
@@ -223,44 +226,44 @@ def test_a_file_gives_what_the_bag_lacks(tmp_path: Path) -> None:
 
 
 def test_frames_that_no_transform_connects(tmp_path: Path) -> None:
-    path = Bag(a_drive(tree=TREE[:1])).write(tmp_path / "bag.mcap")
+    path = Bag(drive_messages(tree=TREE[:1])).write(tmp_path / "bag.mcap")
     with pytest.raises(SourceError, match="/tf_static does not connect 'optical' and 'lidar'"):
         open_source(str(path))
-    broken = a_joint("base", "lidar", T_BASE_LIDAR)
+    broken = transform_message("base", "lidar", T_BASE_LIDAR)
     broken.transform.rotation = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 0.0)
-    path = Bag(a_drive(tree=[broken])).write(tmp_path / "bag.mcap")
+    path = Bag(drive_messages(tree=[broken])).write(tmp_path / "bag.mcap")
     with pytest.raises(SourceError, match="on /tf_static is refused: not a rigid transform"):
         open_source(str(path))
 
 
 @pytest.mark.parametrize("x_m", [np.nan, np.inf, -1e308])
 def test_a_transform_to_nowhere_is_refused(tmp_path: Path, x_m: float) -> None:
-    broken = a_joint("base", "lidar", T_BASE_LIDAR)
+    broken = transform_message("base", "lidar", T_BASE_LIDAR)
     broken.transform.translation = ros.geometry_msgs__msg__Vector3(x_m, 0.0, 0.0)
-    path = Bag(a_drive(tree=[broken, *TREE[1:]])).write(tmp_path / "bag.mcap")
+    path = Bag(drive_messages(tree=[broken, *TREE[1:]])).write(tmp_path / "bag.mcap")
     with pytest.raises(SourceError, match="on /tf_static is refused: not a rigid transform"):
         open_source(str(path))
 
 
 def test_the_camera_info_of_the_cameras_frame_is_taken(tmp_path: Path) -> None:
-    other = ("/rear/camera_info", an_info("equidistant", [0.1] * 4, frame_id="rear"))
-    path = Bag([other, *a_drive()]).write(tmp_path / "bag.mcap")
+    other = ("/rear/camera_info", camera_info_message("equidistant", [0.1] * 4, frame_id="rear"))
+    path = Bag([other, *drive_messages()]).write(tmp_path / "bag.mcap")
     assert cameras.name_of(open_source(str(path)).rig.camera) == "pinhole"
     named = open_source(f"{path}?intrinsics=/rear/camera_info")
     assert cameras.name_of(named.rig.camera) == "kannala_brandt"
 
 
 def test_raw_images(tmp_path: Path) -> None:
-    recording = open_source(str(Bag(a_drive(image=a_raw_image)).write(tmp_path / "bag.mcap")))
+    recording = open_source(str(Bag(drive_messages(image=raw_image_message)).write(tmp_path / "bag.mcap")))
     image = next(m for m in recording.messages([0]) if isinstance(m, CameraFrame))
     assert (image.image.width, image.image.height, len(image.image.data)) == (WIDTH, HEIGHT, WIDTH * HEIGHT)
 
 
 def test_bags_that_lack_a_stream_or_are_damaged(tmp_path: Path) -> None:
-    path = Bag([m for m in a_drive() if m[0] != "/points"]).write(tmp_path / "bag.mcap")
+    path = Bag([m for m in drive_messages() if m[0] != "/points"]).write(tmp_path / "bag.mcap")
     with pytest.raises(SourceError, match="no message of type sensor_msgs/msg/PointCloud2"):
         open_source(str(path))
-    whole = Bag(a_drive()).write(path).read_bytes()
+    whole = Bag(drive_messages()).write(path).read_bytes()
     rng = np.random.default_rng(0)
     for size in rng.integers(0, len(whole), 20).tolist():
         path.write_bytes(whole[:size])
@@ -274,9 +277,9 @@ def test_bags_that_lack_a_stream_or_are_damaged(tmp_path: Path) -> None:
 
 
 def test_a_message_that_is_not_what_its_channel_says(tmp_path: Path) -> None:
-    image = an_image(10**9)
+    image = compressed_image_message(10**9)
     image.data = image.data[:-30]
-    path = Bag([*a_drive(), ("/cut/image", image)]).write(tmp_path / "bag.mcap")
+    path = Bag([*drive_messages(), ("/cut/image", image)]).write(tmp_path / "bag.mcap")
     with pytest.raises(SourceError, match=r"CompressedImage of 1000000000 ns: .*cut off"):
         open_source(f"{path}?camera=/cut/image")
 
@@ -285,7 +288,7 @@ def test_a_message_that_is_not_what_its_channel_says(tmp_path: Path) -> None:
 
 
 def test_a_recorded_window_is_a_recording_of_its_pairs(tmp_path: Path) -> None:
-    bag = open_source(str(Bag(a_drive()).write(tmp_path / "bag.mcap")))
+    bag = open_source(str(Bag(drive_messages()).write(tmp_path / "bag.mcap")))
     pairer = Pairer(PairingConfig(), expects_motion=True)
     pairs = [pair for message in bag.messages() for pair in pairer.push(message)] + pairer.flush()
     configuration = CalibrationConfig(search=SearchConfig(dof=6))
@@ -314,7 +317,7 @@ def stamps(pair: FramePair) -> tuple[int, int, EgoMotion | None]:
 
 @pytest.mark.parametrize("topic", ["/front/image", "/points"])
 def test_messages_without_stamps_are_refused_with_the_way_out(tmp_path: Path, topic: str) -> None:
-    drive = a_drive()
+    drive = drive_messages()
     for name, message in drive:
         if name == topic:
             message.header.stamp.sec = message.header.stamp.nanosec = 0
@@ -332,6 +335,6 @@ def test_a_camera_info_in_a_file_gives_the_intrinsics(tmp_path: Path) -> None:
         "distortion_coefficients": {"data": [0.0] * 5},
     }  # fmt: skip
     (tmp_path / "camera_info.yaml").write_text(json.dumps(info))  # which is YAML, too
-    bag = Bag(a_drive()).write(tmp_path / "b.mcap")
+    bag = Bag(drive_messages()).write(tmp_path / "b.mcap")
     camera = open_source(f"{bag}?intrinsics={tmp_path / 'camera_info.yaml'}").rig.camera
     assert (cameras.name_of(camera), cameras.intrinsics_of(camera)["fy"]) == ("pinhole", 51.0)

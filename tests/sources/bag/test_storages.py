@@ -14,11 +14,11 @@ from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from ruamel.yaml import YAML
 
-from bags import STORE, Bag, a_drive, an_image
+from bags import STORE, Bag, compressed_image_message, drive_messages
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.errors import SourceError, WindowError
 from coec.sources import open_source
-from coec.sources.recording import Message
+from coec.sources.recording import SensorMessage
 
 SQLITE, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
 NONE, FILE, MESSAGE = CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE
@@ -36,7 +36,7 @@ def a_folder(
         writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         connections = {}
-        for time, (topic, message) in enumerate(a_drive() if drive is None else drive):
+        for time, (topic, message) in enumerate(drive_messages() if drive is None else drive):
             name = message.__msgtype__
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, name, typestore=STORE)
@@ -44,7 +44,7 @@ def a_folder(
     return path
 
 
-def told(message: Message) -> tuple[object, ...]:
+def told(message: SensorMessage) -> tuple[object, ...]:
     match message:
         case CameraFrame():
             return message.stamp_ns, message.image.data
@@ -57,7 +57,7 @@ def told(message: Message) -> tuple[object, ...]:
 @pytest.mark.parametrize("plugin", [SQLITE, MCAP])
 @pytest.mark.parametrize("mode", [NONE, FILE, MESSAGE])
 def test_every_folder_holds_the_same_recording(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
-    wanted = open_source(str(Bag(a_drive()).write(tmp_path / "drive.mcap")))
+    wanted = open_source(str(Bag(drive_messages()).write(tmp_path / "drive.mcap")))
     found = open_source(str(a_folder(tmp_path / "drive", plugin, mode)))
     assert [told(m) for m in found.messages()] == [told(m) for m in wanted.messages()]
     assert found.rig.camera == wanted.rig.camera
@@ -74,7 +74,7 @@ def test_a_file_of_a_folder_may_be_opened_alone(tmp_path: Path) -> None:
 def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
     folder = tmp_path / "split"
     folder.mkdir()
-    drive = a_drive()
+    drive = drive_messages()
     for number in range(3):
         Bag(drive[number::3]).write(folder / f"split_{number}.mcap")
     information = {"storage_identifier": "mcap", "relative_file_paths": [f"split_{n}.mcap" for n in range(3)]}
@@ -167,7 +167,7 @@ def test_rows_that_are_no_messages_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", ["mcap", "db3"])
 def test_a_bag_that_is_cut_anywhere_is_refused(tmp_path: Path, suffix: str) -> None:
     if suffix == "mcap":
-        file = Bag(a_drive(), chunking=False).write(tmp_path / "drive.mcap")
+        file = Bag(drive_messages(), chunking=False).write(tmp_path / "drive.mcap")
     else:
         (file,) = a_folder(tmp_path / "drive", SQLITE).glob("*.db3")
     whole = file.read_bytes()
@@ -220,11 +220,11 @@ def test_a_bag_that_grows_without_end_is_refused(
 ) -> None:
     for module in ("folder", "mcap_storage"):
         monkeypatch.setattr(f"coec.sources.bag.{module}.MAX_RATIO", 2)
-    monkeypatch.setattr("coec.sources.bag.folder.MAX_MESSAGE_BYTES", 30_000)
+    monkeypatch.setattr("coec.sources.bag.folder.MAX_UNPACKED_MESSAGE_BYTES", 30_000)
     monkeypatch.setattr("coec.sources.bag.mcap_storage.MAX_CHUNK_BYTES", 30_000)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    zeros = replace(an_image(5), data=np.zeros(20_000, np.uint8))
-    drive = [*a_drive(), *[("/front/image", zeros)] * 9]
+    zeros = replace(compressed_image_message(5), data=np.zeros(20_000, np.uint8))
+    drive = [*drive_messages(), *[("/front/image", zeros)] * 9]
     if mode is NONE:
         path = Bag(drive, compression=CompressionType.ZSTD).write(tmp_path / "drive.mcap")
     else:

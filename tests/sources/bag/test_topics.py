@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from bags import STORE, Bag, a_cloud, a_drive, an_image, converted
+from bags import STORE, Bag, cloud_message, compressed_image_message, converted, drive_messages
 from coec.adapters.mcap.bag_writer import write_bag
 from coec.adapters.ros.incoming import decode
 from coec.adapters.ros.messages import COMPRESSED_IMAGE, ODOMETRY, POINT_CLOUD
@@ -27,7 +27,7 @@ def all_of(path: Path) -> list[TopicMessage]:
 
 
 def test_messages_come_in_the_order_in_which_they_were_recorded_as_they_are(tmp_path: Path) -> None:
-    drive = a_drive()
+    drive = drive_messages()
     told = all_of(Bag(drive).write(tmp_path / "b.mcap"))
     assert [(m.topic, m.type_name, m.stamp_ns) for m in told] == [
         (topic, message.__msgtype__, time) for time, (topic, message) in enumerate(drive)
@@ -40,7 +40,7 @@ def test_messages_come_in_the_order_in_which_they_were_recorded_as_they_are(tmp_
 def test_the_same_drive_is_the_same_in_every_file(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
     """Written by coec, carried over by rosbags: messages to the byte, and what is decoded of them on the bus is what a
     calibration of the file sees."""
-    source = open_source(str(Bag(a_drive()).write(tmp_path / "raw.mcap")))
+    source = open_source(str(Bag(drive_messages()).write(tmp_path / "raw.mcap")))
     written = tmp_path / "drive.mcap"
     write_bag(written, source.rig, source.T_camera_lidar_start, source.messages(), lambda _: None)
     folder = converted(written, tmp_path / "drive", plugin, mode)
@@ -51,7 +51,7 @@ def test_the_same_drive_is_the_same_in_every_file(tmp_path: Path, plugin: Storag
 
 
 def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
-    bag = Bag([("/a", an_image(1)), ("/a", a_cloud(2))]).write(tmp_path / "b.mcap")
+    bag = Bag([("/a", compressed_image_message(1)), ("/a", cloud_message(2))]).write(tmp_path / "b.mcap")
     with pytest.raises(SourceError, match="/a has messages of several types"):
         open_topics(parse_spec(str(bag)))
 

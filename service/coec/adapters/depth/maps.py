@@ -7,8 +7,8 @@ import os
 from collections import OrderedDict
 
 from coec.adapters.depth.model_cards import built_in_cards, find_card
-from coec.adapters.depth.network_files import absence, file_of, places_of
-from coec.adapters.files.home import from_home
+from coec.adapters.depth.network_files import absence_text, candidate_paths, network_file
+from coec.adapters.files.home import expand_home
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import decode_depth
 from coec.calibration.ports import DepthModel
@@ -100,7 +100,7 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
     if config.model == STEREO:
         return PrecomputedDepth(limits)
     named = built_in_cards().get(config.model)
-    places = (from_home(config.model),) if named is None else places_of(named)
+    places = (expand_home(config.model),) if named is None else candidate_paths(named)
     # Of a path below a folder that may not be searched, pathlib raises an error.
     path = next((place for place in places if os.path.isfile(place)), None)  # noqa: PTH113
     if path is None:
@@ -108,8 +108,8 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
             if os.path.isdir(place.parent) and not os.access(place.parent, os.X_OK):  # noqa: PTH112
                 raise ModelError(f"depth network {place}: {permission_denied(place, 'r')}")
         if named is not None:
-            raise ModelError(absence(named))
-        present = [card.name for card in built_in_cards().values() if file_of(card) is not None]
+            raise ModelError(absence_text(named))
+        present = [card.name for card in built_in_cards().values() if network_file(card) is not None]
         raise ModelError(
             f"there is no depth network {places[0]}: give an ONNX file, `{STEREO}` for the maps that come with the "
             f"frames, or the name of a network whose file is on this machine: {', '.join(present)}. "

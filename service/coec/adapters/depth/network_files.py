@@ -9,7 +9,7 @@ from pathlib import Path
 
 from coec.adapters.depth.model_cards import CARDS, ModelCard, built_in_cards
 from coec.adapters.files import durable
-from coec.adapters.files.home import from_home
+from coec.adapters.files.home import expand_home
 from coec.config import LimitsConfig
 from coec.errors import ModelError, OutputError, UsageError
 
@@ -19,10 +19,10 @@ OWN_NETWORKS = "docs/own-network.md"
 def models_folder() -> Path:
     """Folder in which networks are searched by name: `coec/models` in $XDG_DATA_HOME, by default ~/.local/share."""
     base = os.environ.get("XDG_DATA_HOME", "")
-    return (Path(base) if base else from_home("~/.local/share")) / "coec" / "models"
+    return (Path(base) if base else expand_home("~/.local/share")) / "coec" / "models"
 
 
-def places_of(card: ModelCard) -> tuple[Path, ...]:
+def candidate_paths(card: ModelCard) -> tuple[Path, ...]:
     """The paths at which the file of a network is looked for, in this order: `<name>.onnx` in the folder of networks,
     the card's usual file name there, and the files that come with the package."""
     name = f"{card.name}.onnx"
@@ -30,22 +30,22 @@ def places_of(card: ModelCard) -> tuple[Path, ...]:
     return tuple(dict.fromkeys((folder / name, folder / (card.file or name), CARDS / name)))
 
 
-def file_of(card: ModelCard) -> Path | None:
+def network_file(card: ModelCard) -> Path | None:
     """The file of a network on this machine; None if it is at none of the places."""
     # Of a path below a folder that may not be searched, pathlib raises an error.
-    return next((path for path in places_of(card) if os.path.isfile(path)), None)  # noqa: PTH113
+    return next((path for path in candidate_paths(card) if os.path.isfile(path)), None)  # noqa: PTH113
 
 
-def absence(card: ModelCard) -> str:
+def absence_text(card: ModelCard) -> str:
     """What to do about a known network whose file is absent: where it was looked for, where it comes from."""
     return (
         f"the file of the depth network {card.name} is not on this machine: it was looked for as "
-        f"{', '.join(str(path) for path in places_of(card)[:-1])}. It comes from: {card.obtain}. "
+        f"{', '.join(str(path) for path in candidate_paths(card)[:-1])}. It comes from: {card.obtain}. "
         "`coec models add FILE` puts it there; a path to an ONNX file can be given instead of the name"
     )
 
 
-def add(file: Path, name: str | None, *, force: bool) -> tuple[ModelCard, Path, bool]:
+def add_network(file: Path, name: str | None, *, force: bool) -> tuple[ModelCard, Path, bool]:
     """Copies the file of a known network to where it is looked for, atomically and readable for everybody.
 
     The network is recognised by its sha256. A card without one fits every export of its network: then the file's name
@@ -71,8 +71,8 @@ def add(file: Path, name: str | None, *, force: bool) -> tuple[ModelCard, Path, 
             "(Python: `onnx.save(onnx.load(FILE), OTHER)`), or name it by its path (--depth, calibration.depth.model)"
         )
     OnnxDepth(file, card, ("cpu",), 1, LimitsConfig(), identity)
-    place = places_of(card)[0]
-    present = file_of(card)
+    place = candidate_paths(card)[0]
+    present = network_file(card)
     if present is not None and file_identity(present)[0] == digest:
         return card, present, False
     if place.is_file() and not force:

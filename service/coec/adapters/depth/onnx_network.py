@@ -246,14 +246,14 @@ def _open_session(path: Path, providers: Sequence[Provider], threads: int) -> An
 
 def _available(providers: Sequence[Provider]) -> list[str]:
     present = onnxruntime.get_available_providers()
-    wanted: list[Provider] = [*(each for each in providers if each != "cpu"), "cpu"]
-    chosen = []
-    for provider in wanted:
+    requested: list[Provider] = [*(each for each in providers if each != "cpu"), "cpu"]
+    selected = []
+    for provider in requested:
         if PROVIDERS[provider] in present:
-            chosen.append(PROVIDERS[provider])
+            selected.append(PROVIDERS[provider])
         else:
             logger.warning("onnxruntime on this machine has no %s: left out", provider)
-    return chosen
+    return selected
 
 
 def _pick(tensors: Sequence[Any], name: str | None, kind: str, path: Path, card: str) -> Any:
@@ -261,8 +261,8 @@ def _pick(tensors: Sequence[Any], name: str | None, kind: str, path: Path, card:
     if name is None and len(tensors) == 1:
         return tensors[0]
     if name not in names:
-        wanted = f"names {name!r}" if name is not None else "names none, and there are several"
-        raise ModelError(f"{path} has the {kind}s {', '.join(names)}; its card ({card}) {wanted}: correct the card")
+        requested = f"names {name!r}" if name is not None else "names none, and there are several"
+        raise ModelError(f"{path} has the {kind}s {', '.join(names)}; its card ({card}) {requested}: correct the card")
     return tensors[names.index(name)]
 
 

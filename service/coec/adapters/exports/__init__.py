@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from coec.adapters.exports import autoware, json_files, kalibr, kitti, opencv, tf, urdf
-from coec.adapters.exports.extrinsic import Extrinsic
+from coec.adapters.exports.extrinsic import ExportedExtrinsic
 
 JSON, TEXT, XML, YAML = "application/json", "text/plain", "application/xml", "application/yaml"
 
@@ -24,7 +24,7 @@ class Format(NamedTuple):
         encoding: of the text, as Zenoh names encodings.
     """
 
-    text: Callable[[Extrinsic, str | None], str]
+    text: Callable[[ExportedExtrinsic, str | None], str]
     encoding: str
 
 

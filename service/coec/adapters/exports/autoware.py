@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from coec.adapters.exports.blocks import set_entry
-from coec.adapters.exports.extrinsic import Extrinsic, roll_pitch_yaw, translation_m
+from coec.adapters.exports.blocks import set_yaml_entry
+from coec.adapters.exports.extrinsic import ExportedExtrinsic, roll_pitch_yaw, translation_m
 
 DIRECTION = (
     "pose in the parent of the camera's body frame (x forward, y left, z up); the optical frame is the body frame "
@@ -11,7 +11,7 @@ DIRECTION = (
 )
 
 
-def text(extrinsic: Extrinsic, existing: str | None) -> str:
+def text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:
     """The file with this camera below its parent.
 
     Raises:
@@ -21,10 +21,10 @@ def text(extrinsic: Extrinsic, existing: str | None) -> str:
     names = ("x", "y", "z", "roll", "pitch", "yaw")
     values = [*translation_m(T), *roll_pitch_yaw(T)]
     lines = [
-        *(f"# {remark}" for remark in extrinsic.remarks(DIRECTION)),
+        *(f"# {comment}" for comment in extrinsic.remarks(DIRECTION)),
         *(f"{name}: {value!r}" for name, value in zip(names, values, strict=True)),
     ]
     if existing is None:
         rows = (f"    {line}" for line in lines)
         return "\n".join((f"{extrinsic.parent}:", f"  {extrinsic.child}:", *rows)) + "\n"
-    return set_entry(existing, (extrinsic.parent, extrinsic.child), lines)
+    return set_yaml_entry(existing, (extrinsic.parent, extrinsic.child), lines)

@@ -18,7 +18,7 @@ from coec.errors import OutputError
 INDENT = "  "
 
 
-def set_entry(text: str, path: Sequence[str], lines: Sequence[str]) -> str:
+def set_yaml_entry(text: str, path: Sequence[str], lines: Sequence[str]) -> str:
     """The text with one entry set: replaced if it exists, else added at the end of the map that should hold it.
 
     Args:
@@ -29,30 +29,30 @@ def set_entry(text: str, path: Sequence[str], lines: Sequence[str]) -> str:
     Raises:
         OutputError: not such a document, or the entry cannot be changed without touching others.
     """
-    before = _parsed(text)
-    found, depth = _deepest(before, path)
+    before = _parsed_yaml(text)
+    parent, depth = _deepest(before, path)
     rows = text.splitlines()
     if depth == len(path):
-        line, column = found.lc.key(path[-1])
+        line, column = parent.lc.key(path[-1])
         if rows[line][:column].strip():
             raise OutputError(f"`{path[-1]}` stands among others on line {line + 1}: it cannot be changed alone")
         end = _end_of(rows, line, column)
         fresh = [" " * column + f"{path[-1]}:", *(" " * column + INDENT + row for row in lines)]
         rows[line:end] = fresh
     else:
-        column, end = _room_in(found, rows, path[:depth])
+        column, end = _room_in(parent, rows, path[:depth])
         fresh = []
         for level, key in enumerate(path[depth:]):
             fresh.append(" " * column + INDENT * level + f"{key}:")
         fresh += [" " * column + INDENT * len(path[depth:]) + row for row in lines]
         rows[end:end] = fresh
     after = "\n".join(rows) + "\n"
-    if _without(_parsed(after), path) != _without(before, path):
+    if _without(_parsed_yaml(after), path) != _without(before, path):
         raise OutputError(f"`{path[-1]}` cannot be set without changing something else of the file")
     return after
 
 
-def _parsed(text: str) -> CommentedMap:
+def _parsed_yaml(text: str) -> CommentedMap:
     try:
         document = YAML().load(text)
     except (YAMLError, ValueError, RecursionError) as error:
@@ -64,17 +64,17 @@ def _parsed(text: str) -> CommentedMap:
 
 def _deepest(document: CommentedMap, path: Sequence[str]) -> tuple[CommentedMap, int]:
     """The map that holds the longest existing part of the path, and how many keys that part has."""
-    found = document
+    deepest = document
     for depth, key in enumerate(path):
-        if key not in found:
-            return found, depth
+        if key not in deepest:
+            return deepest, depth
         if depth + 1 == len(path):
             break
-        inner = found[key]
+        inner = deepest[key]
         if not isinstance(inner, CommentedMap):
             raise OutputError(f"`{key}` is no map of names")
-        found = inner
-    return found, len(path)
+        deepest = inner
+    return deepest, len(path)
 
 
 def _end_of(rows: Sequence[str], line: int, column: int) -> int:

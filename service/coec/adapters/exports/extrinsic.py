@@ -24,7 +24,7 @@ NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
+class ExtrinsicOrigin:
     """Where an extrinsic comes from.
 
     Attributes:
@@ -41,11 +41,11 @@ class Origin:
     window_id: str | None
     data_stamp_ns: int | None
     config_hash: str | None
-    objections: tuple[str, ...]
+    rejection_reasons: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Extrinsic:
+class ExportedExtrinsic:
     """A camera's pose, ready to be written.
 
     Attributes:
@@ -65,7 +65,7 @@ class Extrinsic:
     child: str
     T_parent_lidar: Matrix
     camera: CameraIntrinsics | None
-    origin: Origin
+    origin: ExtrinsicOrigin
 
     @property
     def T_child_parent(self) -> Matrix:
@@ -95,8 +95,8 @@ class Extrinsic:
             lines.append(
                 f"window {origin.window_id}, data until {utc(origin.data_stamp_ns)}, configuration {origin.config_hash}"
             )
-        if origin.objections:
-            lines.append(f"NOT ACCEPTED, exported by force: {' '.join(origin.objections)}")
+        if origin.rejection_reasons:
+            lines.append(f"NOT ACCEPTED, exported by force: {' '.join(origin.rejection_reasons)}")
         return [_one_line(line) for line in lines]
 
     def document(self, direction: str) -> dict[str, object]:
@@ -104,8 +104,8 @@ class Extrinsic:
         origin = self.origin
         return {
             "direction": direction,
-            "accepted": not origin.objections,
-            "objections": list(origin.objections),
+            "accepted": not origin.rejection_reasons,
+            "objections": list(origin.rejection_reasons),
             "covariance_rad_m": [[number_or_null(value) for value in row] for row in self.covariance.tolist()],
             "vehicle": origin.vehicle,
             "pair": origin.pair,
@@ -118,12 +118,12 @@ class Extrinsic:
 
     def _sigma_line(self) -> str:
         sigma = np.sqrt(self.covariance.diagonal())
-        told = [
+        axis_texts = [
             f"{name} {np.degrees(value):.4f} deg" if axis < 3 else f"{name} {value:.4f} m"
             for axis, (name, value) in enumerate(zip(AXES, sigma.tolist(), strict=True))
             if math.isfinite(value)
         ]
-        return f"sigma about the camera axes: {', '.join(told)}" if told else "sigma: not known"
+        return f"sigma about the camera axes: {', '.join(axis_texts)}" if axis_texts else "sigma: not known"
 
 
 T_OPTICAL_BODY: Matrix = np.array(

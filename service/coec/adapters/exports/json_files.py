@@ -7,7 +7,7 @@ import hashlib
 import json
 from typing import Any
 
-from coec.adapters.exports.extrinsic import Extrinsic, quaternion_wxyz, quaternion_xyzw, translation_m
+from coec.adapters.exports.extrinsic import ExportedExtrinsic, quaternion_wxyz, quaternion_xyzw, translation_m
 from coec.errors import OutputError
 
 NUSCENES_DIRECTION = "pose of the child (optical: z forward) in the parent (nuScenes: ego); rotation w x y z"
@@ -16,7 +16,7 @@ COLMAP_DIRECTION = "cam_from_rig maps the rig (the parent) to the optical camera
 PLAIN_DIRECTION = "T_child_parent maps coordinates in the parent to the optical camera frame (z forward); row-major"
 
 
-def nuscenes_text(extrinsic: Extrinsic, existing: str | None) -> str:
+def nuscenes_text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:
     """The table with the record of this sensor, whose `sensor_token` is the child frame.
 
     Raises:
@@ -39,7 +39,7 @@ def nuscenes_text(extrinsic: Extrinsic, existing: str | None) -> str:
     return _written(table if same else [*table, record])
 
 
-def openlabel_text(extrinsic: Extrinsic, existing: str | None) -> str:
+def openlabel_text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:
     """The document with this coordinate system, and with its parent if that is missing.
 
     Raises:
@@ -67,7 +67,7 @@ def openlabel_text(extrinsic: Extrinsic, existing: str | None) -> str:
     return _written(document)
 
 
-def colmap_text(extrinsic: Extrinsic, existing: str | None) -> str:
+def colmap_text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:
     """The rigs with this camera, whose `image_prefix` is the child and a slash. It is put into the rig whose reference
     sensor is the parent, or into a new rig if there is none.
 
@@ -105,7 +105,7 @@ def colmap_text(extrinsic: Extrinsic, existing: str | None) -> str:
         raise OutputError("the file is no rig configuration of COLMAP") from error
 
 
-def plain_text(extrinsic: Extrinsic, existing: str | None) -> str:  # noqa: ARG001  the file holds this one transform
+def plain_text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:  # noqa: ARG001  the file holds this one transform
     """The whole file: the transform in both directions and in three forms."""
     document = {
         "parent": extrinsic.parent,

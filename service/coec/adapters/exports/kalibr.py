@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import re
 
-from coec.adapters.exports.blocks import set_entry
-from coec.adapters.exports.extrinsic import Extrinsic
+from coec.adapters.exports.blocks import set_yaml_entry
+from coec.adapters.exports.extrinsic import ExportedExtrinsic
 from coec.config import CameraIntrinsics
 from coec.errors import OutputError
 
 DIRECTION = "T_cam_lidar maps coordinates in the parent to the optical camera frame (z forward); rows of a 4x4 matrix"
 
 
-def text(extrinsic: Extrinsic, existing: str | None) -> str:
+def text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:
     """The chain with this camera. Its entry has the name of the child frame if that has Kalibr's form (`cam0`), else
     `cam0`.
 
@@ -26,7 +26,7 @@ def text(extrinsic: Extrinsic, existing: str | None) -> str:
     name = extrinsic.child if re.fullmatch(r"cam\d+", extrinsic.child) else "cam0"
     model, intrinsics, distortion_model, distortion = _camera(extrinsic.camera)
     lines = [
-        *(f"# {remark}" for remark in extrinsic.remarks(DIRECTION)),
+        *(f"# {comment}" for comment in extrinsic.remarks(DIRECTION)),
         f"camera_model: {model}",
         f"intrinsics: {_flow(intrinsics)}",
         f"distortion_model: {distortion_model}",
@@ -37,7 +37,7 @@ def text(extrinsic: Extrinsic, existing: str | None) -> str:
     ]
     if existing is None:
         return "\n".join((f"{name}:", *(f"  {line}" for line in lines))) + "\n"
-    return set_entry(existing, (name,), lines)
+    return set_yaml_entry(existing, (name,), lines)
 
 
 def _camera(camera: CameraIntrinsics) -> tuple[str, list[float], str, list[float]]:

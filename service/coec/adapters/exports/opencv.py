@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 
-from coec.adapters.exports.extrinsic import Extrinsic
+from coec.adapters.exports.extrinsic import ExportedExtrinsic
 from coec.errors import OutputError
 
 HEAD = "%YAML:1.0\n---\n"
 DIRECTION = "maps coordinates in the parent to the optical camera frame (z forward); row by row"
 
 
-def text(extrinsic: Extrinsic, existing: str | None) -> str:
+def text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:
     """The file with this matrix: it replaces the one of the same name, or is added at the end.
 
     YAML libraries cannot read FileStorage, so that the lines of the matrix are found by the way OpenCV writes them: a
@@ -25,7 +25,7 @@ def text(extrinsic: Extrinsic, existing: str | None) -> str:
     block = "".join(
         (
             f"{name}: !!opencv-matrix\n",
-            *(f"   # {remark}\n" for remark in extrinsic.remarks(DIRECTION)),
+            *(f"   # {comment}\n" for comment in extrinsic.remarks(DIRECTION)),
             f"   rows: 4\n   cols: 4\n   dt: d\n   data: [ {data} ]\n",
         )
     )

@@ -5,20 +5,20 @@ from __future__ import annotations
 import re
 import shlex
 
-from coec.adapters.exports.extrinsic import Extrinsic, quaternion_xyzw, translation_m
+from coec.adapters.exports.extrinsic import ExportedExtrinsic, quaternion_xyzw, translation_m
 
 DIRECTION = "pose of the child (optical: z forward) in the parent; quaternion x y z w"
 
 _MARK = "# coec: "
 
 
-def text(extrinsic: Extrinsic, existing: str | None) -> str:
+def text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:
     """The script with this transform: its command replaces the one with the same child, or is added at the end."""
     x, y, z = translation_m(extrinsic.T_parent_child)
     qx, qy, qz, qw = quaternion_xyzw(extrinsic.T_parent_child)
     child = shlex.quote(extrinsic.child)
     fresh = [
-        *(_MARK + remark for remark in extrinsic.remarks(DIRECTION)),
+        *(_MARK + comment for comment in extrinsic.remarks(DIRECTION)),
         f"ros2 run tf2_ros static_transform_publisher --x {x!r} --y {y!r} --z {z!r} "
         f"--qx {qx!r} --qy {qy!r} --qz {qz!r} --qw {qw!r} "
         f"--frame-id {shlex.quote(extrinsic.parent)} --child-frame-id {child} &",

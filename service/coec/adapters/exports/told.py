@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import coec
-from coec.adapters.exports.extrinsic import AXES, Extrinsic, Origin
+from coec.adapters.exports.extrinsic import AXES, ExportedExtrinsic, ExtrinsicOrigin
 from coec.adapters.files.conversions import estimate_of, matrix_of
 from coec.adapters.files.rig import intrinsics_config
 from coec.config import CameraIntrinsics
@@ -28,7 +28,7 @@ PITCH_HEIGHT, YAW_SIDE = (0, 4), (1, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frames:
+class ExportFrames:
     """The frames between which a transform is written; None: the pair's own frames.
 
     Attributes:
@@ -40,11 +40,13 @@ class Frames:
     T_parent_lidar: NDArray[np.float64] | None = None
 
 
-def of_result(result: CalibrationResult, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
+def extrinsic_of_result(
+    result: CalibrationResult, camera: CameraIntrinsics | None, frames: ExportFrames
+) -> ExportedExtrinsic:
     """A window's result, with its whole covariance; the reasons of a negative verdict become the objections. `camera`
     None: the intrinsics that the result holds."""
-    objections = tuple(reason.text for reason in result.verdict.reasons)
-    origin = Origin(
+    reasons = tuple(reason.text for reason in result.verdict.reasons)
+    origin = ExtrinsicOrigin(
         vehicle=result.vehicle,
         pair=result.pair,
         version=coec.__version__,
@@ -52,9 +54,9 @@ def of_result(result: CalibrationResult, camera: CameraIntrinsics | None, frames
         window_id=result.window_id,
         data_stamp_ns=result.data_stamp_ns,
         config_hash=result.config_hash,
-        objections=() if result.verdict.decision == "accepted" else objections or ("Its verdict is negative.",),
+        rejection_reasons=() if result.verdict.decision == "accepted" else reasons or ("Its verdict is negative.",),
     )
-    return framed(
+    return between_frames(
         matrix_of(result.camera_from_lidar),
         estimate_of(result).uncertainty.covariance,
         (result.lidar_frame, result.camera_frame),
@@ -64,12 +66,14 @@ def of_result(result: CalibrationResult, camera: CameraIntrinsics | None, frames
     )
 
 
-def of_reply(reply: ExtrinsicReply, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
+def extrinsic_of_reply(
+    reply: ExtrinsicReply, camera: CameraIntrinsics | None, frames: ExportFrames
+) -> ExportedExtrinsic:
     """The extrinsic that a service serves, with the part of its covariance that a reply holds: σ of each axis and two
     correlations. The only possible objection is that it is still the nominal calibration. `camera` None: the intrinsics
     that the reply holds."""
     served = reply.provenance != "nominal"
-    origin = Origin(
+    origin = ExtrinsicOrigin(
         vehicle=reply.vehicle,
         pair=reply.pair,
         version=coec.__version__,
@@ -77,11 +81,11 @@ def of_reply(reply: ExtrinsicReply, camera: CameraIntrinsics | None, frames: Fra
         window_id=reply.window_id,
         data_stamp_ns=reply.data_stamp_ns,
         config_hash=reply.config_hash,
-        objections=() if served else (NOMINAL,),
+        rejection_reasons=() if served else (NOMINAL,),
     )
-    return framed(
+    return between_frames(
         matrix_of(reply.camera_from_lidar),
-        _covariance(reply),
+        _reply_covariance(reply),
         (reply.lidar_frame, reply.camera_frame),
         frames,
         intrinsics_config_of(reply.intrinsics) if camera is None else camera,
@@ -100,14 +104,14 @@ def intrinsics_config_of(intrinsics: Intrinsics | None) -> CameraIntrinsics | No
         return None
 
 
-def framed(
+def between_frames(
     T_camera_lidar: NDArray[np.float64],
     covariance: NDArray[np.float64],
     own: tuple[str, str],
-    frames: Frames,
+    frames: ExportFrames,
     camera: CameraIntrinsics | None,
-    origin: Origin,
-) -> Extrinsic:
+    origin: ExtrinsicOrigin,
+) -> ExportedExtrinsic:
     """An extrinsic between the requested frames, by default its own (LiDAR, camera).
 
     Raises:
@@ -116,7 +120,7 @@ def framed(
     for name in (frames.parent or own[0], frames.child or own[1]):
         if not FRAME.fullmatch(name):
             raise OutputError(f"{name[:64]!a} names no frame: letters, digits and _ . / - are known to all formats")
-    return Extrinsic(
+    return ExportedExtrinsic(
         T_camera_lidar=T_camera_lidar,
         covariance=covariance,
         parent=frames.parent or own[0],
@@ -127,21 +131,21 @@ def framed(
     )
 
 
-def _covariance(reply: ExtrinsicReply) -> NDArray[np.float64]:
+def _reply_covariance(reply: ExtrinsicReply) -> NDArray[np.float64]:
     axes = [getattr(reply.axes, name) for name in AXES]
     sigma = np.array(
         [math.nan if axis.sigma is None else axis.sigma * (math.pi / 180 if axis.unit == "deg" else 1) for axis in axes]
     )
     covariance = np.full((6, 6), np.nan)
     covariance[np.diag_indices(6)] = sigma**2
-    told = {PITCH_HEIGHT: reply.correlation_pitch_height, YAW_SIDE: reply.correlation_yaw_side}
-    for (one, other), correlation in told.items():
+    correlations = {PITCH_HEIGHT: reply.correlation_pitch_height, YAW_SIDE: reply.correlation_yaw_side}
+    for (one, other), correlation in correlations.items():
         if correlation is not None:
             covariance[one, other] = covariance[other, one] = correlation * sigma[one] * sigma[other]
     return covariance
 
 
-def pose_of(text: str) -> NDArray[np.float64]:
+def parse_pose(text: str) -> NDArray[np.float64]:
     """(4, 4) from ``x,y,z,qx,qy,qz,qw``: metres, and a quaternion of any length.
 
     Raises:

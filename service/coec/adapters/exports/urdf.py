@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from coec.adapters.exports.extrinsic import Extrinsic, roll_pitch_yaw, translation_m
+from coec.adapters.exports.extrinsic import ExportedExtrinsic, roll_pitch_yaw, translation_m
 from coec.errors import OutputError
 
 DIRECTION = "origin: pose of the child (optical: z forward) in the parent; rpy in rad, R = Rz(y) Ry(p) Rx(r)"
@@ -23,7 +23,7 @@ class _Joint:
 
 
 @dataclass(slots=True)
-class _Found:
+class _JointScan:
     """The joints of a document, and where the root element ends."""
 
     joints: list[_Joint] = field(default_factory=list)
@@ -31,7 +31,7 @@ class _Found:
     root_end: int = 0
 
 
-def text(extrinsic: Extrinsic, existing: str | None) -> str:
+def text(extrinsic: ExportedExtrinsic, existing: str | None) -> str:
     """The robot with this joint: it replaces the one with the same child link, or is added as the last one.
 
     Raises:
@@ -42,11 +42,11 @@ def text(extrinsic: Extrinsic, existing: str | None) -> str:
         links = "".join(f"  <link name={quoteattr(name)}/>\n" for name in (extrinsic.parent, extrinsic.child))
         return f'<?xml version="1.0"?>\n<robot name="{_ROBOT}">\n{links}  {joint}\n</robot>\n'
     data = existing.encode()
-    found = _joints(data)
-    same = next((joint for joint in found.joints if joint.child == extrinsic.child), None)
+    scan = _joints(data)
+    same = next((joint for joint in scan.joints if joint.child == extrinsic.child), None)
     if same is None:
         fresh = _joint(extrinsic, f"{extrinsic.child}_joint").encode()
-        return (data[: found.root_end] + b"  " + fresh + b"\n" + data[found.root_end :]).decode()
+        return (data[: scan.root_end] + b"  " + fresh + b"\n" + data[scan.root_end :]).decode()
     return (data[: same.begin] + _joint(extrinsic, same.name).encode() + data[same.end :]).decode()
 
 
@@ -54,11 +54,11 @@ _ROBOT = "vehicle"
 """Name of the robot in a new file."""
 
 
-def _joint(extrinsic: Extrinsic, name: str) -> str:
+def _joint(extrinsic: ExportedExtrinsic, name: str) -> str:
     xyz = " ".join(repr(value) for value in translation_m(extrinsic.T_parent_child))
     rpy = " ".join(repr(value) for value in roll_pitch_yaw(extrinsic.T_parent_child))
     # Two hyphens in a row end a comment.
-    remarks = "".join(f"    <!-- {remark.replace('--', '- -')} -->\n" for remark in extrinsic.remarks(DIRECTION))
+    remarks = "".join(f"    <!-- {comment.replace('--', '- -')} -->\n" for comment in extrinsic.remarks(DIRECTION))
     return (
         f'<joint name={quoteattr(name)} type="fixed">\n'
         f"{remarks}"
@@ -69,29 +69,29 @@ def _joint(extrinsic: Extrinsic, name: str) -> str:
     )
 
 
-def _joints(data: bytes) -> _Found:
+def _joints(data: bytes) -> _JointScan:
     parser = expat.ParserCreate(encoding="utf-8")
-    found = _Found()
+    scan = _JointScan()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         # A joint is below the root or in a xacro macro; a joint in a transmission has no child.
         if tag == "joint":
-            found.joints.append(_Joint(attributes.get("name", ""), parser.CurrentByteIndex))
-        elif tag == "child" and found.open[-1:] == ["joint"]:
-            found.joints[-1].child = attributes.get("link")
-        found.open.append(tag)
+            scan.joints.append(_Joint(attributes.get("name", ""), parser.CurrentByteIndex))
+        elif tag == "child" and scan.open[-1:] == ["joint"]:
+            scan.joints[-1].child = attributes.get("link")
+        scan.open.append(tag)
 
     def end(tag: str) -> None:
-        found.open.pop()
+        scan.open.pop()
         if tag == "joint":
             closing = data.index(b">", parser.CurrentByteIndex) + 1
-            found.joints[-1].end = closing
-        if not found.open:
-            found.root_end = parser.CurrentByteIndex
+            scan.joints[-1].end = closing
+        if not scan.open:
+            scan.root_end = parser.CurrentByteIndex
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
         raise OutputError(f"the file is no XML: {error}") from error
-    return found
+    return scan

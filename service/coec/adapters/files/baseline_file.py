@@ -110,7 +110,7 @@ def save_baseline(path: Path, baseline: Baseline) -> str:
     except OSError as error:
         raise StateError(f"cannot make the folder {path.parent}: {error.strerror}") from error
     file.save({"pairs": pairs})
-    return hash_of(document)
+    return document_hash(document)
 
 
 def load_baseline(path: Path, pair: str) -> Baseline | None:
@@ -132,7 +132,7 @@ def load_baselines(path: Path) -> dict[str, Baseline]:
     return {pair: baseline_from_json(document) for pair, document in _documents(path).items()}
 
 
-def baseline_of(rig: Rig, state: StateConfig) -> Baseline | None:
+def baseline_of_rig(rig: Rig, state: StateConfig) -> Baseline | None:
     """The baseline of a rig: the one learned when it was commissioned, else the one of its vehicle model if the
     configuration names a file for that; None if there is neither.
 
@@ -150,10 +150,10 @@ def baseline_of(rig: Rig, state: StateConfig) -> Baseline | None:
 
 def baseline_hash(baseline: Baseline) -> str:
     """First 16 hexadecimal digits of the sha256 of the canonical JSON."""
-    return hash_of(baseline_to_json(baseline))
+    return document_hash(baseline_to_json(baseline))
 
 
-def hash_of(document: dict[str, Any]) -> str:
+def document_hash(document: dict[str, Any]) -> str:
     """The same for a document."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -246,10 +246,10 @@ def baseline_from_json(values: object) -> Baseline:
 
 
 def _documents(path: Path) -> dict[str, Any]:
-    found = StateFile(path).load()
-    if found.body is None and found.damage:
-        raise StateError(f"{path} cannot be used: {'; '.join(found.damage)}; commission again")
-    return _pairs_of(found.body)
+    loaded = StateFile(path).load()
+    if loaded.body is None and loaded.damage:
+        raise StateError(f"{path} cannot be used: {'; '.join(loaded.damage)}; commission again")
+    return _pairs_of(loaded.body)
 
 
 def _pairs_of(body: dict[str, Any] | None) -> dict[str, Any]:

@@ -80,7 +80,7 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         },
         correlation_pitch_height=number_or_null(uncertainty.pitch_height),
         correlation_yaw_side=number_or_null(uncertainty.yaw_side),
-        independent_looks=number_or_null(uncertainty.looks),
+        independent_looks=number_or_null(uncertainty.independent_samples),
         solved=cast("replies.Flags6", tuple(bool(v) for v in estimate.solved)),
         unobservable=cast("replies.Flags6", tuple(bool(v) for v in estimate.unobservable)),
         status="accepted" if estimate.verdict.decision is Decision.ACCEPTED else "failed",
@@ -153,7 +153,7 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
         uncertainty=Uncertainty(
             noise=np.array([_array(row) for row in result.noise]),
             systematic={name: np.array(shift) for name, shift in result.systematic.items()},
-            looks=_or_nan(result.independent_looks),
+            independent_samples=_or_nan(result.independent_looks),
         ),
         solved=np.array(result.solved, dtype=np.bool_),
         unobservable=np.array(result.unobservable, dtype=np.bool_),

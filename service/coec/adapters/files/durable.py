@@ -30,7 +30,7 @@ The umask of the process may take further ones away."""
 BY_UMASK = 0o666
 """Permissions of files that a command writes for its user: as the umask says."""
 
-MAX_ASIDE = 8
+MAX_QUARANTINED = 8
 """Most files of one name that are kept aside. The first ones tell most, and a disk that damages every file must not be
 filled by them."""
 
@@ -47,7 +47,7 @@ def replace(path: Path, data: bytes, previous: Path | None = None, mode: int = P
         previous: path that receives the replaced file, if there was one; None: it is not kept.
         mode: permissions of the new file, from which the umask takes its own.
     """
-    fresh, link = _beside(path, FRESH_SUFFIX), _beside(path, _LINK_SUFFIX)
+    fresh, link = _with_suffix(path, FRESH_SUFFIX), _with_suffix(path, _LINK_SUFFIX)
     try:
         _write_new(fresh, data, mode)
         if previous is not None:
@@ -89,20 +89,23 @@ def publish(stream: BinaryIO, temporary: Path, final: Path) -> None:
     sync_folder(final.parent)
 
 
-def keep_under(path: Path, other: Path) -> None:
+def add_name(path: Path, other: Path) -> None:
     """Give a file a second name, which must be free."""
     other.hardlink_to(path)
     sync_folder(other.parent)
 
 
-def set_aside(path: Path, suffix: str) -> None:
+def quarantine(path: Path, suffix: str) -> None:
     """Give a file that is about to be replaced a second name beside it: its name and `suffix`, then `suffix`-1, -2 and
     so on. Does nothing if the file does not exist. The first `MAX_ASIDE` are kept, and the newest of the later ones."""
-    names = [_beside(path, suffix), *(_beside(path, f"{suffix}-{number}") for number in range(1, MAX_ASIDE + 1))]
+    names = [
+        _with_suffix(path, suffix),
+        *(_with_suffix(path, f"{suffix}-{number}") for number in range(1, MAX_QUARANTINED + 1)),
+    ]
     other = next((name for name in names if not name.exists()), names[-1])
     other.unlink(missing_ok=True)
     with suppress(FileNotFoundError):
-        keep_under(path, other)
+        add_name(path, other)
 
 
 def remove(path: Path) -> None:
@@ -140,7 +143,7 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-class Log:
+class LineLog:
     """A file of lines that grows at its end and is rewritten when it has become too long.
 
     The log knows how many bytes of the file are sound. Anything behind them, left by a failed write of this process or
@@ -291,5 +294,5 @@ def _joined(lines: Iterable[bytes]) -> bytes:
     return b"".join(line + b"\n" for line in lines)
 
 
-def _beside(path: Path, suffix: str) -> Path:
+def _with_suffix(path: Path, suffix: str) -> Path:
     return path.with_name(path.name + suffix)

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 
-def from_home(path: str) -> Path:
+def expand_home(path: str) -> Path:
     """A path with a leading `~` or `~name` replaced by that user's home. It stays as it is if the user has no home, as
     the dynamic user that a service manager creates for a service."""
     return Path(os.path.expanduser(path))  # noqa: PTH111  pathlib's own raises where there is no home

@@ -9,12 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from coec.adapters.files.durable import Log
+from coec.adapters.files.durable import LineLog
 
 T = TypeVar("T")
 
 
-class Ledger(Generic[T]):
+class AppendLog(Generic[T]):
     """Items in order, each a line of the file. Safe for use from several threads: only `load` and `flush` wait for the
     disk, and no other method waits for them."""
 
@@ -28,13 +28,13 @@ class Ledger(Generic[T]):
         self._line_of = line_of
         self._limit = limit
         self._lock = threading.Lock()
-        self._kept: deque[T] = deque(maxlen=limit)
+        self._items: deque[T] = deque(maxlen=limit)
         self._waiting: list[T] = []
         self._anew = False
         # Only the writing thread uses these.
         self._writing = threading.Lock()
         self._content: tuple[T, ...] = ()
-        self._log = Log(path, limit, lambda: map(line_of, self._content))
+        self._log = LineLog(path, limit, lambda: map(line_of, self._content))
         self._on_disk: tuple[T, ...] = ()
 
     def load(self) -> list[bytes]:
@@ -45,10 +45,10 @@ class Ledger(Generic[T]):
         """
         return self._log.load()
 
-    def found(self, item: T) -> None:
+    def restored(self, item: T) -> None:
         """Add an item that was found in the file."""
-        self._kept.append(item)
-        self._on_disk = tuple(self._kept)
+        self._items.append(item)
+        self._on_disk = tuple(self._items)
 
     def renew(self) -> None:
         """Mark the file as wrong, so that the next `flush` rewrites it."""
@@ -67,13 +67,13 @@ class Ledger(Generic[T]):
     def items(self) -> tuple[T, ...]:
         """All kept items, oldest first."""
         with self._lock:
-            return tuple(self._kept)
+            return tuple(self._items)
 
     def add(self, make: Callable[[T | None], T]) -> T:
         """Keep one more item, which `make` makes from the one before it. The next `flush` puts it on the disk."""
         with self._lock:
-            item = make(self._kept[-1] if self._kept else None)
-            self._kept.append(item)
+            item = make(self._items[-1] if self._items else None)
+            self._items.append(item)
             self._waiting.append(item)
             if len(self._waiting) > self._limit:  # a disk that hangs must not fill the memory
                 self._waiting.clear()
@@ -90,7 +90,7 @@ class Ledger(Generic[T]):
             with self._lock:
                 waiting, self._waiting = self._waiting, []
                 anew, self._anew = self._anew, False
-                self._content = tuple(self._kept)
+                self._content = tuple(self._items)
             if anew:
                 self._log.renew()
             for item in waiting:

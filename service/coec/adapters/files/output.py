@@ -68,7 +68,7 @@ def require_absent(*paths: Path, force: bool) -> None:
         )
 
 
-def write(path: Path, data: bytes) -> Path:
+def write_output(path: Path, data: bytes) -> Path:
     """Write a whole file, and make its folder if needed.
 
     Raises:
@@ -89,7 +89,7 @@ def write(path: Path, data: bytes) -> Path:
     return path
 
 
-def replace(path: Path, data: bytes) -> Path:
+def replace_output(path: Path, data: bytes) -> Path:
     """The same, but atomically, for files that other programs read. An existing file keeps its permissions, and a link
     stays a link.
 
@@ -108,7 +108,7 @@ def replace(path: Path, data: bytes) -> Path:
     return path
 
 
-def kept(path: Path, model: type[M]) -> M | None:
+def load_document(path: Path, model: type[M]) -> M | None:
     """A document that `to_json` made, read from a file; None if there is none or it is damaged."""
     try:
         return from_json(model, path.read_bytes())

@@ -39,7 +39,7 @@ FULL_BYTES = 2**20
 """Free space below which an entry may not find room."""
 
 
-class Book(Protocol):
+class Persistable(Protocol):
     """Something that can be written to the disk."""
 
     def flush(self) -> None:
@@ -51,37 +51,37 @@ class Book(Protocol):
         """
 
 
-class Scribe:
+class DiskWriter:
     """Writes all books in one folder. `thread` writes; the methods are for any thread unless they say otherwise."""
 
     def __init__(self, folder: Path) -> None:
         self.thread = ServiceThread("scribe", self._run)
         self._folder = folder
         self._condition = threading.Condition()
-        self._due: dict[Book, None] = {}
-        self._registered: dict[Book, None] = {}
+        self._due: dict[Persistable, None] = {}
+        self._registered: dict[Persistable, None] = {}
         self._report_replaced: list[Callable[[str], object]] = []
         self._pin = _Pin.of(folder)
         self._requested = self._written = 0
-        self._begun_s: float | None = None
+        self._started_s: float | None = None
         self._failure: Reason | None = None
         self._space: Reason | None = None
 
-    def write(self, *books: Book) -> None:
+    def write(self, *items: Persistable) -> None:
         """Have these books written soon, in this order, because something was noted in them."""
         with self._condition:
-            self._due.update(dict.fromkeys(books))
-            self._registered.update(dict.fromkeys(books))
+            self._due.update(dict.fromkeys(items))
+            self._registered.update(dict.fromkeys(items))
             self._requested += 1
             self._condition.notify_all()
 
-    def keep(self, *books: Book) -> None:
+    def register(self, *items: Persistable) -> None:
         """Have these books written, in this order and after all earlier ones, whenever the folder was removed and made
         again. Those that were ever written are kept anyway."""
         with self._condition:
-            for book in books:
-                self._registered.pop(book, None)
-                self._registered[book] = None
+            for item in items:
+                self._registered.pop(item, None)
+                self._registered[item] = None
 
     def on_replaced(self, report: Callable[[str], object]) -> None:
         """Call `report` with one sentence on the scribe's thread, before the books are written into another folder."""
@@ -91,20 +91,20 @@ class Scribe:
         """Whether everything noted before this call is on the disk. Waits at most `PATIENCE_S`, and not at all if the
         disk refuses, or if the write under way has already taken that long."""
         with self._condition:
-            wanted, end_s = self._requested, time.monotonic() + PATIENCE_S
-            while self._written < wanted:
+            requested, end_s = self._requested, time.monotonic() + PATIENCE_S
+            while self._written < requested:
                 now_s = time.monotonic()
-                patience_s = min(end_s, (now_s if self._begun_s is None else self._begun_s) + PATIENCE_S) - now_s
+                patience_s = min(end_s, (now_s if self._started_s is None else self._started_s) + PATIENCE_S) - now_s
                 if self._failure is not None or patience_s <= 0.0:
                     return False
                 self._condition.wait(patience_s)
             return True
 
     @property
-    def trouble(self) -> Reason | None:
+    def problem(self) -> Reason | None:
         """What is wrong with the disk; None if nothing is."""
-        begun_s, failure = self._begun_s, self._failure
-        silent_s = 0.0 if begun_s is None else time.monotonic() - begun_s
+        started_s, failure = self._started_s, self._failure
+        silent_s = 0.0 if started_s is None else time.monotonic() - started_s
         if silent_s > SLOW_S:
             text = f"The disk of {self._folder} has been busy for {silent_s:.0f} s: what is decided is not on it yet."
             return Reason("disk_slow", text)
@@ -113,20 +113,20 @@ class Scribe:
     def write_due(self) -> None:
         """Write the books that are due. For the scribe's own thread, or for use without a thread."""
         with self._condition:
-            self._begun_s = time.monotonic()
+            self._started_s = time.monotonic()
         self._notice_replacement()
         with self._condition:
-            books, number = tuple(self._due), self._requested
+            items, number = tuple(self._due), self._requested
             self._due.clear()
-        failed: dict[Book, StateError] = {}
-        for book in books:
+        failed: dict[Persistable, StateError] = {}
+        for item in items:
             try:
-                book.flush()
+                item.flush()
             except StateError as error:
-                failed[book] = error
+                failed[item] = error
         self._notice_replacement()  # while the books were written: then they have to be written again
         with self._condition:
-            self._begun_s = None
+            self._started_s = None
             self._due = {**dict.fromkeys(failed), **self._due}
             if failed:
                 text = f"{next(iter(failed.values()))}: it is kept in memory, and tried again every second."
@@ -157,19 +157,19 @@ class Scribe:
             self._due = {**self._registered, **self._due}
             self._requested += 1
 
-    def look(self) -> None:
+    def check_folder(self) -> None:
         """See whether the disk has room, and whether the folder is still the same. For the scribe's own thread, because
         on a disk that hangs even this waits."""
         self._notice_replacement()
         try:
-            found = os.statvfs(self._folder)
+            status = os.statvfs(self._folder)
         except OSError as error:
             self._space = Reason("disk_failing", f"The folder {self._folder} cannot be looked at: {error.strerror}.")
             return
-        if found.f_flag & os.ST_RDONLY:
+        if status.f_flag & os.ST_RDONLY:
             text = f"The disk of {self._folder} is read-only ({os.strerror(errno.EROFS)}): nothing can be kept."
             self._space = Reason("disk_read_only", text)
-        elif found.f_bavail * found.f_frsize < FULL_BYTES:
+        elif status.f_bavail * status.f_frsize < FULL_BYTES:
             text = f"The disk of {self._folder} is full: nothing can be kept. Free space."
             self._space = Reason("disk_full", text)
         else:
@@ -183,7 +183,7 @@ class Scribe:
                 if self._requested == seen:
                     self._condition.wait(RETRY_S)
                 seen = self._requested
-            self.look()
+            self.check_folder()
             if self._due:
                 self.write_due()
         self.write_due()

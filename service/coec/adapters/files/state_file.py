@@ -23,7 +23,7 @@ from coec.errors import StateError
 
 SCHEMA_VERSION = 1
 
-MAX_BYTES = 64 * 2**20
+MAX_STATE_BYTES = 64 * 2**20
 """Largest file that is read. 32 pairs with everything that their state can hold take less than 1 MB."""
 
 BROKEN, NEWER, OLDER = ".broken", ".newer", ".older"
@@ -50,7 +50,7 @@ class StateFile:
         self._previous = path.with_name(path.name + ".previous")
         self._current_is_good = False
         self._loaded: Path | None = None
-        self._aside: dict[Path, str] = {}
+        self._quarantined: dict[Path, str] = {}
 
     def load(self) -> LoadedState:
         """The body of the current copy, else of the previous one, else None. Never raises for a bad file."""
@@ -64,11 +64,11 @@ class StateFile:
                 damage.append(f"{path.name}: {error.strerror}")
             except StateError as error:
                 damage.append(f"{path.name}: {error}")
-                self._aside[path] = NEWER if isinstance(error, _NewerError) else BROKEN
+                self._quarantined[path] = NEWER if isinstance(error, _NewerError) else BROKEN
             else:
                 self._current_is_good, self._loaded = path == self._path, path
                 if version > SCHEMA_VERSION:
-                    self._aside[path] = NEWER
+                    self._quarantined[path] = NEWER
                 return LoadedState(body, tuple(damage))
         return LoadedState(None, tuple(damage))
 
@@ -76,13 +76,13 @@ class StateFile:
         """Whether there is a current copy, good or not."""
         return self._path.exists()
 
-    def distrust(self, suffix: str = BROKEN) -> None:
+    def reject(self, suffix: str = BROKEN) -> None:
         """Call this if the loaded body, or a part of it, turns out to be unusable: the copy that it came from is kept
         aside under `suffix` and does not become the previous copy. `BROKEN` outweighs the other suffixes."""
         if self._loaded is None:
             return
-        if self._aside.get(self._loaded) != BROKEN:
-            self._aside[self._loaded] = suffix
+        if self._quarantined.get(self._loaded) != BROKEN:
+            self._quarantined[self._loaded] = suffix
         self._current_is_good = False
 
     def save(self, body: dict[str, Any]) -> None:
@@ -93,9 +93,9 @@ class StateFile:
             StateError: the disk is full or the folder not writable; a good copy stays on the disk.
         """
         try:
-            for path in tuple(self._aside):
-                durable.set_aside(path, self._aside[path])
-                del self._aside[path]
+            for path in tuple(self._quarantined):
+                durable.quarantine(path, self._quarantined[path])
+                del self._quarantined[path]
             durable.replace(self._path, _encode(body), self._previous if self._current_is_good else None)
         except OSError as error:
             raise StateError(f"cannot write {self._path}: {error.strerror}; it needs space and permission") from error
@@ -115,9 +115,9 @@ def _encode(body: dict[str, Any], version: int = SCHEMA_VERSION) -> bytes:
 
 def _read(path: Path) -> bytes:
     with path.open("rb") as stream:
-        data = stream.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise StateError(f"has more than {MAX_BYTES} bytes")
+        data = stream.read(MAX_STATE_BYTES + 1)
+    if len(data) > MAX_STATE_BYTES:
+        raise StateError(f"has more than {MAX_STATE_BYTES} bytes")
     return data
 
 

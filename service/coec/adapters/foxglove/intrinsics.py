@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coec.adapters.ros.outgoing import UnsayableCameraError, sayable
+from coec.adapters.ros.outgoing import UnsupportedCameraError, ros_camera
 from coec.geometry.cameras import Camera, intrinsics_of, name_of
 
 
 @dataclass(frozen=True, slots=True)
-class Counterpart:
+class ViewerCamera:
     """A camera for viewers: their name of its model, its coefficients in their order, and the camera itself, whose
     size, focal lengths and principal point are sent unchanged."""
 
@@ -18,7 +18,7 @@ class Counterpart:
     coefficients: tuple[float, ...]
 
 
-COUNTERPARTS: dict[str, tuple[str, tuple[str, ...]]] = {
+VIEWER_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "pinhole": ("plumb_bob", ()),
     "radtan": ("plumb_bob", ("k1", "k2", "p1", "p2", "k3")),
     "rational": ("rational_polynomial", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
@@ -28,13 +28,13 @@ COUNTERPARTS: dict[str, tuple[str, tuple[str, ...]]] = {
 them."""
 
 
-def counterpart_of(camera: Camera) -> Counterpart | None:
+def viewer_camera(camera: Camera) -> ViewerCamera | None:
     """The camera for viewers. One of a model that they do not know becomes a Kannala-Brandt camera, as for ROS; None if
     that would put points on other pixels."""
     try:
-        known, _ = sayable(camera)
-    except UnsayableCameraError:
+        known, _ = ros_camera(camera)
+    except UnsupportedCameraError:
         return None
-    model, names = COUNTERPARTS[name_of(known)]
+    model, names = VIEWER_MODELS[name_of(known)]
     values = intrinsics_of(known)
-    return Counterpart(known, model, tuple(float(values[name]) for name in names) or (0.0,) * 5)
+    return ViewerCamera(known, model, tuple(float(values[name]) for name in names) or (0.0,) * 5)

@@ -10,10 +10,10 @@ import numpy as np
 from foxglove import Channel, Context, channels, messages
 
 from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.intrinsics import Counterpart, counterpart_of
-from coec.adapters.foxglove.shown import Marks, Picture
-from coec.adapters.foxglove.timeline import Moment, schema
-from coec.adapters.foxglove.topics import Pose, frame_of
+from coec.adapters.foxglove.intrinsics import ViewerCamera, viewer_camera
+from coec.adapters.foxglove.shown import PairPicture, PointMarks
+from coec.adapters.foxglove.timeline import TimelineEntry, timeline_schema
+from coec.adapters.foxglove.topics import DisplayedPose, frame_of
 from coec.calibration.types import EncodedImage
 from coec.errors import UnavailableError
 from coec.geometry.cameras import Camera
@@ -39,7 +39,7 @@ _LOG_LEVELS = (
 """Log level by ROS level: OK, WARN, ERROR, STALE."""
 
 
-class Screen:
+class ViewerServer:
     """Sends to viewers. For use by one thread; the library's own threads send to each viewer at its speed."""
 
     def __init__(self, host: str, port: int, name: str, camera: Camera) -> None:
@@ -52,20 +52,21 @@ class Screen:
         # Do not report viewers that leave without closing, or that send malformed messages.
         logging.getLogger("foxglove").addHandler(logging.NullHandler())
         context = self._context = Context()  # keep it, as its channels close when it is deleted
-        self._image = channels.CompressedImageChannel(topics.IMAGE, context=context)
+        self._image = channels.CompressedImageChannel(topics.IMAGE_TOPIC, context=context)
         self._marks = {
-            pose: channels.ImageAnnotationsChannel(topic, context=context) for pose, topic in topics.POINTS.items()
+            pose: channels.ImageAnnotationsChannel(topic, context=context)
+            for pose, topic in topics.POINTS_TOPICS.items()
         }
-        self._cloud = channels.PointCloudChannel(topics.CLOUD, context=context)
-        self._transforms = channels.FrameTransformsChannel(topics.TRANSFORMS, context=context)
-        self._counterpart = counterpart_of(camera)
+        self._cloud = channels.PointCloudChannel(topics.CLOUD_TOPIC, context=context)
+        self._transforms = channels.FrameTransformsChannel(topics.TRANSFORMS_TOPIC, context=context)
+        self._counterpart = viewer_camera(camera)
         self._calibration = (
             None
             if self._counterpart is None
-            else channels.CameraCalibrationChannel(topics.CALIBRATION, context=context)
+            else channels.CameraCalibrationChannel(topics.CALIBRATION_TOPIC, context=context)
         )
-        self._health = Channel(topics.HEALTH, schema=schema(), context=context)
-        self._log = channels.LogChannel(topics.LOG, context=context)
+        self._health = Channel(topics.HEALTH_TOPIC, schema=timeline_schema(), context=context)
+        self._log = channels.LogChannel(topics.LOG_TOPIC, context=context)
         always = (self._image, *self._marks.values(), self._cloud, self._transforms, self._health, self._log)
         self._all = always if self._calibration is None else (*always, self._calibration)
         try:
@@ -78,16 +79,16 @@ class Screen:
         self.url = f"ws://{_address(host, self._server.port)}"
 
     @property
-    def wanted(self) -> frozenset[str]:
+    def requested_topics(self) -> frozenset[str]:
         """Topics that some viewer subscribes to."""
         return frozenset(str(channel.topic()) for channel in self._all if channel.has_sinks())
 
-    def show(self, picture: Picture) -> None:
+    def send_picture(self, picture: PairPicture) -> None:
         """Send all parts of a picture, with the stamp of its image."""
         stamp = _stamp(picture.stamp_ns)
         if picture.image is not None:
             self._image.log(_image(picture, picture.image, stamp))
-        for row, pose in enumerate(Pose):
+        for row, pose in enumerate(DisplayedPose):
             if pose in picture.marks:
                 self._marks[pose].log(_annotations(picture.marks[pose], row, picture.rig.camera.width, stamp))
         if picture.cloud is not None:
@@ -96,11 +97,11 @@ class Screen:
         if self._calibration is not None and self._counterpart is not None:
             self._calibration.log(_calibration(picture, self._counterpart, stamp))
 
-    def tell(self, moment: Moment) -> None:
+    def send_entry(self, moment: TimelineEntry) -> None:
         """Send a line of the timeline."""
         self._health.log(moment.document())
 
-    def remark(self, ros_level: Literal[0, 1, 2, 3], text: str, source: str) -> None:
+    def send_log(self, ros_level: Literal[0, 1, 2, 3], text: str, source: str) -> None:
         """Send a line of the log, with the present time."""
         now = messages.Timestamp.now()
         self._log.log(messages.Log(timestamp=now, level=_LOG_LEVELS[ros_level], message=text, name=source))
@@ -118,12 +119,12 @@ def _stamp(stamp_ns: int) -> messages.Timestamp:
     return messages.Timestamp(*divmod(stamp_ns, NS_PER_S))
 
 
-def _image(picture: Picture, image: EncodedImage, stamp: messages.Timestamp) -> messages.CompressedImage:
-    frame = frame_of(picture.rig.camera_frame, Pose.SERVED)
+def _image(picture: PairPicture, image: EncodedImage, stamp: messages.Timestamp) -> messages.CompressedImage:
+    frame = frame_of(picture.rig.camera_frame, DisplayedPose.SERVED)
     return messages.CompressedImage(timestamp=stamp, frame_id=frame, data=image.data, format=str(image.format))
 
 
-def _annotations(marks: Marks, row: int, width_px: int, stamp: messages.Timestamp) -> messages.ImageAnnotations:
+def _annotations(marks: PointMarks, row: int, width_px: int, stamp: messages.Timestamp) -> messages.ImageAnnotations:
     """Points and a line of text. The text is sent even if no point is in view, because viewers wait for annotations
     with the stamp of the image."""
     size_px = max(8.0, width_px * TITLE_SHARE)
@@ -148,7 +149,7 @@ def _annotations(marks: Marks, row: int, width_px: int, stamp: messages.Timestam
     return messages.ImageAnnotations(timestamp=stamp, points=points, texts=[title])
 
 
-def _cloud(picture: Picture, cloud: np.ndarray, stamp: messages.Timestamp) -> messages.PointCloud:
+def _cloud(picture: PairPicture, cloud: np.ndarray, stamp: messages.Timestamp) -> messages.PointCloud:
     names = ("x", "y", "z", "range")
     kind = messages.PackedElementFieldNumericType.Float32
     fields = [
@@ -167,7 +168,7 @@ def _cloud(picture: Picture, cloud: np.ndarray, stamp: messages.Timestamp) -> me
     )
 
 
-def _transforms(picture: Picture, stamp: messages.Timestamp) -> messages.FrameTransforms:
+def _transforms(picture: PairPicture, stamp: messages.Timestamp) -> messages.FrameTransforms:
     return messages.FrameTransforms(
         transforms=[
             _pose_in_lidar(picture, pose, extrinsic.T_camera_lidar, stamp)
@@ -178,7 +179,7 @@ def _transforms(picture: Picture, stamp: messages.Timestamp) -> messages.FrameTr
 
 
 def _pose_in_lidar(
-    picture: Picture, pose: Pose, T_camera_lidar: np.ndarray, stamp: messages.Timestamp
+    picture: PairPicture, pose: DisplayedPose, T_camera_lidar: np.ndarray, stamp: messages.Timestamp
 ) -> messages.FrameTransform:
     """The transform of a camera frame: the pose of the child in the parent, which is the inverse of T_camera_lidar."""
     T_lidar_camera = inverse(T_camera_lidar)
@@ -193,11 +194,13 @@ def _pose_in_lidar(
     )
 
 
-def _calibration(picture: Picture, counterpart: Counterpart, stamp: messages.Timestamp) -> messages.CameraCalibration:
+def _calibration(
+    picture: PairPicture, counterpart: ViewerCamera, stamp: messages.Timestamp
+) -> messages.CameraCalibration:
     camera = counterpart.camera
     return messages.CameraCalibration(
         timestamp=stamp,
-        frame_id=frame_of(picture.rig.camera_frame, Pose.SERVED),
+        frame_id=frame_of(picture.rig.camera_frame, DisplayedPose.SERVED),
         width=camera.width,
         height=camera.height,
         distortion_model=counterpart.distortion_model,

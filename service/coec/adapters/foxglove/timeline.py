@@ -18,11 +18,11 @@ RECORDED = "recorded"
 """State: there is no service; a recording is played."""
 
 
-class _Told(BaseModel):
+class _TimelineModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Axes(_Told):
+class PoseAxes(_TimelineModel):
     """Rotation vector about, and translation along, the axes of the camera; unknown values are left out."""
 
     rx_deg: float | None = None
@@ -33,7 +33,7 @@ class Axes(_Told):
     tz_m: float | None = None
 
 
-class Ages(_Told):
+class StreamAges(_TimelineModel):
     """Seconds since the last frame or answer; left out if nothing has come, or if it is not listened to."""
 
     camera_s: float | None = None
@@ -42,7 +42,7 @@ class Ages(_Told):
     answer_s: float | None = Field(default=None, description="since the last word of the service, asked for or not")
 
 
-class Figure(_Told):
+class TimelineFigure(_TimelineModel):
     """A figure of self-diagnosis with its limit."""
 
     name: str
@@ -51,7 +51,7 @@ class Figure(_Told):
     passed: bool
 
 
-class Missed(_Told):
+class MissedFrames(_TimelineModel):
     """Received frames that were not shown."""
 
     stream: str
@@ -59,7 +59,7 @@ class Missed(_Told):
     count: int
 
 
-class Moment(_Told):
+class TimelineEntry(_TimelineModel):
     """A line of the timeline."""
 
     pair: str
@@ -72,23 +72,23 @@ class Moment(_Told):
     status: str | None = Field(default=None, description="status of the latest attempt, or of a recording's result")
     percent_complete: float | None = Field(default=None, description="how full the open window is")
     candidate: bool = Field(default=False, description="whether a candidate is shown")
-    ages: Ages = Ages()
+    ages: StreamAges = StreamAges()
     pair_rate_hz: float | None = None
     sync_error_s: float | None = None
-    correction: Axes = Field(default=Axes(), description="served extrinsic, from nominal")
-    sigma: Axes = Field(default=Axes(), description="standard deviations of `correction`")
-    step: Axes = Field(default=Axes(), description="candidate, from the served extrinsic")
-    figures: tuple[Figure, ...] = ()
-    not_shown: tuple[Missed, ...] = ()
+    correction: PoseAxes = Field(default=PoseAxes(), description="served extrinsic, from nominal")
+    sigma: PoseAxes = Field(default=PoseAxes(), description="standard deviations of `correction`")
+    step: PoseAxes = Field(default=PoseAxes(), description="candidate, from the served extrinsic")
+    figures: tuple[TimelineFigure, ...] = ()
+    not_shown: tuple[MissedFrames, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """The line in the form in which it is sent."""
         return self.model_dump(mode="json", exclude_none=True)
 
 
-def schema() -> dict[str, Any]:
+def timeline_schema() -> dict[str, Any]:
     """JSON Schema of a `Moment`, without references and choices, which viewers do not follow."""
-    whole = Moment.model_json_schema()
+    whole = TimelineEntry.model_json_schema()
     plain: dict[str, Any] = _plain(whole, whole.get("$defs", {}))
     return plain | {"title": "coec.Moment"}
 

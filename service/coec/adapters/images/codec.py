@@ -192,7 +192,7 @@ class GreyImages:
         return decode_grey(frame.image, self._limits)
 
 
-class Compressed:
+class CompressingReducer:
     """Implements `ports.ImageReducer`. Compressed images stay as they are. Raw pixels become a grey JPEG with a tenth
     to a thirtieth of their bytes, which takes 10 ms of a core per megapixel."""
 
@@ -218,7 +218,7 @@ class CachedGreys:
     def __init__(self, reader: GreyImages, entries: int) -> None:
         self._reader = reader
         self._entries = entries
-        self._kept: dict[bytes, NDArray[np.uint8]] = {}
+        self._greys: dict[bytes, NDArray[np.uint8]] = {}
 
     def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
         """(height, width) grey values.
@@ -227,11 +227,11 @@ class CachedGreys:
             DecodeError: the reasons of `probe` and `raw_image`.
         """
         digest = hashlib.sha256(frame.image.data).digest()
-        if digest not in self._kept:
-            if len(self._kept) == self._entries:
-                del self._kept[next(iter(self._kept))]
-            self._kept[digest] = self._reader.grey(frame)
-        return self._kept[digest]
+        if digest not in self._greys:
+            if len(self._greys) == self._entries:
+                del self._greys[next(iter(self._greys))]
+            self._greys[digest] = self._reader.grey(frame)
+        return self._greys[digest]
 
 
 class Inspector:

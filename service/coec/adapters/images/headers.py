@@ -35,7 +35,7 @@ _MAX_CHUNKS = 16_384
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
+class ImageHeader:
     """Format and size in pixels; `body` is the offset of the first byte behind the header.
 
     Attributes:
@@ -49,7 +49,7 @@ class Header:
     components: int = 0
 
 
-def read_header(data: bytes) -> Header:
+def read_header(data: bytes) -> ImageHeader:
     """Format and size of a JPEG or PNG.
 
     Raises:
@@ -64,7 +64,7 @@ def read_header(data: bytes) -> Header:
     raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, "the image is neither JPEG nor PNG")
 
 
-def check_body(header: Header, data: bytes) -> None:
+def check_body(header: ImageHeader, data: bytes) -> None:
     """Checks that the file is complete and does not make the decoder work for more than the file holds.
 
     Bytes that a driver appends behind the end, such as padding to the size of its buffer, do no harm.
@@ -82,7 +82,7 @@ def check_body(header: Header, data: bytes) -> None:
         raise DecodeError(Refusal.IMAGE_TRUNCATED, "the JPEG has no end marker: it was cut off")
 
 
-def _is_one_scan(header: Header, data: bytes) -> bool:
+def _is_one_scan(header: ImageHeader, data: bytes) -> bool:
     """Whether the first scan of a JPEG holds all components; then a decoder reads no other (libjpeg, jdinput.c). This
     is so for nearly every camera, and saves counting the scans."""
     at = header.body
@@ -102,18 +102,18 @@ def _count_scans(data: bytes) -> int:
     """Number of scan markers, as `data.count` gives it, in a tenth of its time: it compares 16-bit words, once from
     even and once from odd offsets."""
     marker = np.frombuffer(_JPEG_SCAN, np.uint16)
-    words = (np.frombuffer(data, np.uint16, (len(data) - odd) // 2, odd) for odd in (0, 1))
-    return sum(int(np.count_nonzero(half == marker)) for half in words)
+    halves = (np.frombuffer(data, np.uint16, (len(data) - odd) // 2, odd) for odd in (0, 1))
+    return sum(int(np.count_nonzero(half == marker)) for half in halves)
 
 
-def _png_header(data: bytes) -> Header:
+def _png_header(data: bytes) -> ImageHeader:
     """IHDR, which the specification puts first (PNG, 3rd edition, 5.6)."""
     if len(data) < _PNG_HEADER:
         raise DecodeError(Refusal.IMAGE_TRUNCATED, "the PNG ends within its header")
     length, kind, width, height = struct.unpack_from(">I4sII", data, 8)
     if length != 13 or kind != b"IHDR":
         raise DecodeError(Refusal.IMAGE_CORRUPT, "the PNG does not start with IHDR")
-    return Header(ImageFormat.PNG, width, height, _PNG_HEADER)
+    return ImageHeader(ImageFormat.PNG, width, height, _PNG_HEADER)
 
 
 def _check_png_chunks(data: bytes, at: int) -> None:
@@ -132,7 +132,7 @@ def _check_png_chunks(data: bytes, at: int) -> None:
     raise DecodeError(Refusal.IMAGE_CORRUPT, f"the PNG has more than {_MAX_CHUNKS} chunks")
 
 
-def _jpeg_header(data: bytes) -> Header:
+def _jpeg_header(data: bytes) -> ImageHeader:
     """The frame header, behind the segments before it (ITU-T T.81, B.1.1 and B.2.2)."""
     at = 2
     for _ in range(_MAX_SEGMENTS):
@@ -153,7 +153,7 @@ def _jpeg_header(data: bytes) -> Header:
                 raise DecodeError(Refusal.IMAGE_TRUNCATED, "the JPEG ends within its frame header")
             height, width = struct.unpack_from(">HH", data, at + 5)
             components = 0 if marker == _PROGRESSIVE else data[at + 9]
-            return Header(ImageFormat.JPEG, width, height, at + 2 + length, components)
+            return ImageHeader(ImageFormat.JPEG, width, height, at + 2 + length, components)
         if marker in _OTHER_SOF:
             raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, "of JPEGs, only baseline and progressive ones are read")
         if length < 2 or marker in (0x00, 0xD9, 0xDA):  # end of image or a scan without a frame

@@ -28,10 +28,10 @@ colours."""
 LEAST_RATIO = 4.0
 """Least ratio of the far end to the near end, so that a wall has one colour instead of a rainbow of its noise."""
 
-SAMPLES = 4096
+SCALE_SAMPLES = 4096
 """Approximate number of ranges from which the quantiles are taken."""
 
-STEPS = (1.0, 2.0, 5.0)
+SCALE_STEPS = (1.0, 2.0, 5.0)
 """Ends and labels of scales are these numbers, times powers of ten."""
 
 TURNED_STEPS = 2
@@ -66,7 +66,7 @@ class RangeScale:
         return tuple(_of_step(step) for step in range(first, last + 1))
 
 
-WHOLE = RangeScale(NEAREST_M, FURTHEST_M)
+WHOLE_SCALE = RangeScale(NEAREST_M, FURTHEST_M)
 """The scale over all ranges that the objective uses."""
 
 
@@ -74,10 +74,10 @@ def scale_of(range_m: NDArray[np.floating]) -> RangeScale:
     """The scale of a scene: from the nearest to the furthest of its ranges (N,), without a few outliers, at round
     steps; `WHOLE` if there are no ranges. Points nearer than `NEAREST_M` are on the vehicle itself and not drawn."""
     # Some thousand points give good enough quantiles in a tenth of the time.
-    thinned = np.asarray(range_m[:: max(1, len(range_m) // SAMPLES)], dtype=np.float64)
+    thinned = np.asarray(range_m[:: max(1, len(range_m) // SCALE_SAMPLES)], dtype=np.float64)
     thinned = thinned[thinned >= NEAREST_M]
     if len(thinned) == 0:
-        return WHOLE
+        return WHOLE_SCALE
     near_m, far_m = np.quantile(thinned, ROBUST).tolist()
     nearest = furthest = _step(near_m)
     while _of_step(furthest) < far_m or _of_step(furthest) < LEAST_RATIO * _of_step(nearest):
@@ -85,7 +85,7 @@ def scale_of(range_m: NDArray[np.floating]) -> RangeScale:
     return RangeScale(_of_step(nearest), _of_step(furthest))
 
 
-def kept_or(latest: RangeScale | None, fitting: RangeScale) -> RangeScale:
+def stable_scale(latest: RangeScale | None, fitting: RangeScale) -> RangeScale:
     """The scale of the latest picture if it is still good enough, else the one that fits this picture, so that the
     pictures of a drive keep their colours."""
     if latest is None:
@@ -97,12 +97,12 @@ def kept_or(latest: RangeScale | None, fitting: RangeScale) -> RangeScale:
 def _step(range_m: float) -> int:
     """The number of the largest step that is not above a range: 0 is 1 m, 3 is 10 m."""
     decade = floor(log10(range_m) + 1e-9)
-    return 3 * decade + sum(10.0**decade * step <= range_m * (1 + 1e-9) for step in STEPS) - 1
+    return 3 * decade + sum(10.0**decade * step <= range_m * (1 + 1e-9) for step in SCALE_STEPS) - 1
 
 
 def _of_step(number: int) -> float:
-    decade, which = divmod(number, len(STEPS))
-    return float(STEPS[which] * 10.0**decade)
+    decade, which = divmod(number, len(SCALE_STEPS))
+    return float(SCALE_STEPS[which] * 10.0**decade)
 
 
 _PLASMA = np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_PLASMA)).reshape(

@@ -14,7 +14,7 @@ from coec.adapters.ros.topics import Frame, FrameTopics, PairTopics, TopicMessag
 from coec.calibration.types import Matrix4, Rig
 
 
-def _nothing(_: Frame) -> list[tuple[str, str, bytes]]:
+def _no_messages(_: Frame) -> list[tuple[str, str, bytes]]:
     return []
 
 
@@ -23,8 +23,8 @@ def write_bag(
     rig: Rig,
     T_camera_lidar: Matrix4,
     frames: Iterable[Frame],
-    heard: Callable[[Frame], None],
-    beside: Callable[[Frame], Iterable[tuple[str, str, bytes]]] = _nothing,
+    on_frame: Callable[[Frame], None],
+    extra_messages: Callable[[Frame], Iterable[tuple[str, str, bytes]]] = _no_messages,
 ) -> None:
     """Writes the frames on topics below `/<pair>/`, with the camera info of each image and one `/tf_static`.
 
@@ -37,14 +37,14 @@ def write_bag(
     Raises:
         OSError: the file cannot be written.
     """
-    told = FrameTopics(rig, T_camera_lidar, PairTopics.default(rig.pair))
+    topics = FrameTopics(rig, T_camera_lidar, PairTopics.default(rig.pair))
 
     def messages_of() -> Iterator[TopicMessage]:
         for frame in frames:
-            yield from told.of(frame)
-            for topic, type_name, data in beside(frame):
+            yield from topics.of(frame)
+            for topic, type_name, data in extra_messages(frame):
                 yield TopicMessage(frame.stamp_ns, topic, type_name, data)
-            heard(frame)
+            on_frame(frame)
 
     write_messages(path, messages_of())
 

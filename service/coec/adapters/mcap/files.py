@@ -40,7 +40,7 @@ _FOOTER = struct.Struct("<QQI")
 _TAIL_BYTES = _PREFIX.size + _FOOTER.size + len(MAGIC)
 
 
-class McapDamaged(CoecError):  # noqa: N818 - caught by name where it becomes a SourceError or a WindowError
+class McapDamagedError(CoecError):  # noqa: N818 - caught by name where it becomes a SourceError or a WindowError
     """The file is not MCAP, is cut off, or a CRC is wrong; the message begins with the offset of the byte.
 
     Attributes:
@@ -58,8 +58,8 @@ class McapDamaged(CoecError):  # noqa: N818 - caught by name where it becomes a 
         return f"{path} is damaged: {self}. `mcap recover` saves what is whole"
 
 
-def _no_mcap() -> McapDamaged:
-    return McapDamaged("byte 0: it does not begin as one does", is_mcap=False)
+def _no_mcap() -> McapDamagedError:
+    return McapDamagedError("byte 0: it does not begin as one does", is_mcap=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class McapMessage:
     """A message and its place: `chunk_at` is the file offset of its chunk record (None outside of chunks), `at` the
     offset of its data within the unpacked chunk (or within the file)."""
 
@@ -97,7 +97,7 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
-class Attachment:
+class McapAttachment:
     """A file within the file."""
 
     name: str
@@ -113,7 +113,7 @@ class Metadata:
     values: dict[str, str]
 
 
-Record = Schema | Channel | Message | Attachment | Metadata
+Record = Schema | Channel | McapMessage | McapAttachment | Metadata
 
 
 def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> Iterator[Record]:
@@ -141,12 +141,12 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
         opcode, length = _PREFIX.unpack(prefix)
         body_at = at + _PREFIX.size
         if opcode == Opcode.FOOTER:
-            raise McapDamaged(f"byte {at}: the data section has no end")
+            raise McapDamagedError(f"byte {at}: the data section has no end")
         body = _read(stream, length, body_at, size)
         if opcode == Opcode.DATA_END:
             expected = _Cursor(body, body_at).unpack(struct.Struct("<I"))[0]
             if expected not in (0, crc):
-                raise McapDamaged(f"byte {at}: the CRC of the data section does not agree")
+                raise McapDamagedError(f"byte {at}: the CRC of the data section does not agree")
             _check_summary(stream, body_at + length, size)
             return
         crc = zlib.crc32(body, zlib.crc32(prefix, crc))
@@ -154,7 +154,7 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
             chunk = _unpack_chunk(body, body_at)
             unpacked += len(chunk)
             if max_unpacked_bytes is not None and unpacked > max_unpacked_bytes:
-                raise McapDamaged(f"byte {at}: the file unpacks to more than {max_unpacked_bytes} bytes")
+                raise McapDamagedError(f"byte {at}: the file unpacks to more than {max_unpacked_bytes} bytes")
             yield from _chunk_records(chunk, at)
         else:
             yield from _parse(opcode, body, body_at, None)
@@ -184,7 +184,7 @@ class MessageReader:
             self._stream.seek(chunk_at)
             opcode, span = _PREFIX.unpack(_read(self._stream, _PREFIX.size, chunk_at, self._size))
             if opcode != Opcode.CHUNK:
-                raise McapDamaged(f"byte {chunk_at}: there is no chunk here any more: the file has changed")
+                raise McapDamagedError(f"byte {chunk_at}: there is no chunk here any more: the file has changed")
             body_at = chunk_at + _PREFIX.size
             self._chunk = _unpack_chunk(_read(self._stream, span, body_at, self._size), body_at)
             self._chunk_at = chunk_at
@@ -201,7 +201,7 @@ def read_attachment(path: Path, name: str) -> bytes | None:
     with path.open("rb") as stream:
         size = _size(stream)
         summary, summary_at = _summary(stream, size)
-        found: tuple[int, int] | None = None
+        location: tuple[int, int] | None = None
         cursor = _Cursor(summary, summary_at)
         while cursor.left:
             opcode, length = cursor.unpack(_PREFIX)
@@ -209,16 +209,16 @@ def read_attachment(path: Path, name: str) -> bytes | None:
             if opcode == Opcode.ATTACHMENT_INDEX:
                 at, span, *_ = body.unpack(_ATTACHMENT_INDEX)
                 if body.text() == name:
-                    found = at, span
-        if found is None:
+                    location = at, span
+        if location is None:
             return None
-        at, span = found
+        at, span = location
         stream.seek(min(at, size))
         record = _read(stream, span, at, size)
         cursor = _Cursor(record, at)
         opcode, length = cursor.unpack(_PREFIX)
         if opcode != Opcode.ATTACHMENT or length != cursor.left:
-            raise McapDamaged(f"byte {at}: the index points to something that is not an attachment")
+            raise McapDamagedError(f"byte {at}: the index points to something that is not an attachment")
         return _attachment(cursor.take(length), at + _PREFIX.size).data
 
 
@@ -229,8 +229,8 @@ def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
     """The summary section, with verified CRC, and where it begins; empty if there is none."""
     if size < len(MAGIC) + _TAIL_BYTES:
         if size == 0:
-            raise McapDamaged("it is empty", is_mcap=False)
-        raise McapDamaged(f"byte {size}: the file is cut off")
+            raise McapDamagedError("it is empty", is_mcap=False)
+        raise McapDamagedError(f"byte {size}: the file is cut off")
     stream.seek(0)
     if _read(stream, len(MAGIC), 0, size) != MAGIC:
         raise _no_mcap()
@@ -239,16 +239,16 @@ def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
     tail = _read(stream, _TAIL_BYTES, footer_at, size)
     opcode, length = _PREFIX.unpack_from(tail)
     if (opcode, length) != (Opcode.FOOTER, _FOOTER.size) or tail[-len(MAGIC) :] != MAGIC:
-        raise McapDamaged(f"byte {size}: the file is cut off (it does not end as MCAP ends)")
+        raise McapDamagedError(f"byte {size}: the file is cut off (it does not end as MCAP ends)")
     summary_at, _, expected = _FOOTER.unpack_from(tail, _PREFIX.size)
     if summary_at == 0:
         return b"", footer_at
     if not len(MAGIC) <= summary_at <= footer_at:
-        raise McapDamaged(f"byte {footer_at}: the footer points outside the file")
+        raise McapDamagedError(f"byte {footer_at}: the footer points outside the file")
     stream.seek(summary_at)
     summary = _read(stream, footer_at - summary_at, summary_at, size)
     if expected not in (0, zlib.crc32(tail[: _PREFIX.size + _FOOTER.size - 4], zlib.crc32(summary))):
-        raise McapDamaged(f"byte {summary_at}: the CRC of the summary does not agree")
+        raise McapDamagedError(f"byte {summary_at}: the CRC of the summary does not agree")
     return summary, summary_at
 
 
@@ -256,7 +256,7 @@ def _check_summary(stream: BinaryIO, at: int, size: int) -> None:
     """Checks what follows the data section: a summary that begins right here (or none), a footer, and nothing else."""
     _, summary_at = _summary(stream, size)
     if summary_at != at:
-        raise McapDamaged(f"byte {at}: {summary_at - at} bytes between the data and the summary belong to neither")
+        raise McapDamagedError(f"byte {at}: {summary_at - at} bytes between the data and the summary belong to neither")
 
 
 # --- records ------------------------------------------------------------------------------------------------
@@ -266,11 +266,11 @@ def _chunk_records(chunk: bytes, chunk_at: int) -> Iterator[Record]:
     at = 0
     while at < len(chunk):
         if at + _PREFIX.size > len(chunk):
-            raise McapDamaged(f"byte {chunk_at}: a record of this chunk is cut at its end")
+            raise McapDamagedError(f"byte {chunk_at}: a record of this chunk is cut at its end")
         opcode, length = _PREFIX.unpack_from(chunk, at)
         at += _PREFIX.size
         if at + length > len(chunk):
-            raise McapDamaged(f"byte {chunk_at}: a record of this chunk is cut at its end")
+            raise McapDamagedError(f"byte {chunk_at}: a record of this chunk is cut at its end")
         yield from _parse(opcode, chunk[at : at + length], at, chunk_at)
         at += length
 
@@ -281,7 +281,7 @@ def _parse(opcode: int, body: bytes, at: int, chunk_at: int | None) -> Iterator[
     match opcode:
         case Opcode.MESSAGE:
             channel_id, sequence, log_time_ns, _ = cursor.unpack(_MESSAGE)
-            yield Message(channel_id, sequence, log_time_ns, body[_MESSAGE.size :], chunk_at, at + _MESSAGE.size)
+            yield McapMessage(channel_id, sequence, log_time_ns, body[_MESSAGE.size :], chunk_at, at + _MESSAGE.size)
         case Opcode.SCHEMA:
             (schema_id,) = cursor.unpack(struct.Struct("<H"))
             yield Schema(schema_id, cursor.text(), cursor.text(), cursor.blob("<I"))
@@ -294,13 +294,13 @@ def _parse(opcode: int, body: bytes, at: int, chunk_at: int | None) -> Iterator[
             yield Metadata(cursor.text(), cursor.pairs())
 
 
-def _attachment(body: bytes, at: int) -> Attachment:
+def _attachment(body: bytes, at: int) -> McapAttachment:
     cursor = _Cursor(body, at)
     cursor.take(16)  # log time, create time
-    attachment = Attachment(cursor.text(), cursor.text(), cursor.blob("<Q"))
+    attachment = McapAttachment(cursor.text(), cursor.text(), cursor.blob("<Q"))
     (expected,) = cursor.unpack(struct.Struct("<I"))
     if expected not in (0, zlib.crc32(body[:-4])):
-        raise McapDamaged(f"byte {at}: the CRC of an attachment does not agree")
+        raise McapDamagedError(f"byte {at}: the CRC of an attachment does not agree")
     return attachment
 
 
@@ -309,7 +309,7 @@ def _unpack_chunk(body: bytes, at: int) -> bytes:
     _, _, promised, expected = cursor.unpack(_CHUNK)
     compression, packed = cursor.text(), cursor.blob("<Q")
     if promised > MAX_CHUNK_BYTES:
-        raise McapDamaged(f"byte {at}: a chunk would unpack to {promised} bytes, the limit is {MAX_CHUNK_BYTES}")
+        raise McapDamagedError(f"byte {at}: a chunk would unpack to {promised} bytes, the limit is {MAX_CHUNK_BYTES}")
     try:
         match compression:
             case "":
@@ -323,11 +323,11 @@ def _unpack_chunk(body: bytes, at: int) -> bytes:
                 )
                 data = reader.read(promised + 1)
             case _:
-                raise McapDamaged(f"byte {at}: a chunk has a compression that is neither lz4 nor zstd")
+                raise McapDamagedError(f"byte {at}: a chunk has a compression that is neither lz4 nor zstd")
     except (RuntimeError, zstandard.ZstdError) as error:
-        raise McapDamaged(f"byte {at}: a chunk cannot be unpacked") from error
+        raise McapDamagedError(f"byte {at}: a chunk cannot be unpacked") from error
     if len(data) != promised or (expected and zlib.crc32(data) != expected):
-        raise McapDamaged(f"byte {at}: size or CRC of a chunk does not agree")
+        raise McapDamagedError(f"byte {at}: size or CRC of a chunk does not agree")
     return data
 
 
@@ -341,10 +341,10 @@ def _size(stream: BinaryIO) -> int:
 def _read(stream: BinaryIO, count: int, at: int, size: int) -> bytes:
     """Exactly `count` bytes; checks that they exist before allocating memory."""
     if at + count > size:
-        raise McapDamaged(f"byte {size}: the file is cut off ({at + count - size} bytes are missing here)")
+        raise McapDamagedError(f"byte {size}: the file is cut off ({at + count - size} bytes are missing here)")
     data = stream.read(count)
     if len(data) != count:
-        raise McapDamaged(f"byte {at + len(data)}: the file is cut off")
+        raise McapDamagedError(f"byte {at + len(data)}: the file is cut off")
     return data
 
 
@@ -369,7 +369,7 @@ class _Cursor:
     def take(self, count: int) -> bytes:
         """The next `count` bytes."""
         if count > self.left:
-            raise McapDamaged(f"byte {self._start}: a length within a record passes its end")
+            raise McapDamagedError(f"byte {self._start}: a length within a record passes its end")
         self._offset += count
         return self._body[self._offset - count : self._offset]
 
@@ -387,7 +387,7 @@ class _Cursor:
         try:
             return self.blob("<I").decode("utf-8")
         except UnicodeDecodeError as error:
-            raise McapDamaged(f"byte {self._start}: a name is not UTF-8") from error
+            raise McapDamagedError(f"byte {self._start}: a name is not UTF-8") from error
 
     def pairs(self) -> dict[str, str]:
         """The next keys and values, preceded by their total length."""

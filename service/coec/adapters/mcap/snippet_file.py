@@ -11,10 +11,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from coec.adapters.files import durable
-from coec.adapters.mcap.files import Channel, McapDamaged, Message, Metadata, Schema, read_records
+from coec.adapters.mcap.files import Channel, McapDamagedError, McapMessage, Metadata, Schema, read_records
 from coec.adapters.mcap.ros_channels import RosChannel, check_stamp
 from coec.adapters.mcap.whole_file import FinishedFile, WholeFile, failing_as_recording_error
-from coec.adapters.mcap.windows.names import LZ4, PACKING, PART_SUFFIX, REWRITE_SUFFIX, beside
+from coec.adapters.mcap.windows.names import LZ4, PACKING, PART_SUFFIX, REWRITE_SUFFIX, with_suffix
 from coec.adapters.ros.topics import Frame, FrameTopics, PairTopics
 from coec.calibration.types import Matrix4, Rig
 from coec.errors import WindowError
@@ -49,7 +49,7 @@ class SnippetFile:
         """
         self.frames = 0
         self._topics = FrameTopics(rig, T_camera_lidar, PairTopics.default(rig.pair))
-        self._file = WholeFile(beside(path, PART_SUFFIX), path, packed=packed)
+        self._file = WholeFile(with_suffix(path, PART_SUFFIX), path, packed=packed)
         self._file.metadata(METADATA, {**metadata, PACKING: LZ4 if packed else ""})
         self._file.sync()
         self._unsynced = 0
@@ -104,10 +104,10 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None], *, pac
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     messages = 0
-    file = WholeFile(beside(final, REWRITE_SUFFIX), final, packed=packed)
+    file = WholeFile(with_suffix(final, REWRITE_SUFFIX), final, packed=packed)
     try:
         # The error at the damaged end of the file ends the loop; everything before it is sound.
-        with suppress(McapDamaged), part_path.open("rb") as stream:
+        with suppress(McapDamagedError), part_path.open("rb") as stream:
             for record in read_records(stream):
                 match record:
                     case Schema():
@@ -116,9 +116,9 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None], *, pac
                         channels[record.channel_id] = record
                     case Metadata():
                         file.metadata(record.name, record.values)
-                    case Message():
+                    case McapMessage():
                         if record.channel_id not in channels:
-                            raise McapDamaged("a message belongs to no channel")
+                            raise McapDamagedError("a message belongs to no channel")
                         _copy(record, file, schemas, channels[record.channel_id])
                         messages += 1
                         progress()
@@ -131,7 +131,7 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None], *, pac
     return file.finish()
 
 
-def _copy(message: Message, file: WholeFile, schemas: Mapping[int, Schema], channel: Channel) -> None:
+def _copy(message: McapMessage, file: WholeFile, schemas: Mapping[int, Schema], channel: Channel) -> None:
     schema = schemas.get(channel.schema_id)
     stamp_ns, number = message.log_time_ns, message.sequence
     file.message(channel.topic, channel.message_encoding, schema, channel.metadata, stamp_ns, number, message.data)
@@ -150,8 +150,8 @@ def metadata_of(path: Path) -> dict[str, str]:
                 match record:
                     case Metadata() if record.name == METADATA:
                         return record.values
-                    case Message():
+                    case McapMessage():
                         break
-    except McapDamaged as error:
+    except McapDamagedError as error:
         raise WindowError(error.of(path)) from error
     return {}

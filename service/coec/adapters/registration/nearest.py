@@ -23,8 +23,8 @@ class Tree:
         """See `Neighbourhood`."""
         if not len(queries_m):
             return np.empty((0, count), np.int64), np.empty((0, count))
-        found, squared = self._tree.batch_knn_search(queries_m, count, num_threads=1)
-        return np.asarray(found).astype(np.int64), np.asarray(squared, np.float64)
+        indices, squared = self._tree.batch_knn_search(queries_m, count, num_threads=1)
+        return np.asarray(indices).astype(np.int64), np.asarray(squared, np.float64)
 
 
 def installed() -> bool:

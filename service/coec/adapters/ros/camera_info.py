@@ -47,7 +47,7 @@ _ALIASES: Final = {"fisheye": "equidistant", "ds": "double_sphere", "cata": "mei
 
 
 @dataclass(frozen=True, slots=True)
-class Info:
+class CameraInfoContent:
     """Content of a `CameraInfo`: `frame_id` of its header; `size` (width, height) of the full image, px; `d` (N,); `k`
     (9,), `r` (9,) and `p` (12,) by rows; `binning` (x, y), at least 1; `roi` (x, y, width, height), px."""
 
@@ -63,14 +63,14 @@ class Info:
 
 
 @dataclass(frozen=True, slots=True)
-class Lens:
+class CameraInfoIntrinsics:
     """Intrinsics, and a short text that says which of the message's numbers they come from."""
 
     intrinsics: CameraIntrinsics
-    told: str
+    source: str
 
 
-def decode_info(payload: bytes) -> Info:
+def decode_info(payload: bytes) -> CameraInfoContent:
     """The content of a message in CDR.
 
     Raises:
@@ -81,7 +81,7 @@ def decode_info(payload: bytes) -> Info:
     return info_of(deserialized(ros.sensor_msgs__msg__CameraInfo, payload))
 
 
-def info_of(message: Any) -> Info:
+def info_of(message: Any) -> CameraInfoContent:
     """The content of a deserialised `CameraInfo`.
 
     Raises:
@@ -93,7 +93,7 @@ def info_of(message: Any) -> Info:
         raise DecodeError("camera_info", f"a CameraInfo has at most {MAX_COEFFICIENTS} distortion coefficients")
     roi = message.roi
     d, k, r, p = (tuple(float(value) for value in numbers) for numbers in (message.d, message.k, message.r, message.p))
-    return Info(
+    return CameraInfoContent(
         message.header.frame_id,
         (int(message.width), int(message.height)),
         message.distortion_model,
@@ -106,7 +106,7 @@ def info_of(message: Any) -> Info:
     )
 
 
-def info_of_yaml(document: object) -> Info | None:
+def info_of_yaml(document: object) -> CameraInfoContent | None:
     """The content of a YAML file with a `CameraInfo`: as ROS's camera_calibration writes it (`camera_matrix`), or as
     `ros2 topic echo` prints the message. None if it is neither.
 
@@ -120,12 +120,12 @@ def info_of_yaml(document: object) -> Info | None:
         value = next((document[name] for name in names if name in document), default)
         value = value.get("data") if isinstance(value, dict) else value
         try:
-            found = tuple(float(number) for number in value or ())
+            values = tuple(float(number) for number in value or ())
         except (TypeError, ValueError, OverflowError) as error:
             raise SourceError(f"{names[0]} is no list of numbers") from error
-        if count is not None and len(found) != count:
-            raise SourceError(f"{names[0]} has {len(found)} numbers, not {count}")
-        return found
+        if count is not None and len(values) != count:
+            raise SourceError(f"{names[0]} has {len(values)} numbers, not {count}")
+        return values
 
     def whole(names: Sequence[str]) -> int:
         value = next((document[name] for name in names if name in document), None)
@@ -137,7 +137,7 @@ def info_of_yaml(document: object) -> Info | None:
     model = document.get("distortion_model", "plumb_bob")
     if len(d) > MAX_COEFFICIENTS or not isinstance(model, str):
         raise SourceError(f"a CameraInfo has the name of a model, and at most {MAX_COEFFICIENTS} coefficients")
-    return Info(
+    return CameraInfoContent(
         frame_id="",
         size=(whole(("image_width", "width")), whole(("image_height", "height"))),
         model=model,
@@ -162,11 +162,11 @@ def info_topic(image_topic: str) -> str:
 def is_rectified(image_topic: str) -> bool:
     """Whether a topic holds rectified images, by the names that image_proc gives them (`image_rect`,
     `image_rect_color`)."""
-    words = [word for chunk in image_topic.split("/") for word in chunk.split("_")]
-    return any(word in ("rect", "rectified") for word in words)
+    parts = [part for chunk in image_topic.split("/") for part in chunk.split("_")]
+    return any(part in ("rect", "rectified") for part in parts)
 
 
-def lens_of(info: Info, *, rectified: bool) -> Lens:
+def intrinsics_of_info(info: CameraInfoContent, *, rectified: bool) -> CameraInfoIntrinsics:
     """The lens of a raw or rectified image, at the size of the received image. `K` and `P` hold for the full image, of
     which `roi` is cut out and then binned. Pixel centres lie at integers, so that binning by b takes u to
     (u + 0.5)/b - 0.5.
@@ -182,31 +182,31 @@ def lens_of(info: Info, *, rectified: bool) -> Lens:
         raise SourceError("a number in it is not finite")
     if info.k[0] == 0.0:
         raise SourceError("the camera is uncalibrated: K is zero")
-    model, matrix, distortion, told = _rectified(info) if rectified else _raw(info)
+    model, matrix, distortion, source = _rectified(info) if rectified else _raw(info)
     (width, height), (x, y, cut_width, cut_height) = info.size, info.roi
     if cut_width or cut_height:
         if x + cut_width > width or y + cut_height > height:
             raise SourceError("its region of interest reaches beyond the image")
-        width, height, told = cut_width, cut_height, f"{told}, cut to {cut_width} x {cut_height} px at ({x}, {y})"
+        width, height, source = cut_width, cut_height, f"{source}, cut to {cut_width} x {cut_height} px at ({x}, {y})"
     fx, fy, cx, cy = matrix
     try:
         size = {"width": width, "height": height}
         camera = cameras.build(model, **size, fx=fx, fy=fy, cx=cx - x, cy=cy - y, **distortion)
         if info.binning != (1, 1):
             camera = cameras.scaled(camera, 1.0 / info.binning[0], 1.0 / info.binning[1])
-            told += f", binned {info.binning[0]} x {info.binning[1]}"
-        return Lens(intrinsics_config(camera), told)
+            source += f", binned {info.binning[0]} x {info.binning[1]}"
+        return CameraInfoIntrinsics(intrinsics_config(camera), source)
     except ValidationError as error:
         raise SourceError(describe(error)) from error
     except ValueError as error:
         raise SourceError(str(error)) from error
 
 
-_Parts = tuple[str, tuple[float, float, float, float], dict[str, float], str]
+_LensParts = tuple[str, tuple[float, float, float, float], dict[str, float], str]
 """Model; fx, fy, cx, cy; distortion; text that says where they come from."""
 
 
-def _rectified(info: Info) -> _Parts:
+def _rectified(info: CameraInfoContent) -> _LensParts:
     fx, _, cx, tx, _, fy, cy, ty = info.p[:8]
     if fx == 0.0:
         raise SourceError("the camera is uncalibrated for rectified images: P is zero")
@@ -218,16 +218,16 @@ def _rectified(info: Info) -> _Parts:
     return "pinhole", (fx, fy, cx, cy), {}, "P, of the rectified image"
 
 
-def _raw(info: Info) -> _Parts:
+def _raw(info: CameraInfoContent) -> _LensParts:
     if abs(info.k[1]) > MAX_SKEW_PX:
         raise SourceError(f"K has a skew of {info.k[1]:g} px, which no camera model here has")
     name = _ALIASES.get(info.model, info.model)
     model, distortion = _polynomial(info.d) if name in _POLYNOMIAL else _named(name, info)
-    told = f"K and d, {info.model or 'without a name'}"
+    source = f"K and d, {info.model or 'without a name'}"
     turned_deg = _turned_deg(info.r)
     if turned_deg > TURNED_DEG:
-        told += f" (R turns by {turned_deg:.2f} deg, which is not applied)"
-    return model, (info.k[0], info.k[4], info.k[2], info.k[5]), distortion, told
+        source += f" (R turns by {turned_deg:.2f} deg, which is not applied)"
+    return model, (info.k[0], info.k[4], info.k[2], info.k[5]), distortion, source
 
 
 def _polynomial(d: Sequence[float]) -> tuple[str, dict[str, float]]:
@@ -245,7 +245,7 @@ def _polynomial(d: Sequence[float]) -> tuple[str, dict[str, float]]:
     raise AssertionError("the last has every coefficient")
 
 
-def _named(name: str, info: Info) -> tuple[str, dict[str, float]]:
+def _named(name: str, info: CameraInfoContent) -> tuple[str, dict[str, float]]:
     for model, (distortion, parameters) in DISTORTION.items():
         if distortion == name:
             if len(info.d) < len(parameters) or any(info.d[len(parameters) :]):

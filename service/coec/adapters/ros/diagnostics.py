@@ -12,7 +12,7 @@ from coec.schemas.replies import ROS_LEVELS, CalibrationResult, HealthReply, Met
 from coec.schemas.rig_state import SensorReply, SensorState
 from coec.schemas.ros_names import sensor_status_name, status_name
 
-Service = Literal["starting", "running", "stopping", "failing"]
+ServicePhase = Literal["starting", "running", "stopping", "failing"]
 """State of the whole service, as in `status`."""
 
 UNITS: Final = ("deg", "deg", "deg", "m", "m", "m")
@@ -22,7 +22,7 @@ MAX_MESSAGE: Final = 500
 """Most characters of the sentence, which panels show in one line; the values hold every reason in full."""
 
 
-class Level(IntEnum):
+class DiagnosticLevel(IntEnum):
     """`diagnostic_msgs/DiagnosticStatus.level`."""
 
     OK = 0
@@ -32,10 +32,10 @@ class Level(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class DiagnosticStatus:
     """`diagnostic_msgs/DiagnosticStatus`."""
 
-    level: Level
+    level: DiagnosticLevel
     name: str
     message: str
     hardware_id: str
@@ -47,38 +47,40 @@ def hardware_id(vehicle: str, pair: str, serial: str | None) -> str:
     return serial or f"{vehicle}/{pair}"
 
 
-def level_of(health: HealthReply, service: Service) -> Level:
+def level_of(health: HealthReply, service: ServicePhase) -> DiagnosticLevel:
     """The level of the state (`replies.ROS_LEVELS`), with exceptions: STALE if the reply is no longer renewed or the
     service stops, and at least ERROR if the service fails."""
-    level = Level(ROS_LEVELS[health.state])
-    if service == "stopping" or any(reason.code == replies.STUCK for reason in health.reasons):
-        return Level.STALE
-    return max(level, Level.ERROR) if service == "failing" else level
+    level = DiagnosticLevel(ROS_LEVELS[health.state])
+    if service == "stopping" or any(reason.code == replies.SERVICE_STUCK for reason in health.reasons):
+        return DiagnosticLevel.STALE
+    return max(level, DiagnosticLevel.ERROR) if service == "failing" else level
 
 
-def of_health(health: HealthReply, service: Service, serial: str | None, more: Mapping[str, str]) -> Status:
+def status_of_health(
+    health: HealthReply, service: ServicePhase, serial: str | None, more: Mapping[str, str]
+) -> DiagnosticStatus:
     """The status of a pair now. `more` holds values that health does not have."""
-    return Status(
+    return DiagnosticStatus(
         level_of(health, service),
         status_name(health.pair),
-        _message(health, service),
+        _status_message(health, service),
         hardware_id(health.vehicle, health.pair, serial),
-        {**_values(health), "service": service, **more},
+        {**_health_values(health), "service": service, **more},
     )
 
 
-SENSOR_LEVELS: Final[Mapping[SensorState, Level]] = {
-    "calibrated": Level.OK,
-    "undecided": Level.WARN,
-    "camera_moved": Level.ERROR,
-    "lidar_moved": Level.ERROR,
-    "unknown": Level.STALE,
+SENSOR_LEVELS: Final[Mapping[SensorState, DiagnosticLevel]] = {
+    "calibrated": DiagnosticLevel.OK,
+    "undecided": DiagnosticLevel.WARN,
+    "camera_moved": DiagnosticLevel.ERROR,
+    "lidar_moved": DiagnosticLevel.ERROR,
+    "unknown": DiagnosticLevel.STALE,
 }
 
 
-def of_sensor(sensor: SensorReply, vehicle: str, service: Service) -> Status:
+def status_of_sensor(sensor: SensorReply, vehicle: str, service: ServicePhase) -> DiagnosticStatus:
     """The status of a sensor of a rig now; STALE if the service stops."""
-    level = Level.STALE if service == "stopping" else SENSOR_LEVELS[sensor.state]
+    level = DiagnosticLevel.STALE if service == "stopping" else SENSOR_LEVELS[sensor.state]
     text = ": ".join([sensor.state, *(reason.text for reason in sensor.reasons[:1])])
     values = {"state": sensor.state, "kind": sensor.kind, "pairs": ", ".join(sensor.pairs), "service": service}
     values |= {f"reason {reason.code}": reason.text for reason in sensor.reasons}
@@ -87,33 +89,33 @@ def of_sensor(sensor: SensorReply, vehicle: str, service: Service) -> Status:
     if sensor.since_ns is not None:
         values["since_ns"] = str(sensor.since_ns)
     if sensor.moved is not None:
-        told = zip(AXES, sensor.moved.by, sensor.moved.sigma, UNITS, strict=True)
-        values["moved"] = ", ".join(f"{axis} {by:.3g} ± {sigma:.2g} {unit}" for axis, by, sigma, unit in told)
+        axes = zip(AXES, sensor.moved.by, sensor.moved.sigma, UNITS, strict=True)
+        values["moved"] = ", ".join(f"{axis} {by:.3g} ± {sigma:.2g} {unit}" for axis, by, sigma, unit in axes)
     name = sensor_status_name(sensor.name)
-    return Status(level, name, text[:MAX_MESSAGE], hardware_id(vehicle, sensor.name, None), values)
+    return DiagnosticStatus(level, name, text[:MAX_MESSAGE], hardware_id(vehicle, sensor.name, None), values)
 
 
-def of_result(result: CalibrationResult) -> Status:
+def status_of_result(result: CalibrationResult) -> DiagnosticStatus:
     """The status in a window's file: an accepted result has the level of a healthy pair, a failed one that of a
     degraded pair."""
     reasons = result.verdict.reasons
-    return Status(
-        Level(ROS_LEVELS["degraded" if reasons else "healthy"]),
+    return DiagnosticStatus(
+        DiagnosticLevel(ROS_LEVELS["degraded" if reasons else "healthy"]),
         status_name(result.pair),
         "; ".join(reason.text for reason in reasons) or "calibration accepted",
         hardware_id(result.vehicle, result.pair, None),
-        {name: _figure(metric) for name, metric in result.metrics.items()},
+        {name: _figure_text(metric) for name, metric in result.metrics.items()},
     )
 
 
-def _message(health: HealthReply, service: Service) -> str:
+def _status_message(health: HealthReply, service: ServicePhase) -> str:
     """The state and its reasons in one line."""
-    told = health.state if service in ("starting", "running") else f"{health.state}, service {service}"
-    text = ": ".join([told, *(["; ".join(reason.text for reason in health.reasons)] if health.reasons else [])])
+    state = health.state if service in ("starting", "running") else f"{health.state}, service {service}"
+    text = ": ".join([state, *(["; ".join(reason.text for reason in health.reasons)] if health.reasons else [])])
     return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE - 1]}…"
 
 
-def _values(health: HealthReply) -> dict[str, str]:
+def _health_values(health: HealthReply) -> dict[str, str]:
     """Everything that health holds, one value each; unknown values are left out."""
     values = {"state": health.state, "since_ns": str(health.since_ns)}
     values |= {f"reason {reason.code}": reason.text for reason in health.reasons}
@@ -122,7 +124,7 @@ def _values(health: HealthReply) -> dict[str, str]:
         values["age_s"] = f"{health.age_s:.1f}"
     if health.evaluated_ns is not None:
         values["evaluated_ns"] = str(health.evaluated_ns)
-    values |= {name: _figure(metric) for name, metric in health.metrics.items()}
+    values |= {name: _figure_text(metric) for name, metric in health.metrics.items()}
     for name in AXES:
         axis: replies.AxisReply = getattr(health.axes, name)
         sigma = "unknown" if axis.sigma is None else f"{axis.sigma:.4g} {axis.unit}"
@@ -130,8 +132,8 @@ def _values(health: HealthReply) -> dict[str, str]:
     drifts = {"drift from commissioned": health.drift, "drift of the latest result": health.result_drift}
     for name, drift in drifts.items():
         if drift is not None:
-            told = zip(AXES, drift, UNITS, strict=True)
-            values[name] = ", ".join(f"{axis} {value:.4g} {unit}" for axis, value, unit in told if value is not None)
+            axes = zip(AXES, drift, UNITS, strict=True)
+            values[name] = ", ".join(f"{axis} {value:.4g} {unit}" for axis, value, unit in axes if value is not None)
     quality = health.data_quality
     figures = {"pair_rate_hz": quality.pair_rate_hz, "sync_error_s": quality.sync_error_s}
     values |= {name: f"{value:.4g}" for name, value in figures.items() if value is not None}
@@ -141,7 +143,7 @@ def _values(health: HealthReply) -> dict[str, str]:
     return values
 
 
-def _figure(metric: MetricReply) -> str:
+def _figure_text(metric: MetricReply) -> str:
     value = "unknown" if metric.value is None else f"{metric.value:.6g}"
     if metric.limit is None:
         return value

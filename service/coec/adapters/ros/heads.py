@@ -27,7 +27,7 @@ _CHARACTER: Final = 4
 """Most bytes of a character in UTF-8."""
 
 
-class Head:
+class MessageCursor:
     """A cursor that moves through a message from its beginning.
 
     Raises:
@@ -68,13 +68,13 @@ class Head:
         self.skip(length)
 
 
-def check_header(payload: bytes) -> Head:
+def check_header(payload: bytes) -> MessageCursor:
     """Checks the `std_msgs/Header` at the beginning of a message. Returns the cursor behind it.
 
     Raises:
         DecodeError: `frame_id_invalid` or `message_malformed`.
     """
-    head = Head(payload)
+    head = MessageCursor(payload)
     head.skip(_STAMP)
     head.text(_CHARACTER * MAX_FRAME_ID, Refusal.FRAME_ID_INVALID, "the frame id")
     return head

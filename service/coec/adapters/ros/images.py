@@ -31,7 +31,7 @@ channels mean, so that OpenCV's order is assumed."""
 _DEEP: Final = tuple(name for name, form in ENCODINGS.items() if form.endswith("16"))
 """Encodings with two bytes per value."""
 
-_VIDEO: Final = ("h264", "h265", "hevc", "av1", "vp8", "vp9")
+_VIDEO_FORMATS: Final = ("h264", "h265", "hevc", "av1", "vp8", "vp9")
 """Video codecs of ffmpeg_image_transport and others; a packet alone is no picture, as it needs those before it."""
 
 _START_CODES: Final = (b"\0\0\0\1", b"\0\0\1")
@@ -52,7 +52,7 @@ def compressed_image(message: CompressedImage, limits: LimitsConfig) -> EncodedI
             Refusal.IMAGE_UNKNOWN_FORMAT,
             "a depth image (compressedDepth) is no camera's picture: take the topic that ends with /compressed",
         )
-    if any(codec in text for codec in _VIDEO) or data.startswith(_START_CODES):
+    if any(codec in text for codec in _VIDEO_FORMATS) or data.startswith(_START_CODES):
         raise DecodeError(
             Refusal.IMAGE_UNKNOWN_FORMAT,
             "packets of video (h264 and the like) are not read: take the camera's topic of JPEG or of raw pixels",

@@ -43,13 +43,13 @@ class MovingFrame:
         Raises:
             DecodeError: not this message, its pose is invalid, or the motion to it is impossible.
         """
-        found = None
+        motion = None
         for stamped in transforms_in(payload):
             if bare(stamped.child_frame_id) != self._child:
                 continue
             if bare(stamped.header.frame_id) == self._parent:
-                found = self._moved_to(_pose(stamped)) or found
-        return found
+                motion = self._moved_to(_pose(stamped)) or motion
+        return motion
 
     def _moved_to(self, pose: _Pose) -> EgoMotion | None:
         before = self._before

@@ -11,7 +11,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.adapters.images.raw import BYTES_PER_PIXEL
 from coec.adapters.ros import point_cloud2
-from coec.adapters.ros.diagnostics import Status
+from coec.adapters.ros.diagnostics import DiagnosticStatus
 from coec.adapters.ros.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -143,13 +143,13 @@ ROS_MODELS: Final = frozenset({"plumb_bob", "rational_polynomial", "equidistant"
 """Models that ROS's own programs know (sensor_msgs/distortion_models.hpp)."""
 
 
-class UnsayableCameraError(CoecError):
+class UnsupportedCameraError(CoecError):
     """ROS has no camera model that comes near the camera's."""
 
     reply_code = "camera_not_sayable"
 
 
-def sayable(camera: Camera) -> tuple[Camera, float]:
+def ros_camera(camera: Camera) -> tuple[Camera, float]:
     """The camera in a model that ROS's own programs know, and its largest error in pixels.
 
     Raises:
@@ -160,9 +160,9 @@ def sayable(camera: Camera) -> tuple[Camera, float]:
     try:
         fit = fit_kannala_brandt(camera)
     except ValueError as error:
-        raise UnsayableCameraError(f"ROS has no model {name_of(camera)}, and not as equidistant: {error}") from error
+        raise UnsupportedCameraError(f"ROS has no model {name_of(camera)}, and not as equidistant: {error}") from error
     if fit.residual_max_px > MAX_RESIDUAL_PX:
-        raise UnsayableCameraError(
+        raise UnsupportedCameraError(
             f"ROS has no model {name_of(camera)}, and as equidistant it would be {fit.residual_max_px:.2g} px off, "
             f"more than {MAX_RESIDUAL_PX:g} px: nodes need the intrinsics from where this configuration has them"
         )
@@ -193,7 +193,7 @@ def encode_camera_info(rig: Rig, stamp_ns: int) -> bytes:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
+class PlacedFrame:
     """A frame in its parent: `T_parent_child` (4, 4) maps coordinates of the child to those of the parent."""
 
     parent: str
@@ -201,7 +201,7 @@ class Placed:
     T_parent_child: Matrix4
 
 
-def encode_transforms(frames: Sequence[Placed], stamp_ns: int) -> bytes:
+def encode_transforms(frames: Sequence[PlacedFrame], stamp_ns: int) -> bytes:
     """`TFMessage`. Like `Placed`, transforms of tf map coordinates of the child to those of the parent."""
     transforms = []
     for frame in frames:
@@ -221,10 +221,10 @@ def encode_transforms(frames: Sequence[Placed], stamp_ns: int) -> bytes:
 
 def encode_tf_static(rig: Rig, T_camera_lidar: Matrix4, stamp_ns: int) -> bytes:
     """`TFMessage` of a window: the LiDAR as a child of the camera, with `T_camera_lidar` (4, 4) unchanged."""
-    return encode_transforms([Placed(rig.camera_frame, rig.lidar_frame, T_camera_lidar)], stamp_ns)
+    return encode_transforms([PlacedFrame(rig.camera_frame, rig.lidar_frame, T_camera_lidar)], stamp_ns)
 
 
-def encode_diagnostics(stamp_ns: int, statuses: Sequence[Status]) -> bytes:
+def encode_diagnostics(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
     """`DiagnosticArray`."""
     array = [
         ros.diagnostic_msgs__msg__DiagnosticStatus(

@@ -17,7 +17,7 @@ from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 from coec.adapters.frames.incoming import Refusal, finite_rows, lidar_frame
 from coec.adapters.ros.point_time import FIELDS as TIME_FIELDS
 from coec.adapters.ros.point_time import offsets_s, stamp_in
-from coec.adapters.ros.source_field import of_source
+from coec.adapters.ros.source_field import points_of_source
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig
 from coec.errors import DecodeError
@@ -33,7 +33,7 @@ _DTYPES: dict[int, np.dtype[Any]] = {
     PointField.FLOAT64: np.dtype("<f8"),
 }
 
-_PLACE = np.dtype("V12")
+_XYZ_BYTES = np.dtype("V12")
 """x y z as float32."""
 
 
@@ -57,10 +57,10 @@ def frame_of(
         `cloud_time_ambiguous`, `cloud_concatenated`.
     """
     _check_layout(message, limits)
-    message = of_source(message, source)
+    message = points_of_source(message, source)
     by_name = {field.name: field for field in reversed(message.fields)}  # the first field of a name counts
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinite and are dropped
-        xyz_m = _places(message, by_name)
+        xyz_m = _positions(message, by_name)
         intensity = _column(message, by_name.get("intensity"), "fiu")
         ring = _column(message, next((by_name[n] for n in ("ring", "channel", "line") if n in by_name), None), "u")
         if ring is not None and ring.itemsize > 2 and int(ring.max()) > 0xFFFF:
@@ -73,7 +73,7 @@ def frame_of(
             None if intensity is None else intensity.astype(np.float32),
             None if ring is None else ring.astype(np.uint16),
             times.offset_s,
-            timed_by=times.told,
+            timed_by=times.description,
         )
 
 
@@ -133,9 +133,9 @@ def _check_layout(message: PointCloud2, limits: LimitsConfig) -> None:
         )
 
 
-def _places(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[np.float32]:
+def _positions(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[np.float32]:
     """(N, 3) x y z."""
-    together = _together(message, by_name)
+    together = _contiguous_positions(message, by_name)
     if together is not None:
         return together
     xyz_m = np.empty((message.width * message.height, 3), np.float32)
@@ -147,17 +147,17 @@ def _places(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[
     return xyz_m
 
 
-def _together(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[np.float32] | None:
+def _contiguous_positions(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[np.float32] | None:
     """x y z in the layout of most drivers, float32 one after the other. Copying the three together takes a third of the
     time of single columns. None for any other layout."""
     x = by_name.get("x")
-    if x is None or x.offset + _PLACE.itemsize > message.point_step:
+    if x is None or x.offset + _XYZ_BYTES.itemsize > message.point_step:
         return None
     for i, axis in enumerate("xyz"):
         field = by_name.get(axis)
         if field is None or (field.datatype, field.offset) != (PointField.FLOAT32, x.offset + 4 * i) or field.count > 1:
             return None
-    places = np.ascontiguousarray(_view(message, _PLACE, x.offset))
+    places = np.ascontiguousarray(_view(message, _XYZ_BYTES, x.offset))
     return places.view(">f4" if message.is_bigendian else "<f4").reshape(-1, 3).astype(np.float32, copy=False)
 
 
@@ -173,7 +173,7 @@ class _Times:
 
     stamp_ns: int
     offset_s: NDArray[np.float32] | None
-    told: str
+    description: str
 
 
 def _times(
@@ -181,19 +181,19 @@ def _times(
     by_name: Mapping[str, PointField],
     keep: NDArray[np.bool_] | None,
     stamp_ns: int,
-    said: PointTimeConfig | None,
+    configured: PointTimeConfig | None,
 ) -> _Times:
     """`keep` as in `offsets_s`."""
-    names = TIME_FIELDS if said is None else (said.field,)
+    names = TIME_FIELDS if configured is None else (configured.field,)
     name = next((name for name in names if name in by_name), None)
     column = None if name is None else _column(message, by_name[name], "fiu")
     if name is None or column is None:
         return _Times(stamp_ns, None, "")
-    first_ns = None if stamp_ns else stamp_in(column, keep, said)
-    offset_s, told = offsets_s(name, column, keep, first_ns or stamp_ns, said)
+    first_ns = None if stamp_ns else stamp_in(column, keep, configured)
+    offset_s, description = offsets_s(name, column, keep, first_ns or stamp_ns, configured)
     if first_ns is None:
-        return _Times(stamp_ns, offset_s, told)
-    return _Times(first_ns, offset_s, f"{told}; without a stamp, that of the first point is taken")
+        return _Times(stamp_ns, offset_s, description)
+    return _Times(first_ns, offset_s, f"{description}; without a stamp, that of the first point is taken")
 
 
 def _column(message: PointCloud2, field: PointField | None, kinds: str) -> NDArray[Any] | None:

@@ -65,12 +65,12 @@ NS_PER_S: Final = 1_000_000_000
 _TICKS: Final[dict[TimeUnit, int]] = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": NS_PER_S}
 """Ticks of each unit in a second."""
 
-_WORDS: Final[dict[TimeUnit, str]] = {"s": "s", "ms": "ms", "us": "µs", "ns": "ns"}
+_UNIT_TEXT: Final[dict[TimeUnit, str]] = {"s": "s", "ms": "ms", "us": "µs", "ns": "ns"}
 _BASES: Final[dict[TimeBase, str]] = {"stamp": "since the stamp", "clock": "on the stamp's clock"}
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class TimeReading:
     """One way to read a column; with it the first and last point are `begin_s` and `end_s` after the stamp."""
 
     unit: TimeUnit
@@ -88,7 +88,7 @@ class Reading:
         """The reading in words, without the name of the field."""
         begin, end = (f"{1e3 * value:.1f}".replace("-0.0", "0.0") for value in (self.begin_s, self.end_s))
         since = " from the stamp" if self.base == "clock" else ""
-        return f"{_WORDS[self.unit]} {_BASES[self.base]}; {begin} to {end} ms{since}"
+        return f"{_UNIT_TEXT[self.unit]} {_BASES[self.base]}; {begin} to {end} ms{since}"
 
     @property
     def stamped(self) -> str:
@@ -108,7 +108,7 @@ def offsets_s(
     column: NDArray[Any],
     keep: NDArray[np.bool_] | None,
     stamp_ns: int,
-    said: PointTimeConfig | None,
+    configured: PointTimeConfig | None,
 ) -> tuple[NDArray[np.float32], str]:
     """(N,) float32 seconds after the stamp at which each point was measured, and a line that says how they were read.
 
@@ -123,21 +123,21 @@ def offsets_s(
     """
     values = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
     begin, end = _range(values if keep is None else values[keep])
-    if said is not None:
-        reading = _read(begin, end, said.unit, said.base, stamp_ns)
+    if configured is not None:
+        reading = _read(begin, end, configured.unit, configured.base, stamp_ns)
     else:
         reading = recognised(name, values.dtype, begin, end, stamp_ns)
     line = f"{name}: {values.dtype.name}, {reading.sentence}{reading.stamped}"
     return _after_stamp_s(values, reading, stamp_ns), line
 
 
-def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, said: PointTimeConfig | None) -> int | None:
+def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, configured: PointTimeConfig | None) -> int | None:
     """The time of the first point, ns, for a cloud without a stamp; None if its points have no time of day, or not the
     one in the configuration. Arguments as for `offsets_s`."""
     values = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
     begin, end = _range(values if keep is None else values[keep])
-    clocked = [unit for unit in _TICKS if said is None or (said.unit, said.base) == (unit, "clock")]
-    since_s = SINCE_S if said is None else 0
+    clocked = [unit for unit in _TICKS if configured is None or (configured.unit, configured.base) == (unit, "clock")]
+    since_s = SINCE_S if configured is None else 0
     for unit in clocked:
         ticks = _TICKS[unit]
         finest = 1.0 if values.dtype.kind != "f" else float(np.spacing(values.dtype.type(begin)))
@@ -147,7 +147,7 @@ def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, said: PointTi
     return None
 
 
-def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_ns: int) -> Reading:
+def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_ns: int) -> TimeReading:
     """How to read a column whose values reach from `begin` to `end`.
 
     Raises:
@@ -173,29 +173,29 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
     first = candidates[0]
     if all(_agree(first, other) for other in candidates):
         return first
-    told = "; or ".join(reading.sentence for reading in candidates)
+    readings_text = "; or ".join(reading.sentence for reading in candidates)
     raise DecodeError(
         Refusal.CLOUD_TIME_AMBIGUOUS,
-        f"the field {name} of the points may be {told}: say which with "
+        f"the field {name} of the points may be {readings_text}: say which with "
         f"`lidar.time: {{field: {name}, unit: {first.unit}, base: {first.base}}}`, of a bag with "
         f"`?time={name},{first.unit},{first.base}`",
     )
 
 
-def _as_named(name: str, readings: Sequence[Reading]) -> list[Reading]:
+def _as_named(name: str, readings: Sequence[TimeReading]) -> list[TimeReading]:
     """The readings without those on a clock, if the name means the time since the stamp and such a reading is left."""
     since_stamp = [reading for reading in readings if reading.base == "stamp"]
     return since_stamp if since_stamp and name not in ON_A_CLOCK else list(readings)
 
 
-def _agree(a: Reading, b: Reading) -> bool:
+def _agree(a: TimeReading, b: TimeReading) -> bool:
     return max(abs(a.begin_s - b.begin_s), abs(a.end_s - b.end_s)) < SHORTEST_S
 
 
-def _read(begin: float, end: float, unit: TimeUnit, base: TimeBase, stamp_ns: int) -> Reading:
+def _read(begin: float, end: float, unit: TimeUnit, base: TimeBase, stamp_ns: int) -> TimeReading:
     whole, rest_s = _stamp(unit, base, stamp_ns)
     ticks = _TICKS[unit]
-    return Reading(unit, base, (begin - whole) / ticks - rest_s, (end - whole) / ticks - rest_s)
+    return TimeReading(unit, base, (begin - whole) / ticks - rest_s, (end - whole) / ticks - rest_s)
 
 
 def _stamp(unit: TimeUnit, base: TimeBase, stamp_ns: int) -> tuple[int, float]:
@@ -217,7 +217,7 @@ def _range(values: NDArray[Any]) -> tuple[float, float]:
     return _range(values[np.isfinite(values)])
 
 
-def _after_stamp_s(values: NDArray[Any], reading: Reading, stamp_ns: int) -> NDArray[np.float32]:
+def _after_stamp_s(values: NDArray[Any], reading: TimeReading, stamp_ns: int) -> NDArray[np.float32]:
     if reading.base == "stamp" and reading.unit == "s":
         return values.astype(np.float32, copy=False)
     whole, rest_s = _stamp(reading.unit, reading.base, stamp_ns)

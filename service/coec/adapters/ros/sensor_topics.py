@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from coec.adapters.ros import messages, outgoing
-from coec.adapters.ros.outgoing import Placed
+from coec.adapters.ros.outgoing import PlacedFrame
 from coec.adapters.ros.topics import Frame, TopicMessage
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Rig
 from coec.schemas.ros_names import TF_STATIC
@@ -15,7 +15,7 @@ ODOMETRY = "/odometry"
 
 
 @dataclass(frozen=True, slots=True)
-class Vehicle:
+class VehicleSensors:
     """What the messages tell about a vehicle beside its frames.
 
     Attributes:
@@ -24,7 +24,7 @@ class Vehicle:
     """
 
     cameras: Mapping[str, Rig]
-    placed: Sequence[Placed]
+    placed: Sequence[PlacedFrame]
 
 
 def image_topic(camera: str) -> str:
@@ -40,7 +40,7 @@ def points_topic(lidar: str) -> str:
 class SensorTopics:
     """Frames as messages, on topics named after their sensors, with `/tf_static` before the first."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: VehicleSensors) -> None:
         self._vehicle = vehicle
         self._is_joined = False
 

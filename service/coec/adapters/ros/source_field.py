@@ -35,7 +35,7 @@ MAX_LISTED: Final = 16
 """Most sources that a refusal lists. A vehicle has fewer LiDARs, but the field may hold other numbers, however many."""
 
 
-def of_source(message: PointCloud2, source: int | None) -> PointCloud2:
+def points_of_source(message: PointCloud2, source: int | None) -> PointCloud2:
     """The points of one LiDAR, in their order, as a cloud of one row; the message unchanged if it holds no others.
 
     Args:
@@ -55,16 +55,16 @@ def of_source(message: PointCloud2, source: int | None) -> PointCloud2:
             Refusal.CLOUD_CONCATENATED,
             f"source {source} is asked for, but no field of the points names one: {', '.join(SOURCE_FIELDS)} would",
         )
-    wanted = int(values[0, 0]) if source is None else source
-    mine = values == wanted
+    selected = int(values[0, 0]) if source is None else source
+    mine = values == selected
     if mine.all():
         return message
     if source is None or not mine.any():
         known = np.unique(values)
         listed = ", ".join(map(str, known[:MAX_LISTED].tolist())) + (", ..." if len(known) > MAX_LISTED else "")
-        asked = "choose one" if source is None else f"none has {source}"
+        advice = "choose one" if source is None else f"none has {source}"
         raise DecodeError(
-            Refusal.CLOUD_CONCATENATED, f"the cloud is concatenated: its {field.name} has {listed}; {asked}"
+            Refusal.CLOUD_CONCATENATED, f"the cloud is concatenated: its {field.name} has {listed}; {advice}"
         )
     rows = _rows(message)[mine]
     return replace(

@@ -20,12 +20,12 @@ from coec.calibration.types import Matrix4
 from coec.errors import DecodeError
 from coec.geometry.se3 import inverse
 
-MAX_JOINTS: Final = 2048
+MAX_STATIC_TRANSFORMS: Final = 2048
 """Most joints that are kept; vehicles have some hundred."""
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class StaticTransform:
     """One static transform: `T_parent_child` (4, 4) is the pose of the child in its parent."""
 
     parent: str
@@ -42,14 +42,14 @@ class StaticTransforms:
 
     def __init__(self) -> None:
         self.replaced = 0
-        self._joints: dict[str, dict[str, Joint]] = {}
+        self._joints: dict[str, dict[str, StaticTransform]] = {}
 
     @property
     def frames(self) -> tuple[str, ...]:
         """All named frames, sorted by name."""
         return tuple(sorted({*self._joints, *(parent for parents in self._joints.values() for parent in parents)}))
 
-    def take(self, joints: tuple[Joint, ...]) -> None:
+    def add(self, joints: tuple[StaticTransform, ...]) -> None:
         """Add these joints; they replace earlier joints between the same frames.
 
         Raises:
@@ -57,8 +57,8 @@ class StaticTransforms:
         """
         known = {(joint.child, joint.parent) for parents in self._joints.values() for joint in parents.values()}
         fresh = {(joint.child, joint.parent) for joint in joints} - known
-        if len(known) + len(fresh) > MAX_JOINTS:
-            raise DecodeError(Refusal.TRANSFORMS_TOO_MANY, f"more than {MAX_JOINTS} static transforms")
+        if len(known) + len(fresh) > MAX_STATIC_TRANSFORMS:
+            raise DecodeError(Refusal.TRANSFORMS_TOO_MANY, f"more than {MAX_STATIC_TRANSFORMS} static transforms")
         for joint in joints:
             parents = self._joints.setdefault(joint.child, {})
             before = parents.get(joint.parent)
@@ -68,13 +68,13 @@ class StaticTransforms:
 
     def transform(self, target: str, source: str) -> Matrix4 | None:
         """T_target_source (4, 4) along the fewest joints; None if no joints connect the two frames."""
-        way = self._way(bare(target), bare(source))
+        way = self._path(bare(target), bare(source))
         return None if way is None else way[-1][1]
 
     def doubts(self, target: str, source: str) -> tuple[str, ...]:
         """What violates the tree on the way between two frames, one sentence each: a frame with several parents, of
         which tf takes the one it heard last, or a loop."""
-        on_the_way = {frame for frame, _ in self._way(bare(target), bare(source)) or ()}
+        on_the_way = {frame for frame, _ in self._path(bare(target), bare(source)) or ()}
         several = [
             f"frame {child!r} has the parents {' and '.join(repr(parent) for parent in sorted(parents))}"
             for child, parents in sorted(self._joints.items())
@@ -87,9 +87,9 @@ class StaticTransforms:
         ]
         return (*several, *loops)
 
-    def _way(self, target: str, source: str) -> list[tuple[str, Matrix4]] | None:
+    def _path(self, target: str, source: str) -> list[tuple[str, Matrix4]] | None:
         """The frames from source to target, each with T_frame_source (4, 4)."""
-        came_from: dict[str, str] = {source: source}
+        predecessor: dict[str, str] = {source: source}
         reached = {source: np.eye(4)}
         frontier = deque([source])
         neighbours = self._neighbours()
@@ -97,14 +97,14 @@ class StaticTransforms:
             frame = frontier.popleft()
             for neighbour, T_neighbour_frame in neighbours.get(frame, {}).items():
                 if neighbour not in reached:
-                    came_from[neighbour] = frame
+                    predecessor[neighbour] = frame
                     reached[neighbour] = T_neighbour_frame @ reached[frame]
                     frontier.append(neighbour)
         if target not in reached:
             return None
         way = [target]
         while way[-1] != source:
-            way.append(came_from[way[-1]])
+            way.append(predecessor[way[-1]])
         return [(frame, reached[frame]) for frame in reversed(way)]
 
     def _neighbours(self) -> dict[str, dict[str, Matrix4]]:
@@ -132,20 +132,20 @@ class StaticTransforms:
             done.update(way)
 
 
-def decode_joints(payload: bytes) -> tuple[Joint, ...]:
+def decode_static_transforms(payload: bytes) -> tuple[StaticTransform, ...]:
     """The joints of a `TFMessage` in CDR.
 
     Raises:
         DecodeError: not this message, or one of its transforms is invalid.
     """
-    return tuple(_joint(stamped) for stamped in transforms_in(payload))
+    return tuple(_static_transform(stamped) for stamped in transforms_in(payload))
 
 
-def _joint(stamped: Any) -> Joint:
+def _static_transform(stamped: Any) -> StaticTransform:
     parent, child = bare(stamped.header.frame_id), bare(stamped.child_frame_id)
     if not 0 < len(parent) <= MAX_FRAME_ID or not 0 < len(child) <= MAX_FRAME_ID:
         what = f"a frame id of a transform is empty or longer than {MAX_FRAME_ID}"
         raise DecodeError(Refusal.FRAME_ID_INVALID, what)
     if parent == child:
         raise DecodeError(Refusal.TRANSFORM_INVALID, "a transform leads from a frame to itself")
-    return Joint(parent, child, pose_of(stamped))
+    return StaticTransform(parent, child, pose_of(stamped))

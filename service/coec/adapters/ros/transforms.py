@@ -8,7 +8,7 @@ import numpy as np
 from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.adapters.frames.incoming import Refusal
-from coec.adapters.ros.heads import Head
+from coec.adapters.ros.heads import MessageCursor
 from coec.adapters.ros.messages import deserialized
 from coec.calibration.types import Matrix4
 from coec.errors import DecodeError
@@ -33,7 +33,7 @@ def transforms_in(payload: bytes) -> list[Any]:
     if len(payload) > MAX_MESSAGE_BYTES:
         what = f"a message of transforms has at most {MAX_MESSAGE_BYTES} bytes"
         raise DecodeError(Refusal.MESSAGE_TOO_LARGE, what)
-    if Head(payload).number() > MAX_TRANSFORMS:
+    if MessageCursor(payload).number() > MAX_TRANSFORMS:
         raise DecodeError(Refusal.TRANSFORMS_TOO_MANY, f"a message of transforms has at most {MAX_TRANSFORMS}")
     transforms: list[Any] = deserialized(ros.tf2_msgs__msg__TFMessage, payload).transforms
     return transforms

@@ -36,6 +36,6 @@ def clock_state() -> ClockState | None:
     adjtimex = getattr(ctypes.CDLL(None), "adjtimex", None)
     if adjtimex is None:
         return None
-    told = _Timex()
-    state = adjtimex(ctypes.byref(told))  # no mode is set: nothing is adjusted
-    return None if state < 0 else ClockState(state != TIME_ERROR, told.maxerror / 1e6)
+    timex = _Timex()
+    state = adjtimex(ctypes.byref(timex))  # no mode is set: nothing is adjusted
+    return None if state < 0 else ClockState(state != TIME_ERROR, timex.maxerror / 1e6)

@@ -44,7 +44,7 @@ METHODS = (b"GET", b"HEAD")
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class HttpRequest:
     """The parts of a request that an answer depends on.
 
     Attributes:
@@ -57,7 +57,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
+class HttpResponse:
     """An answer."""
 
     status: int
@@ -76,7 +76,7 @@ class _Connection:
 class HttpServer:
     """Listens from construction until `close`; answers while `thread` runs."""
 
-    def __init__(self, host: str, port: int, find: Callable[[Request], Page | None]) -> None:
+    def __init__(self, host: str, port: int, find: Callable[[HttpRequest], HttpResponse | None]) -> None:
         """`find(request)` is called on the thread; for None the answer is 404.
 
         Raises:
@@ -92,10 +92,10 @@ class HttpServer:
     def close(self, deadline_s: float) -> bool:
         """Stop listening and drop all connections; False if the thread did not end within the deadline."""
         self.thread.request_stop()
-        ended = self.thread.join(deadline_s)
-        if ended:
+        joined = self.thread.join(deadline_s)
+        if joined:
             self._close_all()
-        return ended
+        return joined
 
     # --- on the thread ----------------------------------------------------------------------------------------------
 
@@ -144,7 +144,7 @@ class HttpServer:
         if not complete and len(connection.received) < MAX_REQUEST_BYTES:
             return
         too_long = _plain(400, "The request is too long.\n")
-        answer = self._answer(bytes(connection.received)) if complete else _response(too_long)
+        answer = self._answer(bytes(connection.received)) if complete else _response_bytes(too_long)
         connection.unsent = memoryview(answer)
         self._selector.modify(connection.socket, selectors.EVENT_WRITE, connection)
 
@@ -152,19 +152,19 @@ class HttpServer:
         """The bytes of the answer to a request whose head is complete."""
         head = request.partition(b"\r\n\r\n")[0]
         first, *headers = head.split(b"\r\n")
-        words = first.split(b" ")
-        if len(words) != 3 or not words[2].startswith(b"HTTP/1."):
-            return _response(_plain(400, "This is no request.\n"))
-        method = words[0]
+        parts = first.split(b" ")
+        if len(parts) != 3 or not parts[2].startswith(b"HTTP/1."):
+            return _response_bytes(_plain(400, "This is no request.\n"))
+        method = parts[0]
         if method not in METHODS:
-            return _response(_plain(405, "Pages are read with GET or HEAD.\n"), allowed=METHODS)
-        path = words[1].partition(b"?")[0].decode("latin-1")
+            return _response_bytes(_plain(405, "Pages are read with GET or HEAD.\n"), allowed=METHODS)
+        path = parts[1].partition(b"?")[0].decode("latin-1")
         try:
-            page = self._find(Request(path, _values(headers, b"accept")))
+            page = self._find(HttpRequest(path, _values(headers, b"accept")))
         except Exception:
             _log.exception("a page could not be made", extra={"fields": {"path": path[:64]}})
             page = _plain(500, "The service failed on this page; its log says why.\n")
-        return _response(page or _plain(404, "There is no such page.\n"), with_body=method != b"HEAD")
+        return _response_bytes(page or _plain(404, "There is no such page.\n"), with_body=method != b"HEAD")
 
     def _send(self, connection: _Connection) -> None:
         assert connection.unsent is not None
@@ -197,8 +197,8 @@ def _listening(host: str, port: int) -> socket.socket:
     return made
 
 
-def _plain(status: int, text: str) -> Page:
-    return Page(status, text.encode(), "text/plain; charset=utf-8")
+def _plain(status: int, text: str) -> HttpResponse:
+    return HttpResponse(status, text.encode(), "text/plain; charset=utf-8")
 
 
 def _values(headers: Sequence[bytes], name: bytes) -> str:
@@ -207,7 +207,7 @@ def _values(headers: Sequence[bytes], name: bytes) -> str:
     return ",".join(value.strip().decode("latin-1") for key, _, value in split if key.strip().lower() == name)
 
 
-def _response(page: Page, *, with_body: bool = True, allowed: Sequence[bytes] = ()) -> bytes:
+def _response_bytes(page: HttpResponse, *, with_body: bool = True, allowed: Sequence[bytes] = ()) -> bytes:
     """The bytes of an answer. Without its body it has the head that it would have with it."""
     allow = f"Allow: {', '.join(method.decode() for method in allowed)}\r\n" if allowed else ""
     head = (

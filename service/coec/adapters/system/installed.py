@@ -73,41 +73,41 @@ class Package:
     native: tuple[NativeLibrary, ...]
 
 
-def installed(name: str) -> dict[str, Package]:
+def installed_packages(name: str) -> dict[str, Package]:
     """A package and everything that it needs, directly or not, by canonical name in alphabetical order. Optional extras
     are included if a needed package asks for them by name.
 
     Raises:
         NotFoundError: the package, or one that it needs, is not installed.
     """
-    found: dict[str, Package] = {}
+    packages: dict[str, Package] = {}
     waiting: list[tuple[str, frozenset[str]]] = [(name, frozenset())]
     visited: set[tuple[str, frozenset[str]]] = set()
     while waiting:
-        wanted = waiting.pop()
-        if wanted in visited:
+        requirement = waiting.pop()
+        if requirement in visited:
             continue
-        visited.add(wanted)
+        visited.add(requirement)
         try:
-            at_hand = distribution(wanted[0])
+            metadata = distribution(requirement[0])
         except PackageNotFoundError as error:
             raise NotFoundError(
-                f"the package {wanted[0]} is needed but not installed: install coec with all of them (pip install coec)"
+                f"the package {requirement[0]} is needed but not installed: install coec with all of them (pip install coec)"
             ) from error
-        needs = list(_needs(at_hand, wanted[1]))
+        needs = list(_needs(metadata, requirement[1]))
         waiting += needs
-        canonical = canonicalize_name(at_hand.metadata["Name"])
-        before = found[canonical].requires if canonical in found else ()
+        canonical = canonicalize_name(metadata.metadata["Name"])
+        before = packages[canonical].requires if canonical in packages else ()
         requires = tuple(sorted({*before, *(canonicalize_name(need) for need, _ in needs)}))
-        found[canonical] = Package(
-            name=at_hand.metadata["Name"],
-            version=at_hand.version,
-            licence=_licence(at_hand),
-            licence_files=tuple(at_hand.metadata.get_all("License-File") or ()),
+        packages[canonical] = Package(
+            name=metadata.metadata["Name"],
+            version=metadata.version,
+            licence=_licence(metadata),
+            licence_files=tuple(metadata.metadata.get_all("License-File") or ()),
             requires=requires,
-            native=tuple(_native(at_hand)),
+            native=tuple(_native(metadata)),
         )
-    return dict(sorted(found.items()))
+    return dict(sorted(packages.items()))
 
 
 def pinned_hashes(lock: Path) -> dict[tuple[str, str], tuple[str, ...]]:
@@ -120,17 +120,17 @@ def pinned_hashes(lock: Path) -> dict[tuple[str, str], tuple[str, ...]]:
         lines = lock.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read {lock}: {error}") from error
-    found: dict[tuple[str, str], list[str]] = {}
+    hashes_by_pin: dict[tuple[str, str], list[str]] = {}
     hashes: list[str] = []
     for line in lines:
         pin, archive = _PIN.match(line), _HASH.search(line)
         if pin is not None:
-            hashes = found.setdefault((canonicalize_name(pin["name"]), pin["version"]), [])
+            hashes = hashes_by_pin.setdefault((canonicalize_name(pin["name"]), pin["version"]), [])
         elif archive is not None:
             hashes.append(archive["sha256"])
-    if not found:
+    if not hashes_by_pin:
         raise UsageError(f"{lock} pins no package: name the requirements.lock that coec was installed from")
-    return {key: tuple(sorted(values)) for key, values in found.items()}
+    return {key: tuple(sorted(values)) for key, values in hashes_by_pin.items()}
 
 
 def _needs(package: Distribution, extras: frozenset[str]) -> Iterator[tuple[str, frozenset[str]]]:
@@ -154,17 +154,17 @@ def _licence(package: Distribution) -> str | None:
     if classifiers and all(one in CLASSIFIED for one in classifiers):
         return " OR ".join(sorted(CLASSIFIED[one] for one in classifiers))
     texts = (stated, *(_text(package, name) for name in metadata.get_all("License-File") or ()))
-    return next((known for known in map(bsd_of, texts) if known is not None), None)
+    return next((known for known in map(bsd_licence, texts) if known is not None), None)
 
 
-def bsd_of(text: str) -> str | None:
+def bsd_licence(text: str) -> str | None:
     """The licence of the BSD family that a text is, by its clauses; None if it is none."""
-    words = " ".join(text.split())
-    if "Redistribution and use in source and binary forms" not in words:
+    normalised = " ".join(text.split())
+    if "Redistribution and use in source and binary forms" not in normalised:
         return None
     return (
         "BSD-3-Clause"
-        if re.search(r"[Nn]either the name|The name of the author may not be used", words)
+        if re.search(r"[Nn]either the name|The name of the author may not be used", normalised)
         else "BSD-2-Clause"
     )
 

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 
-def holder_of(path: Path) -> int | None:
+def lock_holder(path: Path) -> int | None:
     """Id of a process that holds flock(2) on a file; None if none does, or if the system does not tell; 0 for a process
     that this one cannot see."""
     try:
@@ -16,7 +16,7 @@ def holder_of(path: Path) -> int | None:
         return None
     file = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     for line in lines:
-        words = line.split()
-        if len(words) >= 6 and words[1] == "FLOCK" and words[5] == file:
-            return int(words[4])
+        columns = line.split()
+        if len(columns) >= 6 and columns[1] == "FLOCK" and columns[5] == file:
+            return int(columns[4])
     return None

@@ -48,8 +48,8 @@ class HumanFormatter(logging.Formatter):
         time = datetime.fromtimestamp(record.created, UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
         fields = getattr(record, "fields", None)
-        told = "".join(f"  {key}={value}" for key, value in fields.items()) if isinstance(fields, dict) else ""
-        line = printable(f"{time} {level}{record.getMessage()}{told}", None)
+        fields_text = "".join(f"  {key}={value}" for key, value in fields.items()) if isinstance(fields, dict) else ""
+        line = printable(f"{time} {level}{record.getMessage()}{fields_text}", None)
         if not record.exc_info:
             return line
         return f"{line}\n{printable_lines(self.formatException(record.exc_info))}"

@@ -17,11 +17,11 @@ from pathlib import Path
 
 from coec.adapters.files import durable
 
-ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+LOOPBACK_OF_WILDCARD = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 """Addresses on which a server listens everywhere, and those at which the same computer reaches it."""
 
 
-class Notifier:
+class ServiceManagerNotifier:
     """Tells the service manager the state of the process; does nothing if there is no manager."""
 
     def __init__(self, address: str | None, heartbeat: Path | None = None) -> None:
@@ -32,7 +32,7 @@ class Notifier:
         self._written: bytes | None = None
 
     @classmethod
-    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Notifier:
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> ServiceManagerNotifier:
         """The notifier of the manager that started this process."""
         heartbeat = environment.get("COEC_HEARTBEAT_FILE")
         return cls(environment.get("NOTIFY_SOCKET"), Path(heartbeat) if heartbeat else None)
@@ -53,7 +53,7 @@ class Notifier:
         """Every thread has made progress since the last call. `http` is where the HTTP pages are served; None:
         nowhere."""
         self._send("WATCHDOG=1")
-        self._beat(b"-\n" if http is None else f"{ANYWHERE.get(http[0], http[0])} {http[1]}\n".encode())
+        self._beat(b"-\n" if http is None else f"{LOOPBACK_OF_WILDCARD.get(http[0], http[0])} {http[1]}\n".encode())
 
     def stopping(self) -> None:
         """The shutdown has begun."""

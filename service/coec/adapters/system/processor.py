@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 
-def processor_s(pid: int) -> float:
+def processor_time_s(pid: int) -> float:
     """Processor time of all threads of a process since it began, s, to the microsecond.
 
     Raises:

@@ -26,24 +26,24 @@ from typing import Any
 from coec.config import AuthorityConfig
 from coec.errors import CoecError, ConfigError, NotProvenError, cannot_read
 
-WAITED_S = 5.0
+SECOND_QUERY_S = 5.0
 """How long the listener waits for the second question; a later one is refused. A carrier that holds a question back
 gains at most this time."""
 
-CONVERSATIONS = 256
+MAX_HANDSHAKES = 256
 """Most conversations that have begun and not ended, some 36 kB each. The oldest one makes room once it is `LEFT_S`
 old."""
 
-MAX_SAID = 16_384
+MAX_PAYLOAD_BYTES = 16_384
 """Most bytes that can be said: one record of TLS."""
 
 
-LEFT_S = 1.0
+MIN_HANDSHAKE_AGE_S = 1.0
 """Age before which no conversation is dropped for another. Two queries take some milliseconds, and on a busy computer a
 hundred times that."""
 
 
-class CrowdedError(CoecError):
+class TooManyHandshakesError(CoecError):
     """Too many conversations have begun just now. Nothing was done, and the sender may begin again."""
 
     reply_code = "busy"
@@ -67,29 +67,29 @@ def credentials_of(config: AuthorityConfig) -> Credentials | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class AuthenticatedCommand:
     """The end of a conversation: the speaker's name (common name of its certificate), what it said, and a function that
     encrypts an answer for it."""
 
-    name: str
-    said: bytes
-    sealed: Callable[[bytes], bytes]
+    sender: str
+    payload: bytes
+    seal: Callable[[bytes], bytes]
 
 
-class _Line:
+class _TlsEndpoint:
     """One end of a connection that has no socket."""
 
     def __init__(self, context: ssl.SSLContext, *, server_side: bool) -> None:
-        self._came, self._goes = ssl.MemoryBIO(), ssl.MemoryBIO()
-        self._tls = context.wrap_bio(self._came, self._goes, server_side=server_side)
+        self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=server_side)
 
-    def shake_hands(self, came: bytes) -> bool:
+    def handshake(self, received: bytes) -> bool:
         """Whether the other end has proven its name; if not, its next bytes are needed.
 
         Raises:
             NotProvenError: it cannot.
         """
-        self._came.write(came)
+        self._incoming.write(received)
         try:
             self._tls.do_handshake()
         except ssl.SSLWantReadError:
@@ -106,26 +106,26 @@ class _Line:
             raise NotProvenError(f"the certificate has {len(names)} common names; it must have one")
         return str(names[0])
 
-    def read(self, came: bytes = b"") -> bytes:
+    def read(self, received: bytes = b"") -> bytes:
         """What the other end said, in one record."""
-        self._came.write(came)
+        self._incoming.write(received)
         try:
-            return self._tls.read(MAX_SAID)
+            return self._tls.read(MAX_PAYLOAD_BYTES)
         except ssl.SSLError as error:
             raise NotProvenError(f"what was said cannot be read: {_why(error)}") from None
 
     def write(self, text: bytes) -> None:
         """Say something, in one record."""
-        if len(text) > MAX_SAID:
-            raise NotProvenError(f"more than {MAX_SAID} bytes cannot be said")
+        if len(text) > MAX_PAYLOAD_BYTES:
+            raise NotProvenError(f"more than {MAX_PAYLOAD_BYTES} bytes cannot be said")
         self._tls.write(text)
 
-    def goes(self) -> bytes:
+    def outgoing(self) -> bytes:
         """Bytes for the other end."""
-        return self._goes.read()
+        return self._outgoing.read()
 
 
-class Listener:
+class CommandListener:
     """The service's end, which takes part in many conversations at once. For use by one thread.
 
     Attributes:
@@ -143,20 +143,20 @@ class Listener:
         self._context.num_tickets = 0  # no conversation is resumed
         self.digest = _digest(credentials)
         self._clock = clock
-        self._begun: OrderedDict[str, tuple[_Line, float]] = OrderedDict()
+        self._pending: OrderedDict[str, tuple[_TlsEndpoint, float]] = OrderedDict()
 
-    def renewed(self, credentials: Credentials) -> Listener:
+    def renewed(self, credentials: Credentials) -> CommandListener:
         """A listener that continues the conversations begun here and uses these files, read now, for new ones. For any
         thread. Do not use this one afterwards.
 
         Raises:
             ConfigError: a file cannot be used; then this listener stays in use.
         """
-        fresh = Listener(credentials, self._clock)
-        fresh._begun = self._begun
+        fresh = CommandListener(credentials, self._clock)
+        fresh._pending = self._pending
         return fresh
 
-    def hear(self, conversation: str, came: bytes) -> bytes | Heard:
+    def receive(self, handshake_id: str, received: bytes) -> bytes | AuthenticatedCommand:
         """Takes the next bytes of the conversation with this id, which its speaker chose. Returns the bytes to send
         back, or the end of the conversation.
 
@@ -165,32 +165,32 @@ class Listener:
             CrowdedError: the conversation would begin, but there is no room.
         """
         now_s = self._clock()
-        while self._begun and next(iter(self._begun.values()))[1] < now_s:
-            self._begun.popitem(last=False)
-        line, _ = self._begun.pop(conversation, (None, 0.0))
-        if line is None:
-            return self._begin(conversation, came, now_s)
-        if not line.shake_hands(came):
+        while self._pending and next(iter(self._pending.values()))[1] < now_s:
+            self._pending.popitem(last=False)
+        endpoint, _ = self._pending.pop(handshake_id, (None, 0.0))
+        if endpoint is None:
+            return self._begin(handshake_id, received, now_s)
+        if not endpoint.handshake(received):
             raise NotProvenError("the conversation was broken off")
-        return Heard(line.peer(), line.read(), _sealing(line))
+        return AuthenticatedCommand(endpoint.peer(), endpoint.read(), _sealer(endpoint))
 
-    def _begin(self, conversation: str, came: bytes, now_s: float) -> bytes:
-        if len(self._begun) >= CONVERSATIONS:
+    def _begin(self, handshake_id: str, received: bytes, now_s: float) -> bytes:
+        if len(self._pending) >= MAX_HANDSHAKES:
             # Conversations that have begun get time to go on, so that a flood of new ones makes others wait but ends
             # none.
-            if next(iter(self._begun.values()))[1] > now_s + WAITED_S - LEFT_S:
-                raise CrowdedError("too many conversations have begun; begin again in a moment")
-            self._begun.popitem(last=False)
-        line = _Line(self._context, server_side=True)
-        line.shake_hands(came)
-        flight = line.goes()
+            if next(iter(self._pending.values()))[1] > now_s + SECOND_QUERY_S - MIN_HANDSHAKE_AGE_S:
+                raise TooManyHandshakesError("too many conversations have begun; begin again in a moment")
+            self._pending.popitem(last=False)
+        endpoint = _TlsEndpoint(self._context, server_side=True)
+        endpoint.handshake(received)
+        flight = endpoint.outgoing()
         if not flight:
             raise NotProvenError("this is no beginning of a TLS conversation")
-        self._begun[conversation] = line, now_s + WAITED_S
+        self._pending[handshake_id] = endpoint, now_s + SECOND_QUERY_S
         return flight
 
 
-class Speaker:
+class CommandSender:
     """The sender's end of one conversation."""
 
     def __init__(self, credentials: Credentials, to: str) -> None:
@@ -201,41 +201,41 @@ class Speaker:
         """
         context = _context(credentials, ssl.PROTOCOL_TLS_CLIENT)
         context.check_hostname = False  # the name is not that of a host: `say` checks it
-        self._line = _Line(context, server_side=False)
+        self._endpoint = _TlsEndpoint(context, server_side=False)
         self._to = to
 
-    def hello(self) -> bytes:
+    def first_flight(self) -> bytes:
         """The first bytes."""
-        self._line.shake_hands(b"")
-        return self._line.goes()
+        self._endpoint.handshake(b"")
+        return self._endpoint.outgoing()
 
-    def say(self, came: bytes, text: bytes) -> bytes:
+    def send(self, received: bytes, text: bytes) -> bytes:
         """The bytes that end the conversation, after the listener has proven its name.
 
         Raises:
             NotProvenError: it has another name or no proof; nothing of the text was sent.
         """
-        if not self._line.shake_hands(came):
+        if not self._endpoint.handshake(received):
             raise NotProvenError("the answer holds no certificate")
-        name = self._line.peer()
+        name = self._endpoint.peer()
         if name != self._to:
             raise NotProvenError(f"who answered has the certificate of {name!a}, not that of {self._to!r}")
-        self._line.write(text)
-        return self._line.goes()
+        self._endpoint.write(text)
+        return self._endpoint.outgoing()
 
-    def answer(self, came: bytes) -> bytes:
+    def reply(self, received: bytes) -> bytes:
         """The listener's answer.
 
         Raises:
             NotProvenError: these bytes are not from the listener.
         """
-        return self._line.read(came)
+        return self._endpoint.read(received)
 
 
-def _sealing(line: _Line) -> Callable[[bytes], bytes]:
+def _sealer(endpoint: _TlsEndpoint) -> Callable[[bytes], bytes]:
     def sealed(text: bytes) -> bytes:
-        line.write(text)
-        return line.goes()
+        endpoint.write(text)
+        return endpoint.outgoing()
 
     return sealed
 
@@ -249,7 +249,7 @@ def _context(credentials: Credentials, protocol: int) -> ssl.SSLContext:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{credentials.root_ca} is no certificate of an authority: {_reason(error)}") from None
     try:
-        context.load_cert_chain(credentials.certificate, credentials.private_key, password=_nobody_types)
+        context.load_cert_chain(credentials.certificate, credentials.private_key, password=_no_password)
     except (OSError, ValueError) as error:
         both = f"{credentials.certificate} and {credentials.private_key}"
         raise ConfigError(f"{both} are no certificate and its unencrypted key in PEM: {_reason(error)}") from None
@@ -266,7 +266,7 @@ def _digest(credentials: Credentials) -> str:
     return digest.hexdigest()
 
 
-def _nobody_types() -> str:
+def _no_password() -> str:
     """An empty password for an encrypted key. Without it OpenSSL asks at the terminal and a service waits for ever."""
     return ""
 

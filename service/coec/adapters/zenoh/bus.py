@@ -22,9 +22,16 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.endpoints import without_secrets
-from coec.adapters.zenoh.inputs import Input, Sample
+from coec.adapters.zenoh.inputs import InputSample, StreamInput
 from coec.adapters.zenoh.opening import open_waiting
-from coec.adapters.zenoh.settings import check_certificates, endpoints_of, mode_of, second, settings_of, where
+from coec.adapters.zenoh.settings import (
+    check_certificates,
+    endpoints_of,
+    mode_of,
+    settings_of,
+    settings_source,
+    to_second_session,
+)
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
 from coec.schemas.base import to_json, to_msgpack
@@ -44,7 +51,7 @@ LATCHED_SAMPLES = 100
 POLL_S = 0.2
 
 
-class Lane(Enum):
+class QueryLane(Enum):
     """Where an answer is made: at once on Zenoh's thread, or on a thread that serves only queries of one kind."""
 
     AT_ONCE = "at-once"
@@ -57,7 +64,7 @@ class Lane(Enum):
     """Waits for the worker."""
 
 
-WAITING = {Lane.COMMANDS: 32, Lane.FILES: 32, Lane.DRAWING: 8}
+WAITING = {QueryLane.COMMANDS: 32, QueryLane.FILES: 32, QueryLane.DRAWING: 8}
 """Most queries that wait for each thread; the next one is answered `busy`. Commands: one for each pair that a vehicle
 may have. Answers from files take 16 MB of memory each, pictures a second of the worker."""
 
@@ -88,7 +95,7 @@ class Route:
 
     key: str
     answer: Callable[[Request], Answer]
-    lane: Lane
+    lane: QueryLane
 
 
 def open_session(config: ZenohConfig, limits: LimitsConfig, *, again: bool = False) -> zenoh.Session:
@@ -102,13 +109,13 @@ def open_session(config: ZenohConfig, limits: LimitsConfig, *, again: bool = Fal
     zenoh.init_log_from_env_or("error")
     settings = settings_of(config, limits)
     if again:
-        settings = second(settings)
-    check_certificates(settings, where(config))
+        settings = to_second_session(settings)
+    check_certificates(settings, settings_source(config))
     try:
         return open_waiting(settings) if mode_of(settings) == "client" else zenoh.open(settings)
     except zenoh.ZError as error:
         text = without_secrets(str(error), endpoints_of(config))
-        raise UnavailableError(f"cannot open the Zenoh session ({where(config)}): {text}") from None
+        raise UnavailableError(f"cannot open the Zenoh session ({settings_source(config)}): {text}") from None
 
 
 def is_connected(session: zenoh.Session) -> bool:
@@ -142,7 +149,7 @@ class Bus:
         self._subscribers: list[_Undeclarable] = []
         self._queryables: list[zenoh.Queryable[None]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
-        self._waiting: dict[Lane, _Waiting] = {lane: queue.Queue(most) for lane, most in WAITING.items()}
+        self._waiting: dict[QueryLane, _Waiting] = {lane: queue.Queue(most) for lane, most in WAITING.items()}
         self.threads = tuple(
             ServiceThread(f"{lane.value}-queries", partial(_answer_from, waiting, self._answer))
             for lane, waiting in self._waiting.items()
@@ -151,9 +158,11 @@ class Bus:
     @property
     def prompt_threads(self) -> tuple[ServiceThread, ...]:
         """The `threads` that wait neither for a disk nor for the worker."""
-        return tuple(thread for lane, thread in zip(self._waiting, self.threads, strict=True) if lane is Lane.COMMANDS)
+        return tuple(
+            thread for lane, thread in zip(self._waiting, self.threads, strict=True) if lane is QueryLane.COMMANDS
+        )
 
-    def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
+    def subscribe(self, stream: StreamInput, on_sample: Callable[[InputSample], None]) -> Callable[[], None]:
         """Call `on_sample` for every put on the stream, on Zenoh's thread. Returns a function that ends this."""
         receive = self._receiver(stream, on_sample)
         token = self._shown(stream)
@@ -170,7 +179,7 @@ class Bus:
 
         return end
 
-    def subscribe_latched(self, stream: Input, on_sample: Callable[[Sample], None]) -> None:
+    def subscribe_latched(self, stream: StreamInput, on_sample: Callable[[InputSample], None]) -> None:
         """As `subscribe`, and also for earlier samples if their publisher keeps them for late subscribers (ROS calls
         that transient local). Puts of this session itself are not heard."""
         receive = self._receiver(stream, on_sample)
@@ -187,7 +196,7 @@ class Bus:
             )
             self._subscribers.append(subscriber)
 
-    def _shown(self, stream: Input) -> zenoh.LivelinessToken | None:
+    def _shown(self, stream: StreamInput) -> zenoh.LivelinessToken | None:
         """Declares the liveliness token that shows others that this stream is subscribed; None if it has no token."""
         if stream.token is None:
             return None
@@ -196,7 +205,7 @@ class Bus:
         return token
 
     @staticmethod
-    def _receiver(stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[zenoh.Sample], None]:
+    def _receiver(stream: StreamInput, on_sample: Callable[[InputSample], None]) -> Callable[[zenoh.Sample], None]:
         def receive(sample: zenoh.Sample) -> None:
             try:
                 if sample.kind == zenoh.SampleKind.PUT:
@@ -275,8 +284,11 @@ class Bus:
                 _reply_error(query, error.reply_code, str(error))
             return
         lanes = {route.lane for route in routes}
-        slowest = next((lane for lane in (Lane.DRAWING, Lane.FILES, Lane.COMMANDS) if lane in lanes), Lane.AT_ONCE)
-        if slowest is Lane.AT_ONCE:
+        slowest = next(
+            (lane for lane in (QueryLane.DRAWING, QueryLane.FILES, QueryLane.COMMANDS) if lane in lanes),
+            QueryLane.AT_ONCE,
+        )
+        if slowest is QueryLane.AT_ONCE:
             self._answer(query, routes, received_s)
             return
         try:

@@ -40,7 +40,7 @@ def paced(
     rate: float,
     stop: threading.Event,
     send: Callable[[T], tuple[str, int]],
-    heard: Callable[[T, Played], None],
+    on_sent: Callable[[T, Played], None],
     played: Played,
 ) -> Played:
     """Sends every item when it is due, `rate` times as fast as it was recorded; 0 = without waiting.
@@ -71,7 +71,7 @@ def paced(
         if rate > 0:
             played.latest_late_s = max(time.monotonic() - due_s, 0.0)
             played.late_s = max(played.late_s, played.latest_late_s)
-        heard(item, played)
+        on_sent(item, played)
     return played
 
 

@@ -16,7 +16,7 @@ from coec.schemas.base import from_json, from_msgpack
 from coec.schemas.keys import Keys
 from coec.schemas.replies import ExtrinsicReply, HealthReply
 
-MAX_BYTES = 2**20
+MAX_DOCUMENT_BYTES = 2**20
 """Largest document that is read; health with all its figures has some 10 kB."""
 
 
@@ -25,7 +25,7 @@ MAX_KEYS = 4096
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class PairUpdate:
     """One change of a pair.
 
     Attributes:
@@ -44,43 +44,43 @@ class Change:
 
 
 @contextmanager
-def listening(
+def subscribed(
     session: zenoh.Session,
     keys: Keys,
     pair: str,
     timeout_s: float,
-    take: Callable[[Change], None],
-    refuse: Callable[[], None],
+    on_update: Callable[[PairUpdate], None],
+    on_refused: Callable[[], None],
 ) -> Iterator[None]:
     """Inside the block, `take` is called for the current state of a pair (`*`: of each pair) and for every change, and
     `refuse` for every document that cannot be read. Both are called on Zenoh's threads and must not wait. The block
     begins before the answers about the current state are there; they come within `timeout_s` or not at all. A pair that
     appears later is queried, too, because its first words may have been sent before it knew of this subscriber."""
-    heard: set[str] = set()
+    known: set[str] = set()
     answers: dict[str, tuple[object, zenoh.Timestamp | None]] = {}
     order = threading.Lock()
-    given_up = zenoh.CancellationToken()
+    cancelled = zenoh.CancellationToken()
 
-    def give(sample: zenoh.Sample) -> bool:
+    def deliver(sample: zenoh.Sample) -> bool:
         key = str(sample.key_expr)
         try:
-            if key not in heard and len(heard) >= MAX_KEYS:
+            if key not in known and len(known) >= MAX_KEYS:
                 raise DecodeError("too_many_keys", f"a vehicle with more than {MAX_KEYS} keys")
-            change = _change(sample)
+            change = _update_in(sample)
         except DecodeError:
-            refuse()
+            on_refused()
             return False
-        heard.add(key)
-        take(change)
+        known.add(key)
+        on_update(change)
         return True
 
-    def hear(sample: zenoh.Sample) -> bool:
+    def on_sample(sample: zenoh.Sample) -> bool:
         with order:
             answers.pop(str(sample.key_expr), None)
-            return give(sample)
+            return deliver(sample)
 
-    def ask(told: Iterable[str]) -> None:
-        query = object()
+    def request(requested: Iterable[str]) -> None:
+        query_id = object()
 
         def answered(reply: zenoh.Reply) -> None:
             if reply.ok is None:
@@ -90,53 +90,53 @@ def listening(
                 query_of, before = answers.get(key, (None, None))
                 # A change that was heard meanwhile is as new as this answer, or newer. Of several answers to one query
                 # the latest counts.
-                if (key not in heard or (query_of is query and is_later(stamp, before))) and give(reply.ok):
-                    answers[key] = (query, stamp)
+                if (key not in known or (query_of is query_id and is_later(stamp, before))) and deliver(reply.ok):
+                    answers[key] = (query_id, stamp)
 
-        for key in told:
+        for key in requested:
             session.get(
                 key,
                 zenoh.handlers.Callback(answered, indirect=False),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,  # else Zenoh keeps all answers until the query ends
                 timeout=timeout_s,
-                cancellation_token=given_up,
+                cancellation_token=cancelled,
             )
 
-    def come_or_gone(sample: zenoh.Sample) -> None:
-        if not hear(sample):
+    def on_token(sample: zenoh.Sample) -> None:
+        if not on_sample(sample):
             return
         of_pair = str(sample.key_expr).removesuffix("alive")
-        told = (f"{of_pair}health", f"{of_pair}extrinsic")
+        documents = (f"{of_pair}health", f"{of_pair}extrinsic")
         if sample.kind == zenoh.SampleKind.PUT:
-            ask(told)
+            request(documents)
         else:
             with order:
-                heard.difference_update(told)
+                known.difference_update(documents)
 
     now = (keys.health(pair), keys.extrinsic(pair))
-    handler = zenoh.handlers.Callback(hear, indirect=False)
+    handler = zenoh.handlers.Callback(on_sample, indirect=False)
     with ExitStack() as stack:
         for key in now:
             stack.callback(session.declare_subscriber(key, handler).undeclare)
-        of_tokens = zenoh.handlers.Callback(come_or_gone, indirect=False)
+        of_tokens = zenoh.handlers.Callback(on_token, indirect=False)
         tokens = session.liveliness().declare_subscriber(keys.alive(pair), of_tokens, history=True)
         stack.callback(tokens.undeclare)
-        stack.callback(given_up.cancel)
-        ask(now)
+        stack.callback(cancelled.cancel)
+        request(now)
         yield
 
 
-def _change(sample: zenoh.Sample) -> Change:
+def _update_in(sample: zenoh.Sample) -> PairUpdate:
     """The change in a sample. Raises DecodeError if it is not a document of this schema."""
     key = str(sample.key_expr)
     _, pair, kind = key.rsplit("/", 2)
     if kind == "alive":
-        return Change(key, pair, "alive", sample.kind == zenoh.SampleKind.PUT)
-    if len(sample.payload) > MAX_BYTES:
-        raise DecodeError("message_too_large", f"a document of more than {MAX_BYTES} bytes")
+        return PairUpdate(key, pair, "alive", sample.kind == zenoh.SampleKind.PUT)
+    if len(sample.payload) > MAX_DOCUMENT_BYTES:
+        raise DecodeError("message_too_large", f"a document of more than {MAX_DOCUMENT_BYTES} bytes")
     read = from_json if str(sample.encoding).startswith(JSON) else from_msgpack
     payload = sample.payload.to_bytes()
     if kind == "health":
-        return Change(key, pair, "health", read(HealthReply, payload))
-    return Change(key, pair, "extrinsic", read(ExtrinsicReply, payload))
+        return PairUpdate(key, pair, "health", read(HealthReply, payload))
+    return PairUpdate(key, pair, "extrinsic", read(ExtrinsicReply, payload))

@@ -49,7 +49,7 @@ MAX_SHOWN_KEY = 160
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
+class ReplyBounds:
     """Most that the replies to one query may bring. Anybody whom the router lets answer may send any number of replies
     of any size.
 
@@ -64,11 +64,11 @@ class Bounds:
     reply_bytes: int = MAX_MESSAGE_BYTES
 
 
-OF_ONE_KEY = Bounds(16, MAX_MESSAGE_BYTES)
+OF_ONE_KEY = ReplyBounds(16, MAX_MESSAGE_BYTES)
 """Of a query for one key. One program answers, or two while a storage keeps last words; more than some are no service
 of ours."""
 
-OF_MANY_KEYS = Bounds(4096, 2 * MAX_MESSAGE_BYTES)
+OF_MANY_KEYS = ReplyBounds(4096, 2 * MAX_MESSAGE_BYTES)
 """Of a query for many keys: as many replies as `watch` follows keys. The history of 32 pairs has 20 MB at its default
 length."""
 
@@ -83,7 +83,7 @@ class Reply:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class RouterAddress:
     """How to reach a router: at the first of the endpoints that answers, with the session settings of a file (Zenoh
     configuration, JSON5; None: default settings)."""
 
@@ -94,12 +94,14 @@ class Way:
 @contextmanager
 def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session]:
     """As `connected_by`, with endpoints and default settings."""
-    with connected_by(Way(tuple(endpoints)), wait_s) as session:
+    with connected_by(RouterAddress(tuple(endpoints)), wait_s) as session:
         yield session
 
 
 @contextmanager
-def connected_by(way: Way, wait_s: float, max_message_bytes: int = MAX_MESSAGE_BYTES) -> Iterator[zenoh.Session]:
+def connected_by(
+    router: RouterAddress, wait_s: float, max_message_bytes: int = MAX_MESSAGE_BYTES
+) -> Iterator[zenoh.Session]:
     """A client session with the first router that answers, closed at the end. `max_message_bytes` is the largest
     message that it receives, whatever the file says.
 
@@ -108,8 +110,8 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int = MAX_MESSAGE_B
         ConfigError: the file, or a certificate that it names, cannot be used.
         ConnectionFailedError: no router answered within `wait_s`.
     """
-    settings = zenoh.Config() if way.file is None else read_settings(way.file)
-    for endpoint in way.endpoints:
+    settings = zenoh.Config() if router.file is None else read_settings(router.file)
+    for endpoint in router.endpoints:
         if not ENDPOINT.fullmatch(endpoint):
             raise UsageError(
                 f"{redacted(endpoint)!r} is no endpoint of a router: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447"
@@ -122,15 +124,15 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int = MAX_MESSAGE_B
     # Publishers that keep their last message for late subscribers need timestamps.
     settings.insert_json5("timestamping/enabled", "true")
     try:
-        settings.insert_json5("connect/endpoints", json.dumps(way.endpoints))
-        check_certificates(settings, str(way.file or "--connect"))
+        settings.insert_json5("connect/endpoints", json.dumps(router.endpoints))
+        check_certificates(settings, str(router.file or "--connect"))
         session = open_client(settings, wait_s)
     except (zenoh.ZError, ValueError) as error:
-        asked = ", ".join(redacted(endpoint) for endpoint in way.endpoints)
-        by_certificate = any(endpoint.startswith(("tls/", "quic/")) for endpoint in way.endpoints)
+        tried = ", ".join(redacted(endpoint) for endpoint in router.endpoints)
+        by_certificate = any(endpoint.startswith(("tls/", "quic/")) for endpoint in router.endpoints)
         refused = ", or it refuses the certificate (`openssl x509 -in FILE -noout -subject -issuer -dates`)"
         raise ConnectionFailedError(
-            f"no Zenoh router answered at {asked} within {wait_s:g} s{refused if by_certificate else ''}: start one, "
+            f"no Zenoh router answered at {tried} within {wait_s:g} s{refused if by_certificate else ''}: start one, "
             "start `coec run --embedded-router`, or name the endpoint with --connect"
         ) from error
     try:
@@ -170,7 +172,7 @@ def _first_clause(text: str) -> str:
     return text.partition(" at /")[0].partition("`: ")[2] or text
 
 
-def ask(
+def query_all(
     session: zenoh.Session,
     selector: str,
     timeout_s: float,
@@ -196,7 +198,7 @@ def ask(
     return replies.result()
 
 
-def target_of(selector: str) -> zenoh.QueryTarget:
+def query_target(selector: str) -> zenoh.QueryTarget:
     """Which queryables are asked: the nearest complete one for a key, all of them for a key expression.
 
     Raises:
@@ -215,7 +217,7 @@ class Replies:
     """
 
     def __init__(
-        self, selector: str, timeout_s: float, on_finished: Callable[[], None], bounds: Bounds | None = None
+        self, selector: str, timeout_s: float, on_finished: Callable[[], None], bounds: ReplyBounds | None = None
     ) -> None:
         """`on_finished` is called on Zenoh's thread when no more replies are needed. `bounds` None: by whether the
         selector stands for one key.
@@ -226,7 +228,7 @@ class Replies:
         self._selector = selector
         self._timeout_s = timeout_s
         self._on_finished = on_finished
-        self._target = target_of(selector)
+        self._target = query_target(selector)
         self._key = selector.partition("?")[0]
         self._bounds = bounds or (OF_MANY_KEYS if "*" in self._key else OF_ONE_KEY)
         self._given_up = zenoh.CancellationToken()
@@ -344,16 +346,16 @@ def patience_ms(timeout_s: float) -> int:
     return min(max(round(timeout_s * 1e3 * ON_SITE), 1), MAX_COMMAND_TIMEOUT_MS)
 
 
-def ask_one(session: zenoh.Session, selector: str, timeout_s: float, payload: bytes | None = None) -> Reply:
+def query_one(session: zenoh.Session, selector: str, timeout_s: float, payload: bytes | None = None) -> Reply:
     """The answer to a query for one key, the first if there are several.
 
     Raises:
         NotFoundError: nobody answered; says what to check.
         RemoteError: as `ask`.
     """
-    replies = ask(session, selector, timeout_s, payload)
+    replies = query_all(session, selector, timeout_s, payload)
     if not replies:
-        raise nobody(selector)
+        raise no_reply_error(selector)
     return replies[0]
 
 
@@ -373,7 +375,7 @@ def is_alive(session: zenoh.Session, keys: Keys, timeout_s: float) -> bool:
     return held.is_set()
 
 
-def nobody(selector: str, *, service_is_there: bool = False) -> NotFoundError:
+def no_reply_error(selector: str, *, service_is_there: bool = False) -> NotFoundError:
     """The error for a query that nobody answered. A query that the router's rules forbid is not answered either;
     neither Zenoh nor this function can distinguish the two for certain."""
     if service_is_there:

@@ -69,7 +69,7 @@ class Endpoint:
         """The port, for a protocol that has ports."""
         return int(self.address.rpartition(":")[2])
 
-    def lets_in_whoever_comes(self, *, certificates_asked: bool) -> bool:
+    def admits_anyone(self, *, certificates_required: bool) -> bool:
         """Whether a program on another computer gets in without a certificate if a session listens on this endpoint.
 
         Args:
@@ -77,9 +77,9 @@ class Endpoint:
         """
         if self.on_loopback:
             return False
-        said = dict(item.partition("=")[::2] for item in self.settings.split(";")).get(MTLS)
-        asked = certificates_asked if said is None else said == "true"
-        return not (asked and self.protocol in CERTIFIED)
+        setting = dict(item.partition("=")[::2] for item in self.settings.split(";")).get(MTLS)
+        required = certificates_required if setting is None else setting == "true"
+        return not (required and self.protocol in CERTIFIED)
 
 
 def redacted(text: str) -> str:

@@ -18,7 +18,7 @@ NO_TYPE = "?"
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class InputSample:
     """A message as it was received.
 
     Attributes:
@@ -36,7 +36,7 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True)
-class Input:
+class StreamInput:
     """How to listen to one stream: key expressions to subscribe to, and a function that reads the samples.
 
     Attributes:
@@ -44,37 +44,37 @@ class Input:
     """
 
     expressions: tuple[str, ...]
-    read: Callable[[zenoh.Sample], Sample]
+    read: Callable[[zenoh.Sample], InputSample]
     token: str | None = None
 
 
-def input_of(stream: StreamConfig, config: Config) -> Input:
+def input_of(stream: StreamConfig, config: Config) -> StreamInput:
     """The input of a stream of this configuration."""
     if stream.key is not None:
         return on_key(stream.key)
     if config.middleware == "ros2dds":
         return on_key(ros2dds.topic_key(config.ros.namespace, stream.place))
-    return Input(rmw_zenoh.topic_expressions(config.ros.domain, stream.place), _typed_by_key)
+    return StreamInput(rmw_zenoh.topic_expressions(config.ros.domain, stream.place), _typed_by_key)
 
 
-def on_key(key: str) -> Input:
+def on_key(key: str) -> StreamInput:
     """The input for everything that is put on one key."""
-    return Input((key,), _as_it_is)
+    return StreamInput((key,), _as_it_is)
 
 
-def _as_it_is(sample: zenoh.Sample) -> Sample:
+def _as_it_is(sample: zenoh.Sample) -> InputSample:
     stamp = sample.timestamp
     origin = b"" if stamp is None else str(stamp.get_id()).encode()
-    return Sample(sample.payload.to_bytes(), str(sample.encoding), origin=origin)
+    return InputSample(sample.payload.to_bytes(), str(sample.encoding), origin=origin)
 
 
-def _typed_by_key(sample: zenoh.Sample) -> Sample:
+def _typed_by_key(sample: zenoh.Sample) -> InputSample:
     """Reads a sample from rmw_zenoh, whose key holds the type; its encoding says nothing."""
     try:
         type_name = rmw_zenoh.TopicKey.parse(str(sample.key_expr)).type_name
     except UsageError:
         type_name = NO_TYPE
-    told = sample.attachment
-    readable = told is not None and len(told) <= rmw_zenoh.MAX_ATTACHMENT
-    attachment = told.to_bytes() if told is not None and readable else b""
-    return Sample(sample.payload.to_bytes(), f"{CDR};{type_name}", attachment)
+    received = sample.attachment
+    readable = received is not None and len(received) <= rmw_zenoh.MAX_ATTACHMENT
+    attachment = received.to_bytes() if received is not None and readable else b""
+    return InputSample(sample.payload.to_bytes(), f"{CDR};{type_name}", attachment)

@@ -7,7 +7,7 @@ from typing import cast
 import zenoh
 
 
-def is_heard(publisher: zenoh.Publisher) -> bool:
+def has_subscribers(publisher: zenoh.Publisher) -> bool:
     """Whether somebody subscribes to the publisher's key."""
     # The stubs of eclipse-zenoh 1.10 declare a bool, but it is a `MatchingStatus` object, which is always truthy.
     return cast("zenoh.MatchingStatus", publisher.matching_status).matching

@@ -14,7 +14,7 @@ import zenoh
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import messages, outgoing
 from coec.adapters.zenoh.cadence import Played, paced
-from coec.adapters.zenoh.matching import is_heard
+from coec.adapters.zenoh.matching import has_subscribers
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import OpenPairConfig
 from coec.errors import UsageError
@@ -25,7 +25,7 @@ Frame = CameraFrame | LidarFrame | EgoMotion
 
 
 @dataclass(frozen=True, slots=True)
-class Streams:
+class StreamKeys:
     """The keys of a pair; `ego` None: ego-motion is not published."""
 
     camera: str
@@ -33,7 +33,7 @@ class Streams:
     ego: str | None
 
     @classmethod
-    def of_pair(cls, pair: OpenPairConfig) -> Streams:
+    def of_pair(cls, pair: OpenPairConfig) -> StreamKeys:
         """The keys in a configuration.
 
         Raises:
@@ -45,7 +45,7 @@ class Streams:
         return cls(pair.camera.place, pair.lidar.place, pair.ego.place if pair.ego else None)
 
     @classmethod
-    def default(cls, pair: str) -> Streams:
+    def default(cls, pair: str) -> StreamKeys:
         """`sensors/<pair>/camera`, `lidar` and `ego`."""
         return cls(f"sensors/{pair}/camera", f"sensors/{pair}/lidar", f"sensors/{pair}/ego")
 
@@ -79,7 +79,7 @@ class Player:
     receiver loses frames, which it counts."""
 
     def __init__(
-        self, session: zenoh.Session, streams: Streams | SensorKeys, encoding: Literal["msgpack", "cdr"]
+        self, session: zenoh.Session, streams: StreamKeys | SensorKeys, encoding: Literal["msgpack", "cdr"]
     ) -> None:
         self._encoding = encoding
         self._stream_of = streams.stream_of
@@ -98,9 +98,9 @@ class Player:
         try:
             while True:
                 changed.clear()
-                deaf = [str(p.key_expr) for p in self._publishers.values() if not is_heard(p)]
-                if not deaf or not changed.wait(max(deadline_s - time.monotonic(), 0.0)):
-                    return deaf
+                unmatched = [str(p.key_expr) for p in self._publishers.values() if not has_subscribers(p)]
+                if not unmatched or not changed.wait(max(deadline_s - time.monotonic(), 0.0)):
+                    return unmatched
         finally:
             for listener in listeners:
                 listener.undeclare()
@@ -110,11 +110,11 @@ class Player:
         frames: Iterable[Frame],
         rate: float,
         stop: threading.Event,
-        heard: Callable[[Frame, Played], None],
+        on_sent: Callable[[Frame, Played], None],
     ) -> Played:
         """Publishes every frame when it is due, see `paced`; frames of a stream without a key are left out."""
         ours = (frame for frame in frames if self._stream_of(frame) in self._publishers)
-        return paced(ours, rate, stop, self._send, heard, self.played)
+        return paced(ours, rate, stop, self._send, on_sent, self.played)
 
     def close(self) -> None:
         """Withdraws the publishers."""

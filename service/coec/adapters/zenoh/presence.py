@@ -36,7 +36,7 @@ from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import closed
 from coec.adapters.zenoh.client import GRACE_S
 from coec.adapters.zenoh.opening import open_client
-from coec.adapters.zenoh.settings import beside, mode_of, settings_of
+from coec.adapters.zenoh.settings import mode_of, settings_of, to_observer
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import DecodeError, UnavailableError, UsageError
 from coec.schemas.base import from_json
@@ -48,7 +48,7 @@ _log = logging.getLogger(__name__)
 CONNECT_S = 1.0
 """Timeout for opening the session to look with; a router on the same network answers in milliseconds."""
 
-LOOK_S = 1.0
+QUERY_S = 1.0
 """Timeout of one look."""
 
 SEEN_S = 5.0
@@ -94,7 +94,7 @@ def outranking(own: str, others: Iterable[Claim]) -> Claim | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class RouterView:
     """What the router holds about one vehicle.
 
     Attributes:
@@ -118,7 +118,7 @@ class Seen:
         return tuple(claim for claim in self.others if claim.daemon not in answering)
 
 
-class Presence:
+class SingletonGuard:
     """Presence of one daemon. `thread` looks for others while the daemon serves.
 
     Attributes:
@@ -172,14 +172,14 @@ class Presence:
         end_s = time.monotonic() + deadline_s
         self.thread.request_stop()
         self._stop.set()
-        ended, through = self.thread.join(deadline_s), self._through
+        joined, through = self.thread.join(deadline_s), self._through
         self._withdraw()
-        if not ended or through is None or through is self._session:
-            return ended
+        if not joined or through is None or through is self._session:
+            return joined
         return closed(through, max(end_s - time.monotonic(), 0.0))
 
     def _decide(self, stop: threading.Event) -> None:
-        seen = self._look_until_seen(stop)
+        seen = self._query_until_seen(stop)
         started_s = time.monotonic()
         while not stop.is_set():
             waited_s = time.monotonic() - started_s
@@ -187,7 +187,7 @@ class Presence:
             rivals = self._rivals(seen, tokens_count=silent and self._forbidden)
             step = next_step(self._daemon, rivals)
             if step == "leave" or (step == "wait" and waited_s > DECIDED_S):
-                raise UnavailableError(told(self._keys.vehicle, min(rivals, key=lambda claim: not claim.serving)))
+                raise UnavailableError(rival_text(self._keys.vehicle, min(rivals, key=lambda claim: not claim.serving)))
             unproven = self._unproven(seen, rivals)
             if silent and unproven and self._forbidden:
                 raise UnavailableError(
@@ -200,9 +200,9 @@ class Presence:
                 self._undeclare_first()
                 return
             stop.wait(POLL_S)
-            seen = self._look()
+            seen = self._query_router()
 
-    def _rivals(self, seen: Seen, *, tokens_count: bool) -> tuple[Claim, ...]:
+    def _rivals(self, seen: RouterView, *, tokens_count: bool) -> tuple[Claim, ...]:
         """Claims of the other daemons that are there. `tokens_count`: a token suffices, because the router's rules
         forbid the queries."""
         if tokens_count:
@@ -216,7 +216,7 @@ class Presence:
         unnamed = () if self._serving or known else tuple(Claim("", since_ns, serving=True) for since_ns in nameless)
         return (*seen.answers, *known, *unnamed)
 
-    def _unproven(self, seen: Seen, rivals: tuple[Claim, ...]) -> tuple[str, ...]:
+    def _unproven(self, seen: RouterView, rivals: tuple[Claim, ...]) -> tuple[str, ...]:
         """Keys of tokens that claim the vehicle and belong to none of the rivals."""
         there = {claim.daemon for claim in rivals}
         keys = tuple(self._keys.claim(claim) for claim in seen.silent if claim.daemon not in there)
@@ -261,7 +261,7 @@ class Presence:
         unseen, before = 0, self.unproven
         while not self._stop.wait(WATCH_S):
             thread.beat()
-            seen = self._look()
+            seen = self._query_router()
             rivals = self._rivals(seen, tokens_count=self._forbidden)
             unproven = self._unproven(seen, rivals)
             # A daemon that leaves withdraws its token and its answer one after the other.
@@ -275,10 +275,10 @@ class Presence:
                 unseen = 0 if seen.own else unseen + 1
                 self.hidden = unseen > 1 or (self.hidden and not seen.own)
 
-    def _look_until_seen(self, stop: threading.Event) -> Seen:
+    def _query_until_seen(self, stop: threading.Event) -> RouterView:
         """The first look that sees the own claim, or the last look within `SEEN_S`."""
         deadline_s = time.monotonic() + SEEN_S
-        while not (seen := self._look()).own:
+        while not (seen := self._query_router()).own:
             if not seen.routed and not list(self._session.info.routers_zid()):
                 _log.warning("no router answers yet: whether another daemon serves the vehicle is seen when one does")
                 break
@@ -288,12 +288,12 @@ class Presence:
                 break
         return seen
 
-    def _look(self) -> Seen:
+    def _query_router(self) -> RouterView:
         """What the router holds now; nothing while there is no router."""
         if self._through is None:
-            self._through = self._looking_glass()
+            self._through = self._open_observer()
         if self._through is None:
-            return Seen()
+            return RouterView()
         routed = bool(list(self._through.info.routers_zid()))
         held, answered, tokens = set[Claim](), set[Claim](), set[str]()
 
@@ -316,7 +316,7 @@ class Presence:
         others, answers = (
             tuple(claim for claim in claims if claim.daemon != self._daemon) for claims in (held, answered)
         )
-        return Seen(routed, own, others, tuple(sorted(tokens)), answers)
+        return RouterView(routed, own, others, tuple(sorted(tokens)), answers)
 
     @property
     def _forbidden(self) -> bool:
@@ -342,7 +342,7 @@ class Presence:
         """Calls `take`, on Zenoh's thread, for each token that is held; for none while the router is away."""
         if self._through is not None:
             with suppress(zenoh.ZError), _within(take) as (handler, given_up):
-                self._through.liveliness().get(key, handler, timeout=LOOK_S, cancellation_token=given_up)
+                self._through.liveliness().get(key, handler, timeout=QUERY_S, cancellation_token=given_up)
 
     def _each_reply(self, key: str, take: Callable[[zenoh.Sample], None], parameters: str = "") -> None:
         """Calls `take`, on Zenoh's thread, for each answer to a query; for none while the router is away."""
@@ -353,18 +353,18 @@ class Presence:
                     handler,
                     target=zenoh.QueryTarget.ALL,
                     consolidation=zenoh.ConsolidationMode.NONE,
-                    timeout=LOOK_S,
+                    timeout=QUERY_S,
                     cancellation_token=given_up,
                 )
 
-    def _looking_glass(self) -> zenoh.Session | None:
+    def _open_observer(self) -> zenoh.Session | None:
         """The session to look through: the daemon's own if it is the router, otherwise a client session beside it.
         None: there is no router."""
         settings = settings_of(self._config, self._limits)
         if mode_of(settings) == "router":
             return self._session
         try:
-            return open_client(beside(settings), CONNECT_S)
+            return open_client(to_observer(settings), CONNECT_S)
         except zenoh.ZError:
             return None
 
@@ -382,11 +382,11 @@ def _within(
             take(reply.ok)
 
     yield zenoh.handlers.Callback(receive, finished.set, indirect=False), given_up
-    finished.wait(LOOK_S + GRACE_S)
+    finished.wait(QUERY_S + GRACE_S)
     given_up.cancel()
 
 
-def told(vehicle: str, other: Claim) -> str:
+def rival_text(vehicle: str, other: Claim) -> str:
     """A sentence for people that says which daemon has the vehicle."""
     since = datetime.fromtimestamp(other.since_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     does = "is served" if other.serving else "is about to be served"

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from coec.adapters.system.listening import Address, Transport, addresses_of_port
+from coec.adapters.system.listening import IpAddress, Transport, listening_addresses
 from coec.adapters.zenoh.endpoints import WITH_PORT, Endpoint, redacted
 from coec.adapters.zenoh.settings import connected_of, finds_peers, listened_of
 
@@ -17,7 +17,7 @@ class Reach:
     """Reach of a session with these settings."""
 
     def __init__(
-        self, settings: zenoh.Config, addresses: Callable[[Transport, int], set[Address]] = addresses_of_port
+        self, settings: zenoh.Config, addresses: Callable[[Transport, int], set[IpAddress]] = listening_addresses
     ) -> None:
         """`addresses(protocol, port)` returns the addresses of this computer at which somebody listens on a port.
 
@@ -29,7 +29,7 @@ class Reach:
         self._finds_peers = finds_peers(settings)
         self._addresses = addresses
 
-    def outside(self) -> str | None:
+    def exposure(self) -> str | None:
         """A clause that says why programs on other computers may reach the session; None: as far as this computer can
         tell they cannot. Examined anew at each call, because a router may be started or stopped at any time."""
         if self._finds_peers:
@@ -49,8 +49,8 @@ class Reach:
         protocol: Transport = "udp" if router.protocol in OVER_UDP else "tcp"
         port = router.port
         try:
-            found = self._addresses(protocol, port)
+            addresses = self._addresses(protocol, port)
         except OSError:
             return "this system does not show where its router listens"
-        wide = sorted(str(address) for address in found if not address.is_loopback)
+        wide = sorted(str(address) for address in addresses if not address.is_loopback)
         return f"its router's port {port} is open at {wide[0]}, too" if wide else None

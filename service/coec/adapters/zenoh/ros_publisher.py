@@ -14,7 +14,7 @@ from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, decla
 
 from coec.adapters.ros.wire.dialect import Dialect
 from coec.adapters.ros.wire.qos import Qos
-from coec.adapters.zenoh.matching import is_heard
+from coec.adapters.zenoh.matching import has_subscribers
 
 _log = logging.getLogger(__name__)
 
@@ -68,9 +68,9 @@ class RosPublisher:
         return str(self._publisher.key_expr)
 
     @property
-    def is_heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """Whether somebody subscribes now; always True for a publisher that keeps messages for late subscribers."""
-        return not isinstance(self._publisher, zenoh.Publisher) or is_heard(self._publisher)
+        return not isinstance(self._publisher, zenoh.Publisher) or has_subscribers(self._publisher)
 
     def put(self, payload: bytes, source_ns: int) -> None:
         """Publish a message in CDR; `source_ns` is the wall clock at which it was made. It is silently lost while there

@@ -9,9 +9,9 @@ import zenoh
 from coec.adapters.ros import messages
 from coec.adapters.ros.dialects import dialect_of
 from coec.adapters.ros.wire.qos import SENSOR_DATA, STATIC_LISTENER, Qos
-from coec.adapters.zenoh.inputs import Input, input_of
+from coec.adapters.zenoh.inputs import StreamInput, input_of
 from coec.adapters.zenoh.ros_publisher import RosNode
-from coec.adapters.zenoh.ros_topics import RosTopics, Topics
+from coec.adapters.zenoh.ros_topics import RosTopicList, RosTopicMonitor
 from coec.config import AnyStreamConfig, Config, StreamConfig
 from coec.schemas.ros_names import TF_STATIC
 
@@ -28,31 +28,31 @@ class RosSide:
         dialect = dialect_of(config, str(session.info.zid()))
         self._config = config
         self.node = None if dialect is None else RosNode(session, dialect)
-        self._topics = None if dialect is None else RosTopics(session, config)
+        self._topics = None if dialect is None else RosTopicMonitor(session, config)
 
-    def input_of(self, stream: AnyStreamConfig) -> Input:
+    def input_of(self, stream: AnyStreamConfig) -> StreamInput:
         """How to listen to a stream, with the token that shows the subscription to ROS nodes and tools."""
         return self._announced(input_of(stream, self._config), stream.topic, stream.assumed_type, SENSOR_DATA)
 
-    def input_of_info(self, topic: str) -> Input:
+    def input_of_info(self, topic: str) -> StreamInput:
         """The same for a `CameraInfo` topic."""
         return self._announced(self._of_topic(topic), topic, messages.CAMERA_INFO, SENSOR_DATA)
 
-    def input_of_static_transforms(self) -> Input:
+    def input_of_static_transforms(self) -> StreamInput:
         """The same for `/tf_static`."""
         return self._announced(self._of_topic(TF_STATIC), TF_STATIC, messages.TF, STATIC_LISTENER)
 
-    def _of_topic(self, topic: str) -> Input:
+    def _of_topic(self, topic: str) -> StreamInput:
         return input_of(StreamConfig(topic=topic), self._config)
 
-    def _announced(self, plain: Input, topic: str | None, type_name: str, qos: Qos) -> Input:
+    def _announced(self, plain: StreamInput, topic: str | None, type_name: str, qos: Qos) -> StreamInput:
         if self.node is None or topic is None:
             return plain
         return replace(plain, token=self.node.dialect.subscriber_token(self.node.number(), topic, type_name, qos))
 
-    def topics(self) -> Topics:
+    def topics(self) -> RosTopicList:
         """What is published now. May be called from any thread."""
-        return Topics() if self._topics is None else self._topics.now()
+        return RosTopicList() if self._topics is None else self._topics.now()
 
     def close(self) -> None:
         """Withdraw the node and stop following the publishers."""

@@ -18,7 +18,7 @@ from coec.adapters.ros.wire import rmw_zenoh, ros2dds
 from coec.adapters.ros.wire.publisher import Publisher
 from coec.config import Config
 
-_log = logging.getLogger(__name__)
+_topic_log = logging.getLogger(__name__)
 
 MAX_PUBLISHERS = 4096
 """Most publishers that are kept, 2 MB: twenty times those of a large vehicle."""
@@ -31,7 +31,7 @@ SHOWN = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Topics:
+class RosTopicList:
     """Publishers at one moment.
 
     Attributes:
@@ -47,15 +47,15 @@ class Topics:
 
     def types(self) -> dict[str, tuple[str, ...]]:
         """The types of each topic; topics and types are sorted by name."""
-        found: dict[str, set[str]] = {}
+        types_by_topic: dict[str, set[str]] = {}
         for one in self.publishers:
-            found.setdefault(one.topic, set()).add(one.type_name)
-        return {topic: tuple(sorted(found[topic])) for topic in sorted(found)}
+            types_by_topic.setdefault(one.topic, set()).add(one.type_name)
+        return {topic: tuple(sorted(types_by_topic[topic])) for topic in sorted(types_by_topic)}
 
     def nodes_of(self, gids: Iterable[bytes]) -> tuple[str, ...]:
         """Names of the nodes whose publishers have these ids, as far as known."""
-        wanted = frozenset(gids)
-        return tuple(sorted({one.node for one in self.publishers if one.node and one.gid in wanted}))
+        requested = frozenset(gids)
+        return tuple(sorted({one.node for one in self.publishers if one.node and one.gid in requested}))
 
     def absent(self, topic: str, types: Collection[str]) -> str | None:
         """None if somebody publishes the topic; otherwise a sentence that lists the topics of these types instead."""
@@ -75,7 +75,7 @@ def listed(names: Collection[str]) -> str:
     return shown if len(names) <= SHOWN else f"{shown} and {len(names) - SHOWN} more"
 
 
-class RosTopics:
+class RosTopicMonitor:
     """Follows the tokens of publishers, except those of coec services. `now` may be called from any thread."""
 
     def __init__(self, session: zenoh.Session, config: Config) -> None:
@@ -84,17 +84,17 @@ class RosTopics:
         self._publishers: dict[str, Publisher] = {}
         self._left_out: Counter[str] = Counter()
         self._changed = True
-        self._now = Topics()
+        self._now = RosTopicList()
         tokens, self._read = _tokens_of(config)
         self._subscriber: zenoh.Subscriber[None] | None = session.liveliness().declare_subscriber(
             tokens, zenoh.handlers.Callback(self._receive, indirect=False), history=True
         )
 
-    def now(self) -> Topics:
+    def now(self) -> RosTopicList:
         """The publishers that exist now."""
         with self._lock:
             if self._changed:
-                self._now = Topics(tuple(self._publishers.values()), self._left_out.copy())
+                self._now = RosTopicList(tuple(self._publishers.values()), self._left_out.copy())
                 self._changed = False
             return self._now
 
@@ -108,7 +108,7 @@ class RosTopics:
         try:
             self._take(str(sample.key_expr), there=sample.kind == zenoh.SampleKind.PUT)
         except Exception:
-            _log.exception("a liveliness token could not be read")
+            _topic_log.exception("a liveliness token could not be read")
 
     def _take(self, token: str, *, there: bool) -> None:
         publisher = self._read(token) if there else None
@@ -130,5 +130,5 @@ class RosTopics:
 def _tokens_of(config: Config) -> tuple[str, Callable[[str], Publisher | None]]:
     """The key expression of publishers' tokens, and the function that reads one."""
     if config.middleware == "ros2dds":
-        return ros2dds.PUBLISHER_TOKENS, lambda token: ros2dds.publisher_of(token, config.ros.namespace)
-    return rmw_zenoh.publisher_tokens(config.ros.domain), rmw_zenoh.publisher_of
+        return ros2dds.PUBLISHER_TOKENS, lambda token: ros2dds.bridge_publisher(token, config.ros.namespace)
+    return rmw_zenoh.publisher_tokens(config.ros.domain), rmw_zenoh.rmw_publisher

@@ -11,7 +11,7 @@ import zenoh
 
 from coec.adapters.zenoh.endpoints import CERTIFIED, Endpoint, redacted, without_secrets
 from coec.adapters.zenoh.settings_file import TLS, read_settings
-from coec.adapters.zenoh.tls import Role, check_material, material_of
+from coec.adapters.zenoh.tls import Role, check_tls_files, tls_files
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
 
@@ -74,11 +74,11 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
         # ends (Zenoh 1.10). Without it a frame is copied once more, which takes a hundredth of a core at 35 MB/s.
         settings.insert_json5("transport/shared_memory/enabled", "false")
     except (zenoh.ZError, ValueError) as error:
-        raise ConfigError(f"{where(config)}: {without_secrets(str(error), endpoints_of(config))}") from None
+        raise ConfigError(f"{settings_source(config)}: {without_secrets(str(error), endpoints_of(config))}") from None
     doors = unguarded(settings)
     if doors and not config.insecure:
         raise ConfigError(
-            f"{where(config)}: whoever reaches {', '.join(doors)} would be let in, to read, to send frames and to give "
+            f"{settings_source(config)}: whoever reaches {', '.join(doors)} would be let in, to read, to send frames and to give "
             "commands: listen on loopback, or on tls with enable_mtls and a root_ca_certificate; or set "
             "`zenoh.insecure: true`, and health will say so"
         )
@@ -99,7 +99,7 @@ def check_certificates(settings: zenoh.Config, place: str) -> None:
     for role, endpoints in roles:
         for endpoint in map(Endpoint.parse, endpoints):
             if endpoint.protocol in CERTIFIED:
-                check_material(material_of(settings, endpoint, role), f"{place}, {TLS}")
+                check_tls_files(tls_files(settings, endpoint, role), f"{place}, {TLS}")
 
 
 def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
@@ -108,15 +108,15 @@ def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
     Raises:
         ConfigError: one of them is malformed.
     """
-    certificates_asked = bool(json.loads(settings.get_json(TLS)).get("enable_mtls"))
+    certificates_required = bool(json.loads(settings.get_json(TLS)).get("enable_mtls"))
     return tuple(
         redacted(endpoint)
         for endpoint in listened_of(settings)
-        if Endpoint.parse(endpoint).lets_in_whoever_comes(certificates_asked=certificates_asked)
+        if Endpoint.parse(endpoint).admits_anyone(certificates_required=certificates_required)
     )
 
 
-def beside(settings: zenoh.Config) -> zenoh.Config:
+def to_observer(settings: zenoh.Config) -> zenoh.Config:
     """Changes a session's settings, in place, into those of a client beside it, which sees what the router gives to
     others."""
     own = {
@@ -130,7 +130,7 @@ def beside(settings: zenoh.Config) -> zenoh.Config:
     return settings
 
 
-def second(settings: zenoh.Config) -> zenoh.Config:
+def to_second_session(settings: zenoh.Config) -> zenoh.Config:
     """Changes a session's settings, in place, into those of a session of the same kind that may run at the same time:
     with an id of its own, and listening at free ports of the same addresses."""
     ports = re.compile(r":\d+(?=$|[?#])")
@@ -171,7 +171,7 @@ def endpoints_of(config: ZenohConfig) -> tuple[str, ...]:
     return (*config.listen, *config.connect)
 
 
-def where(config: ZenohConfig) -> str:
+def settings_source(config: ZenohConfig) -> str:
     """The part of the configuration that an error message is about."""
     if config.file:
         return f"zenoh.file {config.file}"
@@ -195,5 +195,5 @@ def _new_id() -> str:
 def _of_mode(value: Any, mode: str) -> tuple[str, ...]:
     """The endpoints of a mode. `value` is a list of endpoints, or holds one such list per mode; within the list,
     `locators` of an object are several endpoints."""
-    found = value.get(mode, []) if isinstance(value, dict) else value
-    return tuple(one for item in found or [] for one in ([item] if isinstance(item, str) else item["locators"]))
+    configured = value.get(mode, []) if isinstance(value, dict) else value
+    return tuple(one for item in configured or [] for one in ([item] if isinstance(item, str) else item["locators"]))

@@ -14,7 +14,7 @@ from coec.errors import ConfigError, cannot_read
 
 TLS = "transport/link/tls"
 
-MAX_BYTES = 2**20
+MAX_SETTINGS_BYTES = 2**20
 """Largest file; the shipped rules of a router have 8 kB."""
 
 MAX_BRACKETS = 10_000
@@ -34,16 +34,16 @@ def read_settings(path: Path) -> zenoh.Config:
     """
     try:
         with path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
+            data = stream.read(MAX_SETTINGS_BYTES + 1)
         text = data.decode("utf-8")
     except OSError as error:
         raise ConfigError(cannot_read(path, error)) from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path} is no text in UTF-8") from None
     brackets = text.count("{") + text.count("[")
-    if len(data) > MAX_BYTES or brackets > MAX_BRACKETS:
+    if len(data) > MAX_SETTINGS_BYTES or brackets > MAX_BRACKETS:
         raise ConfigError(
-            f"{path} is no configuration of Zenoh: it has more than {MAX_BYTES} bytes, or {MAX_BRACKETS} brackets"
+            f"{path} is no configuration of Zenoh: it has more than {MAX_SETTINGS_BYTES} bytes, or {MAX_BRACKETS} brackets"
         )
     try:
         return zenoh.Config.from_json5(text)

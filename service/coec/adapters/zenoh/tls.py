@@ -23,13 +23,13 @@ X509_V_FLAG_NO_CHECK_TIME = 0x200000
 Role = Literal["connect", "listen"]
 """Which end of a link an endpoint is."""
 
-HEARD_OUT_S = 0.5
+REFUSAL_WAIT_S = 0.5
 """How long to listen after the handshake, s: in TLS 1.3 the other end refuses a certificate only after it, if at
 all."""
 
 
 @dataclass(frozen=True, slots=True)
-class Material:
+class TlsFiles:
     """Files with which one end of a link identifies itself and checks the other end; None for a file that is not
     set."""
 
@@ -59,18 +59,18 @@ class CertificateError(Exception):
     """A certificate cannot be used; says why."""
 
 
-def material_of(settings: zenoh.Config, endpoint: Endpoint, role: Role) -> Material:
+def tls_files(settings: zenoh.Config, endpoint: Endpoint, role: Role) -> TlsFiles:
     """The files for an endpoint to connect to or listen on. What the endpoint sets itself overrides the common TLS
     settings."""
     of_all: Mapping[str, Any] = json.loads(settings.get_json(TLS))
     own = dict(item.partition("=")[::2] for item in endpoint.settings.split(";") if item)
 
     def file(name: str) -> Path | None:
-        told = own.get(f"{name}_file") or of_all.get(name)
-        return Path(told) if told else None
+        value = own.get(f"{name}_file") or of_all.get(name)
+        return Path(value) if value else None
 
     checked = own.get("verify_name_on_connect", of_all.get("verify_name_on_connect"))
-    return Material(
+    return TlsFiles(
         file("root_ca_certificate"),
         file(f"{role}_certificate"),
         file(f"{role}_private_key"),
@@ -78,7 +78,7 @@ def material_of(settings: zenoh.Config, endpoint: Endpoint, role: Role) -> Mater
     )
 
 
-def check_material(material: Material, where: str) -> None:
+def check_tls_files(material: TlsFiles, where: str) -> None:
     """Checks that this process can read the files of one end of a link, and that the key belongs to the certificate.
     Validity periods are left to Zenoh: at a start the clock may not be set yet.
 
@@ -93,12 +93,12 @@ def check_material(material: Material, where: str) -> None:
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(material.certificate, material.key, password="")
     except (OSError, ValueError) as error:
-        why = _words(error) if isinstance(error, ssl.SSLError) else str(error)
+        why = _reason_text(error) if isinstance(error, ssl.SSLError) else str(error)
         both = f"{material.certificate} and {material.key}"
         raise ConfigError(f"{where}: {both} are no certificate and its unencrypted key in PEM: {why}") from None
 
 
-def read_certificate(material: Material, role: Role) -> Certificate:
+def read_certificate(material: TlsFiles, role: Role) -> Certificate:
     """The certificate of the material, which must be signed by its authority and fit its key. The caller has to check
     whether it has expired.
 
@@ -120,7 +120,7 @@ def read_certificate(material: Material, role: Role) -> Certificate:
         if material.authority is not None:
             checks.load_verify_locations(material.authority)
     except ssl.SSLError as error:
-        raise CertificateError(f"certificate and key cannot be used: {_words(error)}") from error
+        raise CertificateError(f"certificate and key cannot be used: {_reason_text(error)}") from error
     except OSError as error:
         files = ", ".join(str(path) for path in (material.certificate, material.key, material.authority) if path)
         raise CertificateError(f"one of {files} cannot be read: {error.strerror}") from error
@@ -129,11 +129,11 @@ def read_certificate(material: Material, role: Role) -> Certificate:
     except ssl.SSLCertVerificationError as error:
         raise CertificateError(error.verify_message) from error
     except ssl.SSLError as error:
-        raise CertificateError(_words(error)) from error
+        raise CertificateError(_reason_text(error)) from error
     return _certificate(seen)
 
 
-def shake_hands(endpoint: Endpoint, material: Material, timeout_s: float) -> Certificate:
+def shake_hands(endpoint: Endpoint, material: TlsFiles, timeout_s: float) -> Certificate:
     """The certificate of the server at an endpoint, after both ends have accepted each other's.
 
     Raises:
@@ -153,7 +153,7 @@ def shake_hands(endpoint: Endpoint, material: Material, timeout_s: float) -> Cer
             context.wrap_socket(link, server_hostname=host) as tls,
         ):
             seen = tls.getpeercert() or {}
-            tls.settimeout(HEARD_OUT_S)
+            tls.settimeout(REFUSAL_WAIT_S)
             with suppress(TimeoutError):
                 tls.recv(1)
             return _certificate(seen)
@@ -170,13 +170,13 @@ def host_and_port(endpoint: Endpoint) -> tuple[str, int]:
 
 
 def _alert(error: ssl.SSLError) -> str:
-    reason = _words(error)
+    reason = _reason_text(error)
     if "alert" in reason:
         return f"the other end refuses: {reason.rpartition('alert ')[2]}"
     return f"no TLS connection comes about: {reason}"
 
 
-def _words(error: ssl.SSLError) -> str:
+def _reason_text(error: ssl.SSLError) -> str:
     """OpenSSL's reason in plain words."""
     return (error.reason or str(error)).lower().replace("_", " ")
 

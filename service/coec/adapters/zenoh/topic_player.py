@@ -30,7 +30,7 @@ TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,127}/msg/[A-Za-z][A-Za-z0-9]{0
 
 _TOPIC: Final = TypeAdapter[str](TopicName)
 
-LOOK_AGAIN_S: Final = 0.05
+MATCHING_POLL_S: Final = 0.05
 """Pause between two looks for subscribers."""
 
 
@@ -67,23 +67,23 @@ class TopicPlayer:
     def wait_for_listener(self, topics: Iterable[str], timeout_s: float, stop: threading.Event) -> list[str]:
         """Wait until each of these topics has a subscriber, at most `timeout_s`. Returns the topics that still have
         none."""
-        awaited = list(topics)
+        pending = list(topics)
         deadline_s = time.monotonic() + timeout_s
         while True:
-            deaf = [topic for topic in awaited if not self._publishers[topic].is_heard]
-            if not deaf or time.monotonic() > deadline_s or stop.wait(LOOK_AGAIN_S):
-                return deaf
+            unmatched = [topic for topic in pending if not self._publishers[topic].has_subscribers]
+            if not unmatched or time.monotonic() > deadline_s or stop.wait(MATCHING_POLL_S):
+                return unmatched
 
     def play(
         self,
         items: Iterable[TopicMessage],
         rate: float,
         stop: threading.Event,
-        heard: Callable[[TopicMessage, Played], None],
+        on_sent: Callable[[TopicMessage, Played], None],
     ) -> Played:
         """Publishes every message on one of the player's topics when it is due, see `paced`; others are left out."""
         ours = (message for message in items if message.topic in self._publishers)
-        return paced(ours, rate, stop, self._send, heard, Played(Counter()))
+        return paced(ours, rate, stop, self._send, on_sent, Played(Counter()))
 
     def close(self) -> None:
         """Withdraws tokens and publishers."""

@@ -19,7 +19,7 @@ import zenoh
 
 from coec.adapters.files import durable
 from coec.adapters.files.output import require_absent
-from coec.adapters.zenoh.client import ask_one
+from coec.adapters.zenoh.client import query_one
 from coec.errors import CoecError, NotFoundError, OutputError, RemoteError
 from coec.schemas.base import from_json
 from coec.schemas.keys import Keys
@@ -40,7 +40,7 @@ DIGEST_POLL_S: Final = 0.2
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 """Pause before a piece is asked for again, doubled each time up to the longest."""
 
-WAITS: Final = frozenset({"uplink_busy", "busy", "timeout"})
+RETRIED_CODES: Final = frozenset({"uplink_busy", "busy", "timeout"})
 """Reply codes after which it makes sense to send the same query again."""
 
 SHA256: Final = re.compile(r"[0-9a-f]{64}")
@@ -50,10 +50,10 @@ BLOCK_BYTES: Final = 2**20
 """Bytes of the part that is already there to read and hash at a time."""
 
 
-Recording = WindowInfo | SnippetInfo
+RecordingInfo = WindowInfo | SnippetInfo
 
 
-class NoRoomError(CoecError):
+class NoSpaceError(CoecError):
     """The disk has no room for a window that is to be fetched."""
 
     reply_code = "no_room"
@@ -67,11 +67,11 @@ def fetch_window(
     path: Path,
     timeout_s: float,
     patience_s: float,
-    heard: Callable[[int, int], None],
+    on_progress: Callable[[int, int], None],
     max_bytes: int = MAX_WINDOW_BYTES,
     *,
     replaces: bool = True,
-) -> Recording:
+) -> RecordingInfo:
     """Fetches a window or snippet into a file, which gets its final name only if its sha256 is right.
 
     If the service rewrites the window meanwhile (because its result came), it is fetched once more. A file that is
@@ -99,13 +99,13 @@ def fetch_window(
             text = f"window {window_id} is said to have {info.size_bytes} bytes, and {max_bytes} may be fetched"
             raise RemoteError("too_large", f"{text}: nothing of it was")
         try:
-            if _is_there(path, info):
-                heard(info.size_bytes, info.size_bytes)
+            if _is_complete(path, info):
+                on_progress(info.size_bytes, info.size_bytes)
                 return info
             require_absent(path, force=replaces)
             part = path.with_name(f"{path.name}.{info.sha256[:16]}.part")
-            _require_room(part, info, window_id)
-            if _whole(session, keys.window(pair, window_id), info, part, timeout_s, patience_s, heard):
+            _require_space(part, info, window_id)
+            if _complete(session, keys.window(pair, window_id), info, part, timeout_s, patience_s, on_progress):
                 part.replace(path)
                 return info
             part.unlink()
@@ -118,14 +118,14 @@ def fetch_window(
     raise RemoteError("checksum", f"the bytes of window {window_id} do not have the sha256 of the list; try again")
 
 
-def _whole(
+def _complete(
     session: zenoh.Session,
     key: str,
-    info: Recording,
+    info: RecordingInfo,
     part: Path,
     timeout_s: float,
     patience_s: float,
-    heard: Callable[[int, int], None],
+    on_progress: Callable[[int, int], None],
 ) -> bool:
     """Completes the part that is there; False if the result does not have the promised hash."""
     with os.fdopen(durable.reopen(part), "a+b") as file:
@@ -136,25 +136,25 @@ def _whole(
         while block := file.read(BLOCK_BYTES):
             digest.update(block)
             done += len(block)
-        heard(done, info.size_bytes)
+        on_progress(done, info.size_bytes)
         while done < info.size_bytes:
-            wanted = min(PIECE_BYTES, info.size_bytes - done)
-            piece = _piece(session, f"{key}?offset={done};length={wanted}", timeout_s, patience_s)
-            if len(piece) != wanted:
+            length = min(PIECE_BYTES, info.size_bytes - done)
+            piece = _piece(session, f"{key}?offset={done};length={length}", timeout_s, patience_s)
+            if len(piece) != length:
                 return False
             file.write(piece)
             digest.update(piece)
             done += len(piece)
-            heard(done, info.size_bytes)
+            on_progress(done, info.size_bytes)
     return digest.hexdigest() == info.sha256
 
 
-def _require_room(part: Path, info: Recording, window_id: str) -> None:
+def _require_space(part: Path, info: RecordingInfo, window_id: str) -> None:
     part.parent.mkdir(parents=True, exist_ok=True)
     missing = info.size_bytes - (part.stat().st_size if part.exists() else 0)
     free = shutil.disk_usage(part.parent).free
     if missing + SPARE_BYTES > free:
-        raise NoRoomError(
+        raise NoSpaceError(
             f"no room for window {window_id} in {part.parent}: {missing} bytes are to be fetched, {free} are free, and "
             f"{SPARE_BYTES} of these stay free; make room, or name another place with --output"
         )
@@ -164,23 +164,23 @@ def _piece(session: zenoh.Session, selector: str, timeout_s: float, patience_s: 
     deadline_s, pause_s = time.monotonic() + patience_s, FIRST_PAUSE_S
     while True:
         try:
-            return ask_one(session, selector, timeout_s).payload
+            return query_one(session, selector, timeout_s).payload
         except CoecError as error:
-            again = isinstance(error, NotFoundError) or error.reply_code in WAITS
+            again = isinstance(error, NotFoundError) or error.reply_code in RETRIED_CODES
             if not again or time.monotonic() + pause_s > deadline_s:
                 raise
         time.sleep(pause_s)
         pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
 
 
-def _is_there(path: Path, info: Recording) -> bool:
+def _is_complete(path: Path, info: RecordingInfo) -> bool:
     if not path.is_file() or path.stat().st_size != info.size_bytes:
         return False
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest() == info.sha256
 
 
-def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> Recording:
+def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> RecordingInfo:
     """The entry of a window in the service's list, once the service has read the window and knows its hash."""
     deadline_s = time.monotonic() + timeout_s
     while (info := _info(session, keys, pair, window_id, timeout_s)).sha256 is None:
@@ -191,9 +191,9 @@ def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, tim
     return info
 
 
-def _info(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> Recording:
-    reply = from_json(WindowsReply, ask_one(session, f"{keys.windows(pair)}?format=json", timeout_s).payload)
-    recorded: dict[str, Recording] = {
+def _info(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> RecordingInfo:
+    reply = from_json(WindowsReply, query_one(session, f"{keys.windows(pair)}?format=json", timeout_s).payload)
+    recorded: dict[str, RecordingInfo] = {
         **{info.window_id: info for info in reply.windows},
         **{info.snippet_id: info for info in reply.snippets},
     }

@@ -14,18 +14,18 @@ from typing import Final, Literal
 import zenoh
 
 from coec.schemas.keys import Keys
-from coec.schemas.last_word import MAX_BYTES
+from coec.schemas.last_word import MAX_HEARTBEAT_BYTES
 
-WAITING: Final = 32_768
+MAX_WAITING: Final = 32_768
 """Most words that wait to be read, 1 kB each: enough for a fleet that answers all at once. Words beyond this are
 counted as lost, and repeated by their pairs within a period."""
 
-WAITING_BYTES: Final = 2**26
+MAX_WAITING_BYTES: Final = 2**26
 """Most bytes of all these words together, because a word may have 16 kB: twice what as many usual words have."""
 
 
 @dataclass(frozen=True, slots=True)
-class Came:
+class HeartbeatEvent:
     """One received thing: a word as it was published (`said`), a word from a query (`kept`), or a token. `at_s` is by
     the steady clock. The payload of a token is empty if the token was withdrawn."""
 
@@ -35,7 +35,7 @@ class Came:
     at_s: float
 
 
-class Words:
+class HeartbeatReceiver:
     """Last words of the vehicles that an expression names. Callbacks run on Zenoh's threads and do not wait."""
 
     def __init__(self, session: zenoh.Session, of_tokens: zenoh.Session, keys: Keys, timeout_s: float) -> None:
@@ -46,16 +46,16 @@ class Words:
         self._of_tokens = of_tokens
         self._keys = keys
         self._timeout_s = timeout_s
-        self._waiting: queue.Queue[Came] = queue.Queue(WAITING)
+        self._waiting: queue.Queue[HeartbeatEvent] = queue.Queue(MAX_WAITING)
         self._waiting_bytes = 0
         self._lock = threading.Lock()
         self._refused: Counter[str] = Counter()
-        self.told = threading.Event()
+        self.initial_query_done = threading.Event()
         """Set when everybody has answered the query at the beginning, or its time is up."""
 
-    def take(self) -> Iterator[Came]:
+    def pending(self) -> Iterator[HeartbeatEvent]:
         """The words and tokens that wait, at most `WAITING`."""
-        for _ in range(WAITING):
+        for _ in range(MAX_WAITING):
             try:
                 received = self._waiting.get_nowait()
             except queue.Empty:
@@ -70,7 +70,7 @@ class Words:
             refused, self._refused = self._refused, Counter()
         return refused
 
-    def ask(self, vehicle: str, pair: str) -> None:
+    def query(self, vehicle: str, pair: str) -> None:
         """Query the word of one pair from whoever has it; the answer comes as `kept`."""
         self._get(Keys(self._keys.prefix, vehicle).last(pair), threading.Event())
 
@@ -82,54 +82,54 @@ class Words:
     # --- inside -----------------------------------------------------------------------------------------------------
 
     @contextmanager
-    def listening(self) -> Iterator[None]:
+    def subscribed(self) -> Iterator[None]:
         """Inside the block: receive published words and tokens, and query once for earlier words."""
         with ExitStack() as stack:
-            said = zenoh.handlers.Callback(self._said, indirect=False)
-            stack.callback(self._session.declare_subscriber(self._keys.last("*"), said).undeclare)
-            token = zenoh.handlers.Callback(self._token, indirect=False)
+            on_published = zenoh.handlers.Callback(self._on_published, indirect=False)
+            stack.callback(self._session.declare_subscriber(self._keys.last("*"), on_published).undeclare)
+            token = zenoh.handlers.Callback(self._on_token, indirect=False)
             tokens = self._of_tokens.liveliness().declare_subscriber(self._keys.alive("*"), token, history=True)
             stack.callback(tokens.undeclare)
-            self._get(self._keys.last("*"), self.told)
+            self._get(self._keys.last("*"), self.initial_query_done)
             yield
 
     def _get(self, key: str, done: threading.Event) -> None:
-        handler = zenoh.handlers.Callback(self._kept, done.set, indirect=False)
+        handler = zenoh.handlers.Callback(self._on_reply, done.set, indirect=False)
         # Any other mode of consolidation keeps all words in Zenoh until the query ends. The roster takes the latest.
         of_all, none = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
         self._session.get(key, handler, target=of_all, consolidation=none, timeout=self._timeout_s)
 
-    def _said(self, sample: zenoh.Sample) -> None:
+    def _on_published(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
             self._put("said", str(sample.key_expr), sample.payload)
 
-    def _kept(self, reply: zenoh.Reply) -> None:
+    def _on_reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is not None:
             self._put("kept", str(reply.ok.key_expr), reply.ok.payload)
 
-    def _token(self, sample: zenoh.Sample) -> None:
+    def _on_token(self, sample: zenoh.Sample) -> None:
         there = b"\x01" if sample.kind == zenoh.SampleKind.PUT else b""
-        self._add(Came("token", str(sample.key_expr), there, time.monotonic()))
+        self._add(HeartbeatEvent("token", str(sample.key_expr), there, time.monotonic()))
 
     def _put(self, kind: Literal["said", "kept"], key: str, payload: zenoh.ZBytes) -> None:
-        if len(payload) > MAX_BYTES:
+        if len(payload) > MAX_HEARTBEAT_BYTES:
             self._refuse("word_too_large")
             return
         with self._lock:
-            is_full = self._waiting_bytes + len(payload) > WAITING_BYTES
+            is_full = self._waiting_bytes + len(payload) > MAX_WAITING_BYTES
         if is_full:
             self._refuse("too_many_at_once")
             return
-        self._add(Came(kind, key, payload.to_bytes(), time.monotonic()))
+        self._add(HeartbeatEvent(kind, key, payload.to_bytes(), time.monotonic()))
 
-    def _add(self, came: Came) -> None:
+    def _add(self, event: HeartbeatEvent) -> None:
         with self._lock:
-            self._waiting_bytes += len(came.payload)
+            self._waiting_bytes += len(event.payload)
         try:
-            self._waiting.put_nowait(came)
+            self._waiting.put_nowait(event)
         except queue.Full:
             with self._lock:
-                self._waiting_bytes -= len(came.payload)
+                self._waiting_bytes -= len(event.payload)
             self._refuse("too_many_at_once")
 
     def _refuse(self, cause: str) -> None:

@@ -186,7 +186,7 @@ class Baseline:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drift:
+class BaselineDrift:
     """Distance from the commissioned calibration: ξ (6,) and its standard deviation (6,), rad and m; NaN where not
     estimated."""
 
@@ -194,11 +194,11 @@ class Drift:
     sigma: NDArray[np.float64]
 
 
-def drift(T_camera_lidar: Matrix4, sigma: NDArray[np.float64], baseline: Baseline) -> Drift:
+def drift(T_camera_lidar: Matrix4, sigma: NDArray[np.float64], baseline: Baseline) -> BaselineDrift:
     """How far an estimate (4, 4) with standard deviations (6,) lies from the commissioned calibration. The estimator's
     bias on the rig is removed, and the uncertainty of the bias is included."""
     value = se3.difference(T_camera_lidar, baseline.T_camera_lidar) - baseline.bias
-    return Drift(value, np.asarray(np.sqrt(sigma**2 + np.nan_to_num(baseline.bias_sigma) ** 2)))
+    return BaselineDrift(value, np.asarray(np.sqrt(sigma**2 + np.nan_to_num(baseline.bias_sigma) ** 2)))
 
 
 def mismatch(baseline: Baseline, rig: Rig, depth_identity: str, config_hash: str) -> str | None:

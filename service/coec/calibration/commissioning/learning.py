@@ -30,10 +30,10 @@ from coec.calibration.commissioning.baseline import (
 from coec.calibration.commissioning.equation_2 import PaperLimits, beyond
 from coec.calibration.commissioning.quantiles import chi2_quantile, distance2_quantile, normal_quantile
 from coec.calibration.commissioning.verdict_limits import verdict_limits
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.monitor.check import Check, CheckInput, Expected, check_at, gather
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, Opinion, edges_per_pair, opinion
-from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
+from coec.calibration.monitor.depth_witness import DepthCue, depth_cue
 from coec.calibration.monitor.neighbourhood import POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence, Step, Steps, run_to_end
@@ -131,7 +131,7 @@ def commission(
         CalibrationError: too few pairs, or the windows contradict the reference: nothing is learned from a rig whose
             extrinsic is wrong.
     """
-    heard = progress or Silence()
+    listener = progress or Silence()
     steps = commission_in_steps(
         windows,
         depth,
@@ -140,9 +140,9 @@ def commission(
         sensors=sensors,
         reference=reference,
         false_alarm_rate=false_alarm_rate,
-        progress=heard,
+        progress=listener,
     )
-    return run_to_end(steps, heard)
+    return run_to_end(steps, listener)
 
 
 def commission_in_steps(
@@ -171,7 +171,9 @@ def commission_in_steps(
         with suppress(DecodeError):  # whoever needs the depth reports that there is none
             depth.infer(pair.camera)
         yield Step("depth", number, len(whole.pairs))
-    window_data = sight_of(replace(whole, T_camera_lidar_start=right), depth, images, config, progress or Silence())
+    window_data = prepare_window_data(
+        replace(whole, T_camera_lidar_start=right), depth, images, config, progress or Silence()
+    )
     yield Step("edges", 1, 2)
     evidence = gather(window_data, FAR_RAD)
     yield Step("edges", 2, 2)
@@ -281,8 +283,8 @@ def _halves(count: int) -> list[list[int]]:
     """
     blocks = np.array_split(np.arange(count), min(count, BLOCKS))
     rng = np.random.default_rng([SEED, count])
-    drawn = (rng.permutation(len(blocks))[: (len(blocks) + 1) // 2] for _ in range(HALVES))
-    return [[int(index) for block in sorted(half) for index in blocks[block]] for half in drawn]
+    selections = (rng.permutation(len(blocks))[: (len(blocks) + 1) // 2] for _ in range(HALVES))
+    return [[int(index) for block in sorted(half) for index in blocks[block]] for half in selections]
 
 
 def _known_by(count: int) -> int:
@@ -307,10 +309,10 @@ def _accuracy(
     is that of the streets that were driven; on other streets it differs by a share of a pixel (`pixels`, (6,)).
     """
     known_by = _known_by(count)
-    apart = np.abs(of_halves - whole)
+    deviation = np.abs(of_halves - whole)
     # A single check that ended in another basin must not make the spread of the rig look huge.
-    apart = np.minimum(apart, OUTLIER * np.median(apart, axis=0) + FLOOR)
-    variance = (apart**2 / share[:, None]).mean(axis=0)
+    deviation = np.minimum(deviation, OUTLIER * np.median(deviation, axis=0) + FLOOR)
+    variance = (deviation**2 / share[:, None]).mean(axis=0)
     spread = np.sqrt((PRIOR_BLOCKS * prior**2 + (known_by - PRIOR_BLOCKS) * variance) / known_by)
     return Accuracy(bias=whole, bias_sigma=np.sqrt(spread**2 / count + pixels**2), spread=spread)
 
@@ -330,7 +332,7 @@ class _LeftOut:
     squared, over rotations and on the farthest axis of the pose, as in `Accuracy`."""
 
     seen: Check
-    depth: DepthWitness
+    depth: DepthCue
     distance2_rotation: float
     farthest2_pose: float
 
@@ -381,25 +383,25 @@ class _Checks:
             checks = yield from self._moved(0.0, 0.0, name, count)
             return [self._against(part, seen, rotation, pose) for part, seen in checks]
         rng = np.random.default_rng([SEED, pairs])
-        found: list[_LeftOut] = []
+        results: list[_LeftOut] = []
         for fold, block in enumerate(blocks):
             rest = [index for other in blocks if other is not block for index in other]
-            told = check_at(self._evidence.of(rest), self._right)
-            of_rotation = replace(rotation, bias=told.offset_rotation + 0.0 * rotation.bias)
-            of_pose = replace(pose, bias=told.offset_pose)
+            of_rest = check_at(self._evidence.of(rest), self._right)
+            of_rotation = replace(rotation, bias=of_rest.offset_rotation + 0.0 * rotation.bias)
+            of_pose = replace(pose, bias=of_rest.offset_pose)
             size = min(CHECK_PAIRS, len(block))
-            while len(found) * FOLDS < count * (fold + 1):
+            while len(results) * FOLDS < count * (fold + 1):
                 first = int(rng.integers(0, len(block) - size + 1))
                 part = self._evidence.of(block[first : first + size])
                 seen = check_at(part, self._right, Expected(of_rotation.expected, of_pose.expected))
-                found.append(self._against(part, seen, of_rotation, of_pose))
-                yield Step(name, len(found), count)
-        return found
+                results.append(self._against(part, seen, of_rotation, of_pose))
+                yield Step(name, len(results), count)
+        return results
 
     def _against(self, part: CheckInput, seen: Check, rotation: Accuracy, pose: Accuracy) -> _LeftOut:
         return _LeftOut(
             seen,
-            ask_depth(part, seen, self._right, self._config),
+            depth_cue(part, seen, self._right, self._config),
             rotation.distance2(seen.offset_rotation, seen.pairs),
             pose.farthest2(seen.offset_pose, seen.pairs),
         )

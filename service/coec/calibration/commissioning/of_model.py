@@ -19,7 +19,7 @@ MIN_VEHICLES = 3
 """Fewer vehicles do not show how vehicles of the model differ."""
 
 
-def of_model(baselines: Sequence[Baseline]) -> Baseline:
+def model_baseline(baselines: Sequence[Baseline]) -> Baseline:
     """One baseline for all vehicles of a model. Their order does not matter.
 
     The estimator's bias is the mean over the vehicles; the bias of a further vehicle scatters about it as theirs do.
@@ -39,21 +39,21 @@ def of_model(baselines: Sequence[Baseline]) -> Baseline:
         raise CalibrationError(
             f"{len(baselines)} baselines: at least {MIN_VEHICLES} vehicles are needed to see how they differ"
         )
-    for what, found in (
+    for what, values in (
         ("pair", {one.pair for one in baselines}),
         ("number of degrees of freedom", {str(one.dof) for one in baselines}),
         ("depth network", {one.depth_identity for one in baselines}),
         ("configuration", {one.config_hash for one in baselines}),
     ):
-        if len(found) > 1:
-            raise CalibrationError(f"baselines of more than one {what}: {', '.join(sorted(found))}")
+        if len(values) > 1:
+            raise CalibrationError(f"baselines of more than one {what}: {', '.join(sorted(values))}")
     # Sorted by content, so that rounding does not depend on the order in which they were given.
     several = sorted(baselines, key=lambda one: one.T_camera_lidar.tobytes() + one.rotation.bias.tobytes())
     first = several[0]
-    apart = [se3.difference(one.T_camera_lidar, first.T_camera_lidar) for one in several]
+    offsets = [se3.difference(one.T_camera_lidar, first.T_camera_lidar) for one in several]
     return Baseline(
         pair=first.pair,
-        T_camera_lidar=se3.perturb(first.T_camera_lidar, _mean(apart)),
+        T_camera_lidar=se3.perturb(first.T_camera_lidar, _mean(offsets)),
         rotation=_accuracy([one.rotation for one in several]),
         pose=_accuracy([one.pose for one in several]),
         dof=first.dof,

@@ -36,7 +36,7 @@ OF_NOISE = ("sigma", "newton_step")
 """Figures that show how precise a result is, not whether it is the right one. Their limits depend on the use of the
 result, and stay as configured."""
 
-SEED = 20_230_617
+VERDICT_SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
 
@@ -56,25 +56,25 @@ def verdict_limits(
         right: (4, 4) the right extrinsic, around which the starts lie.
         expected: (4, 4) where the estimator puts it.
     """
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(VERDICT_SEED)
     near: list[Estimate] = []
     lost: list[Estimate] = []
     count = len(window.pairs)
     for number in range(1, 2 * SOLVES + 1):
         astray = number % 2 == 0
-        chosen = sorted(rng.permutation(count)[: max(count // 2, min(MIN_HALF, count))].tolist())
+        indices = sorted(rng.permutation(count)[: max(count // 2, min(MIN_HALF, count))].tolist())
         xi = np.zeros(6)
         xi[:3] = (LOST_RAD if astray else NEAR_RAD) * random_direction(rng)
         tried = replace(
-            window, T_camera_lidar_start=se3.perturb(right, xi), pairs=tuple(window.pairs[i] for i in chosen)
+            window, T_camera_lidar_start=se3.perturb(right, xi), pairs=tuple(window.pairs[i] for i in indices)
         )
         try:
             estimate = calibrate(tried, depth, images, _astray(config) if astray else config, Silence())
         except CalibrationError:
             pass
         else:
-            apart_rad = se3.rotation_angle_rad(estimate.optimum.T_camera_lidar @ se3.inverse(expected))
-            (near if apart_rad < RIGHT_RAD else lost).append(estimate)
+            error_rad = se3.rotation_angle_rad(estimate.optimum.T_camera_lidar @ se3.inverse(expected))
+            (near if error_rad < RIGHT_RAD else lost).append(estimate)
         yield Step("verdicts", number, 2 * SOLVES)
     return learned(near, lost) if near and lost else {}
 

@@ -22,7 +22,7 @@ LEAST_M2 = 1e-12
 """Least variance, m²: a centre is neither known nor measured to better than a thousandth of a millimetre."""
 
 
-def in_centre(certainty: float, off_m: float, known_m: float) -> float:
+def centre_weight(certainty: float, off_m: float, known_m: float) -> float:
     """The share by which a shift of the camera's centre counts that a window sees: 0 for no shift, 1 for one beyond
     doubt.
 
@@ -39,11 +39,11 @@ def in_centre(certainty: float, off_m: float, known_m: float) -> float:
         return 0.0
     measured = (off_m / (2.0 * certainty)) ** 2
     if_right = 1.0 - measured / max(known_m * known_m + measured, LEAST_M2)
-    is_wrong = in_doubt(certainty, CENTRE_EVEN) ** 2
+    is_wrong = posterior_weight(certainty, CENTRE_EVEN) ** 2
     return sqrt((1.0 - is_wrong) * if_right * if_right + is_wrong)
 
 
-def in_doubt(certainty: float, even: float) -> float:
+def posterior_weight(certainty: float, even: float) -> float:
     """The share by which the shift counts for an assumption that is either right or wrong: the root of the probability
     that it is wrong.
 

@@ -18,8 +18,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.grain import Grain
-from coec.calibration.objective.cells import SightLines
+from coec.calibration.confidence.grain import SensorResolution
+from coec.calibration.objective.cells import PointsInView
 from coec.geometry.linear import inverted
 from coec.geometry.thinning import thinned
 
@@ -39,7 +39,7 @@ STAMP_S = 1e-3 / sqrt(12.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Lines:
+class _Rays:
     """Sight lines, with all that the terms need.
 
     Attributes:
@@ -58,24 +58,26 @@ class _Lines:
     frame: NDArray[np.int64]
     axis_of_sweep: NDArray[np.float64]
 
-    def beside(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    def perpendicular(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) the part of a direction (3,) or (N, 3) that lies across each sight line."""
         along = np.sum(self.towards * direction, axis=1, keepdims=True)
         return np.asarray(direction - self.towards * along)
 
 
-Term = Callable[[_Lines, Grain], NDArray[np.float64]]
+Term = Callable[[_Rays, SensorResolution], NDArray[np.float64]]
 """The displacement (N, 3) of the sight lines by one standard deviation of an error, radians."""
 
 RIGHT, DOWN, FORWARD = np.eye(3)
 
 TERMS: MappingProxyType[str, Term] = MappingProxyType(
     {
-        "lens_across": lambda lines, grain: grain.lens_px * grain.pixel_rad * lines.beside(RIGHT),
-        "lens_down": lambda lines, grain: grain.lens_px * grain.pixel_rad * lines.beside(DOWN),
-        "lens_scale": lambda lines, grain: grain.lens_px * grain.pixel_rad * _of_mean_one(lines.beside(-FORWARD)),
-        "near_edges_across": lambda lines, grain: EDGE_PX * grain.pixel_rad * lines.near * lines.beside(RIGHT),
-        "near_edges_down": lambda lines, grain: EDGE_PX * grain.pixel_rad * lines.near * lines.beside(DOWN),
+        "lens_across": lambda lines, grain: grain.lens_px * grain.pixel_rad * lines.perpendicular(RIGHT),
+        "lens_down": lambda lines, grain: grain.lens_px * grain.pixel_rad * lines.perpendicular(DOWN),
+        "lens_scale": lambda lines, grain: (
+            grain.lens_px * grain.pixel_rad * _of_mean_one(lines.perpendicular(-FORWARD))
+        ),
+        "near_edges_across": lambda lines, grain: EDGE_PX * grain.pixel_rad * lines.near * lines.perpendicular(RIGHT),
+        "near_edges_down": lambda lines, grain: EDGE_PX * grain.pixel_rad * lines.near * lines.perpendicular(DOWN),
         "columns": lambda lines, grain: (
             COLUMN_SHARE * grain.column_rad * lines.near * np.cross(lines.axis_of_sweep, lines.towards)
         ),
@@ -89,20 +91,20 @@ HELD: MappingProxyType[int, str] = MappingProxyType({3: "held_across", 4: "held_
 """Names of further terms, one for each translation that was not searched, by its place in ξ."""
 
 
-def systematic(
-    sight: SightLines, grain: Grain, moved: tuple[int, ...], axis_of_sweep: NDArray[np.float64]
+def systematic_shifts(
+    points: PointsInView, resolution: SensorResolution, moved: tuple[int, ...], axis_of_sweep: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
     """By how much each term moves a pose, by name: (6,) radians and metres, zero on axes that were not `moved`. Empty
     if the points in view do not determine the pose.
 
     `axis_of_sweep` (3,) is the axis about which the LiDAR turns, camera frame.
     """
-    chosen = thinned(len(sight.p_camera), POINTS)
-    p_camera, weight = sight.p_camera[chosen], sight.weight[chosen]
+    indices = thinned(len(points.p_camera), POINTS)
+    p_camera, weight = points.p_camera[indices], points.weight[indices]
     range_m = np.sqrt(np.sum(p_camera * p_camera, axis=1))
     towards = p_camera / range_m[:, None]
     near = (range_m < np.median(range_m)).astype(np.float64)[:, None] if len(range_m) else np.zeros((0, 1))
-    lines = _Lines(towards, p_camera, range_m, near, sight.frame[chosen], axis_of_sweep)
+    lines = _Rays(towards, p_camera, range_m, near, points.frame[indices], axis_of_sweep)
     answers = np.stack([_answer(lines, axis) for axis in moved], axis=2)  # (N, 3, n)
     # Sums without a BLAS product are the same to the bit in every process.
     weighted = answers * weight[:, None, None]
@@ -112,10 +114,10 @@ def systematic(
         inverse = np.array(inverted(normal))
     except ValueError:
         return {}
-    displacements = {name: term(lines, grain) for name, term in TERMS.items()}
+    displacements = {name: term(lines, resolution) for name, term in TERMS.items()}
     for axis, name in HELD.items():
         if axis not in moved:
-            displacements[name] = grain.held_m * _answer(lines, axis)
+            displacements[name] = resolution.held_m * _answer(lines, axis)
     shifts = {}
     for name, displaced in displacements.items():
         right = np.array([float(np.sum(weighted[:, :, i] * displaced)) for i in each])
@@ -125,12 +127,12 @@ def systematic(
     return shifts
 
 
-def _answer(lines: _Lines, axis: int) -> NDArray[np.float64]:
+def _answer(lines: _Rays, axis: int) -> NDArray[np.float64]:
     """(N, 3) how the sight lines move with one axis of ξ, per radian or metre."""
     unit = np.eye(3)[axis % 3]
     if axis < 3:
         return np.asarray(np.cross(unit, lines.towards))
-    return lines.beside(unit) / lines.range_m[:, None]
+    return lines.perpendicular(unit) / lines.range_m[:, None]
 
 
 def _of_mean_one(displaced: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -139,8 +141,8 @@ def _of_mean_one(displaced: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(displaced / max(float(mean), 1e-12))
 
 
-def _passing(lines: _Lines, grain: Grain) -> NDArray[np.float64]:
+def _passing(lines: _Rays, resolution: SensorResolution) -> NDArray[np.float64]:
     """(N, 3) how fast the sight lines move as the vehicle passes, radians per second."""
     # Standing things move against the motion of the vehicle.
-    speed = grain.velocity_mps[lines.frame] + np.cross(grain.turn_radps[lines.frame], lines.p_camera)
-    return lines.beside(-speed) / lines.range_m[:, None]
+    speed = resolution.velocity_mps[lines.frame] + np.cross(resolution.turn_radps[lines.frame], lines.p_camera)
+    return lines.perpendicular(-speed) / lines.range_m[:, None]

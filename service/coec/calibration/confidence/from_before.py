@@ -11,27 +11,27 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coec.calibration.confidence.told import SHIFTS, SIZE, TURNS, levels_told
-from coec.calibration.confidence.ways import Ways, climbed
-from coec.calibration.search.observability import CentreKept
+from coec.calibration.confidence.told import SHIFTS, SIZE, TURNS, assumed_levels
+from coec.calibration.confidence.ways import ParameterSubset, local_ascent
+from coec.calibration.search.observability import FixedCentre
 from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
 from coec.geometry.edges.alignment import EdgeFrames
 
 
-def summit_from_before(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> Matrix4 | None:
+def mode_next_to_prior(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> Matrix4 | None:
     """The pose (4, 4) of the most significant alignment next to the camera's centre at the window's start. The climb
     begins with the rotation of `pose` (4, 4); it first turns only, then also shifts. None if the edges in view
     determine no pose.
 
     `edges` are those of the window, from coarser levels that lead there to the sharpest one.
     """
-    kept = CentreKept(tuple(SHIFTS), window.T_camera_lidar_start)(pose)
-    levels = levels_told(edges, window, kept)
+    start_pose = FixedCentre(tuple(SHIFTS), window.T_camera_lidar_start)(pose)
+    levels = assumed_levels(edges, window, start_pose)
     nothing, turns, every = np.zeros(SIZE), tuple(TURNS), (*TURNS, *SHIFTS)
     try:
-        turned = climbed(levels, Ways.of(levels[-1], nothing, turns, ()), nothing)
-        found = climbed(levels, Ways.of(levels[-1], turned, every, ()), turned)
+        turned = local_ascent(levels, ParameterSubset.of(levels[-1], nothing, turns, ()), nothing)
+        deviation = local_ascent(levels, ParameterSubset.of(levels[-1], turned, every, ()), turned)
     except ValueError:
         return None
-    return se3.perturb(kept, found[: SHIFTS.stop])
+    return se3.perturb(start_pose, deviation[: SHIFTS.stop])

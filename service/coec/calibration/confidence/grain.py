@@ -12,7 +12,7 @@ from coec.calibration.confidence.lens_limit import lens_error_px
 from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.geometry.cameras import pixel_rad
 from coec.geometry.edges.range_edges import NEIGHBOUR_RAD
-from coec.geometry.edges.scan_lines import BAND_RAD, telling
+from coec.geometry.edges.scan_lines import BAND_RAD, distinct_rings
 
 LENS_PX = 0.05
 """Error that a target-based calibration of a lens leaves in its principal point, and in its scale at the rim. It is
@@ -22,7 +22,7 @@ as wide as the error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grain:
+class SensorResolution:
     """The grain of one window.
 
     Attributes:
@@ -41,10 +41,10 @@ class Grain:
     held_m: float
 
 
-def grain_of(window: Window, T_camera_lidar: Matrix4, held_m: float) -> Grain:
+def sensor_resolution(window: Window, T_camera_lidar: Matrix4, held_m: float) -> SensorResolution:
     """The grain of a window whose camera is at `T_camera_lidar` (4, 4); a held centre is known to `held_m`."""
     velocity_mps, turn_radps = _rates(window, T_camera_lidar)
-    return Grain(
+    return SensorResolution(
         pixel_rad=pixel_rad(window.rig.camera),
         lens_px=hypot(LENS_PX, lens_error_px(window.rig.camera_residual_px)),
         column_rad=column_rad(window.pairs[0].lidar),
@@ -59,7 +59,7 @@ def column_rad(sweep: LidarFrame) -> float:
     0 if no point has a neighbour."""
     x, y, z = (sweep.xyz_m[:, axis].astype(np.float64) for axis in range(3))
     azimuth, across = np.arctan2(y, x), np.hypot(x, y)
-    ring = telling(sweep.ring)
+    ring = distinct_rings(sweep.ring)
     row = np.floor(np.arctan2(z, across) / BAND_RAD) if ring is None else ring.astype(np.float64)
     order = np.lexsort((azimuth, row))
     turn = np.diff(azimuth[order])

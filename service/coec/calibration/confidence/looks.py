@@ -24,7 +24,7 @@ hundreds."""
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
+class IndependentSamples:
     """The looks at one pose.
 
     Attributes:
@@ -37,15 +37,15 @@ class Looks:
     significance: float
 
 
-def look(edges: EdgeFrames, T_camera_lidar: Matrix4) -> Looks:
+def independent_samples_at(edges: EdgeFrames, T_camera_lidar: Matrix4) -> IndependentSamples:
     """How many independent looks put the camera at `T_camera_lidar` (4, 4), and how significantly."""
     some = edges.of_points(thinned(len(edges.weight), POINTS))
-    count = independent_looks(strengths_on_each_map(some, T_camera_lidar))
+    count = effective_sample_size(strengths_on_each_map(some, T_camera_lidar))
     whole = frame_alignment(edges, T_camera_lidar).significance
-    return Looks(count, whole * sqrt(count / len(edges.maps)))
+    return IndependentSamples(count, whole * sqrt(count / len(edges.maps)))
 
 
-def independent_looks(agreement: NDArray[np.float64]) -> float:
+def effective_sample_size(agreement: NDArray[np.float64]) -> float:
     """The number of independent looks of F frames, from how well each sweep (rows) agrees with each image (columns),
     (F, F). It is F over the design effect (Kish 1965) of as many repetitions,
 

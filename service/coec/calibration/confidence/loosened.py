@@ -16,7 +16,7 @@ from math import hypot, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.belief import in_centre, in_doubt
+from coec.calibration.confidence.belief import centre_weight, posterior_weight
 from coec.calibration.confidence.landscape import certainty
 from coec.calibration.confidence.told import (
     CLOCKS,
@@ -26,11 +26,11 @@ from coec.calibration.confidence.told import (
     REACH,
     SHIFTS,
     SIZE,
-    Told,
-    levels_told,
+    AssumedEdges,
+    assumed_levels,
     moves,
 )
-from coec.calibration.confidence.ways import Ways, climbed, ends_along
+from coec.calibration.confidence.ways import ParameterSubset, ends_along, local_ascent
 from coec.calibration.objective.cells import COLUMNS, ROWS, sectors
 from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
@@ -61,7 +61,7 @@ is half believed (`beside_a_turn`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Loosened:
+class RelaxedAssumption:
     """The result of setting one assumption free.
 
     Attributes:
@@ -96,9 +96,9 @@ class Loosened:
         return self.believed >= 0.5
 
 
-def loosen(
+def relax_assumptions(
     edges: Sequence[EdgeFrames], window: Window, pose: Matrix4, held: Sequence[int], known_m: float
-) -> tuple[Loosened, ...]:
+) -> tuple[RelaxedAssumption, ...]:
     """Sets the assumptions of a window free, one after the other; empty if the edges in view do not determine a pose.
 
     Args:
@@ -108,45 +108,50 @@ def loosen(
         held: the translations (places in ξ) that were taken as known.
         known_m: the standard deviation to which each of them is known.
     """
-    levels = levels_told(edges, window, pose)
+    levels = assumed_levels(edges, window, pose)
     free: list[tuple[str, Sequence[int], Sequence[int]]] = [(HELD_FREE, held, ())] if held else []
     if moves(window):
         free.append((CLOCKS_FREE, CLOCKS, LATE))
     free.append((LENS_FREE, LENS, PRINCIPAL_POINT))
     base = tuple(axis for axis in range(SHIFTS.stop) if axis not in held)
     try:
-        before = climbed(levels[-1:], Ways.of(levels[-1], np.zeros(SIZE), base, ()), np.zeros(SIZE))
-        found = []
+        before = local_ascent(levels[-1:], ParameterSubset.of(levels[-1], np.zeros(SIZE), base, ()), np.zeros(SIZE))
+        results = []
         for name, places, along in free:
-            ways = Ways.of(levels[-1], before, base, tuple(places))
-            ends = ends_along(along, levels, ways, before)
-            judged = [_judged(name, levels[-1], ways, before, after, known_m) for after in ends]
-            found.append(max(judged, key=lambda one: one.astray))
-            base, before = (*base, *places), found[-1].deviation
+            subset = ParameterSubset.of(levels[-1], before, base, tuple(places))
+            ends = ends_along(along, levels, subset, before)
+            judged = [_judged(name, levels[-1], subset, before, after, known_m) for after in ends]
+            results.append(max(judged, key=lambda one: one.astray))
+            base, before = (*base, *places), results[-1].deviation
     except ValueError:
         return ()
-    return tuple(found)
+    return tuple(results)
 
 
 def _judged(
-    name: str, sharp: Told, ways: Ways, before: NDArray[np.float64], after: NDArray[np.float64], known_m: float
-) -> Loosened:
+    name: str,
+    sharp: AssumedEdges,
+    subset: ParameterSubset,
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    known_m: float,
+) -> RelaxedAssumption:
     uv_px, seen = sharp.pixels(after)
     sector = np.full(len(uv_px), UNSEEN, np.uint8)
     sector[seen] = sectors(uv_px[seen])
     shift = se3.difference(sharp.otherwise(after)[1], sharp.otherwise(before)[1])
     gained = certainty(_cells(sharp, after, sector) - _cells(sharp, before, sector))
-    moved_px = ways.moved_px(after - before)
+    moved_px = subset.moved_px(after - before)
     if name == HELD_FREE:
-        believed = in_centre(gained, hypot(*(after - before)[list(ways.free)].tolist()), known_m)
+        believed = centre_weight(gained, hypot(*(after - before)[list(subset.free)].tolist()), known_m)
     elif name == CLOCKS_FREE:
-        believed = in_doubt(gained, EVEN)
+        believed = posterior_weight(gained, EVEN)
     else:
-        believed = in_doubt(gained, LENS_EVEN) * beside_a_turn(moved_px)
-    return Loosened(name, gained, moved_px, after, shift, believed)
+        believed = posterior_weight(gained, LENS_EVEN) * weight_beyond_turn(moved_px)
+    return RelaxedAssumption(name, gained, moved_px, after, shift, believed)
 
 
-def beside_a_turn(moved_px: float) -> float:
+def weight_beyond_turn(moved_px: float) -> float:
     """The share by which a lens is believed that moves the edges by so much beyond the pose that answers it.
 
     A lens trades its principal point against a turn of the camera: one that moves the edges by a fifth of a pixel
@@ -156,7 +161,7 @@ def beside_a_turn(moved_px: float) -> float:
     return moved_px**2 / (moved_px**2 + LEAST_PX**2)
 
 
-def _cells(sharp: Told, deviation: NDArray[np.float64], sector: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _cells(sharp: AssumedEdges, deviation: NDArray[np.float64], sector: NDArray[np.uint8]) -> NDArray[np.float64]:
     """(F, B) what each frame adds to the significance in each sector; `sector` (E,) is where each range edge lies."""
     frames, pose = sharp.otherwise(deviation)
     of_parts = alignment_of_parts(frames, sector, UNSEEN + 1, pose[None])

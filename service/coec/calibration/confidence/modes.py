@@ -36,21 +36,21 @@ def with_modes(rivals: Rivals, moved: Sequence[int], covariance: list[list[float
     axes = tuple(moved)
     aways = [se3.difference(other, rivals.best)[list(axes)].tolist() for other in rivals.others]
     aways_and_poses = [
-        (away, other) for away, other in zip(aways, rivals.others, strict=True) if _beside(away, covariance)
+        (away, other) for away, other in zip(aways, rivals.others, strict=True) if _on_another_hill(away, covariance)
     ]
     if not aways_and_poses:
         return covariance
     landscape = Landscape.about(rivals.objective.cells(rivals.best), rivals.best, axes)
     at_others = landscape.cells.at(np.array([other for _, other in aways_and_poses]))
-    found = [
+    weighted = [
         (exp(-2.0 * max(landscape.certainty(cells), 0.0) ** 2), away)
         for (away, _), cells in zip(aways_and_poses, at_others, strict=True)
     ]
-    whole = 1.0 + fsum(weight for weight, _ in found)
+    whole = 1.0 + fsum(weight for weight, _ in weighted)
     n = range(len(axes))
-    return [[covariance[i][j] + fsum(w * away[i] * away[j] for w, away in found) / whole for j in n] for i in n]
+    return [[covariance[i][j] + fsum(w * away[i] * away[j] for w, away in weighted) / whole for j in n] for i in n]
 
 
-def _beside(away: list[float], covariance: list[list[float]]) -> bool:
+def _on_another_hill(away: list[float], covariance: list[list[float]]) -> bool:
     """Whether a summit that lies `away` (n,) from the best one is on another hill."""
     return fsum(a * b for a, b in zip(away, solved(covariance, away), strict=True)) > SAME_HILL**2

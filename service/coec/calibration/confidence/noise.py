@@ -42,7 +42,7 @@ class Noise:
 
     covariance: list[list[float]]
     information: list[list[float]]
-    looks: float
+    independent_samples: float
 
 
 def measure_noise(landscape: Landscape) -> Noise | None:
@@ -60,7 +60,7 @@ def measure_noise(landscape: Landscape) -> Noise | None:
         scattered = scatter(gradients, fitted)
         if not _is_of_full_rank(scattered):
             return None
-        return Noise(congruent(inverse, scattered), information, independent_looks(gradients, inverse))
+        return Noise(congruent(inverse, scattered), information, effective_frame_count(gradients, inverse))
     return None
 
 
@@ -92,7 +92,7 @@ def _is_of_full_rank(covariance: Rows) -> bool:
     return values[-1][0] > SAME * values[0][0]
 
 
-def independent_looks(gradients: NDArray[np.float64], inverse: list[list[float]]) -> float:
+def effective_frame_count(gradients: NDArray[np.float64], inverse: list[list[float]]) -> float:
     """The number of independent looks of F frames, from the gradients (n, F, B) of their cells and the inverse (n, n)
     of the information. It is F over the design effect (Kish 1965): how much more the sectors scatter than they would if
     the cells of each frame were independent of those of the others."""

@@ -45,8 +45,8 @@ def widened(landscape: Landscape, noise: Noise) -> list[list[float]]:
         [sqrt(max(variance, 0.0)) * part * of for part, of in zip(direction, scale, strict=True)]
         for variance, direction in eigen(scaled)
     ]
-    both_ways = _reaches(landscape, np.array([[axis, np.negative(axis)] for axis in axes]).reshape(-1, len(scale)))
-    for axis, ahead, behind in zip(axes, both_ways[::2], both_ways[1::2], strict=True):
+    both_sides = _reaches(landscape, np.array([[axis, np.negative(axis)] for axis in axes]).reshape(-1, len(scale)))
+    for axis, ahead, behind in zip(axes, both_sides[::2], both_sides[1::2], strict=True):
         more = max(0.5 * (ahead**2 + behind**2) / _expected(noise, axis) ** 2 - 1.0, 0.0)
         wide = [[wide[i][j] + more * axis[i] * axis[j] for j in n] for i in n]
     return wide

@@ -16,15 +16,15 @@ from coec.calibration.confidence.modes import Rivals
 from coec.calibration.objective.mutual_information import Divisible
 from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import near, polish
-from coec.calibration.search.observability import TRANSLATIONS, CentreKept
+from coec.calibration.search.observability import TRANSLATIONS, FixedCentre
 from coec.calibration.types import Matrix4
 from coec.config import CalibrationConfig
 from coec.geometry import se3
 
-WAYS = (1.0, -1.0)
+SIGNS = (1.0, -1.0)
 
 
-def shifted(objective: Divisible, pose: Matrix4, moved: Sequence[int], config: CalibrationConfig) -> Rivals:
+def translation_profile(objective: Divisible, pose: Matrix4, moved: Sequence[int], config: CalibrationConfig) -> Rivals:
     """The best poses with the camera `verdict.max_sigma_m` aside of the optimum at `pose` (4, 4), either way along each
     translation among the axes `moved`: the profile of the objective there. There are no such poses if only rotations
     moved."""
@@ -34,8 +34,8 @@ def shifted(objective: Divisible, pose: Matrix4, moved: Sequence[int], config: C
     for axis in moved:
         if axis not in TRANSLATIONS:
             continue
-        for way in WAYS:
-            aside = se3.perturb(pose, way * config.verdict.max_sigma_m * np.eye(6)[axis])
-            kept = CentreKept((axis, *held), aside)
-            ends.append(polish(objective, aside, search, Silence(), 0, kept).T_camera_lidar)
+        for way in SIGNS:
+            displaced = se3.perturb(pose, way * config.verdict.max_sigma_m * np.eye(6)[axis])
+            constraint = FixedCentre((axis, *held), displaced)
+            ends.append(polish(objective, displaced, search, Silence(), 0, constraint).T_camera_lidar)
     return Rivals(objective, pose, tuple(ends))

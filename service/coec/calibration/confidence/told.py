@@ -58,7 +58,7 @@ alike."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class AssumedEdges:
     """The range edges of a window on the image edges of one level, as assumed, and what it takes to move them to where
     they lie under other assumptions.
 
@@ -88,16 +88,16 @@ class Told:
             return frames
         return replace(frames, camera=_through(frames.camera, deviation[LENS]))
 
-    def thinned(self, at_most: int) -> Told:
+    def thinned(self, at_most: int) -> AssumedEdges:
         """The same with at most about this many range edges."""
-        kept = thinned(len(self.frames.weight), at_most)
+        indices = thinned(len(self.frames.weight), at_most)
         return replace(
-            self, frames=self.frames.of_points(kept), passing=self.passing[:, kept], share=self.share[:, kept]
+            self, frames=self.frames.of_points(indices), passing=self.passing[:, indices], share=self.share[:, indices]
         )
 
     def significances(self, deviations: NDArray[np.float64]) -> NDArray[np.float64]:
         """(K,) of the alignment at each of K deviations (K, 12)."""
-        found = np.empty(len(deviations))
+        values = np.empty(len(deviations))
         for through in _of_one_lens(deviations):
             some = deviations[through]
             poses = np.array([se3.perturb(self.pose, deviation[: SHIFTS.stop]) for deviation in some])
@@ -106,8 +106,8 @@ class Told:
                 at = alignments_of_late(frames, self.passing, self.share, late_s, poses)
             else:
                 at = alignments(frames, poses)
-            found[through] = [at.at(k).significance for k in range(len(some))]
-        return found
+            values[through] = [at.at(k).significance for k in range(len(some))]
+        return values
 
     def pixels(self, deviation: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(E, 2) the pixels at which the range edges lie at a deviation (12,), and (E,) whether they have one."""
@@ -165,16 +165,16 @@ def _of_one_lens(deviations: NDArray[np.float64]) -> list[list[int]]:
     return list(places.values())
 
 
-def levels_told(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> list[Told]:
+def assumed_levels(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> list[AssumedEdges]:
     """The levels of a window at `pose` (4, 4), from `edges` of coarser levels that lead there to the sharpest one.
     Edges that no deviation brings into view are left out."""
     counts = [*([LEADING_POINTS] * (len(edges) - 1)), SETTLING_POINTS]
     half_view_rad = half_field_of_view_rad(edges[0].camera, edges[0].maps[0] != VOID)
     levels = [level.of_points(thinned(len(level.weight), count)) for level, count in zip(edges, counts, strict=True)]
-    return [_told(in_reach(level, half_view_rad, pose, SEEN), window, pose) for level in levels]
+    return [_assumed_edges(in_reach(level, half_view_rad, pose, SEEN), window, pose) for level in levels]
 
 
-def _told(frames: EdgeFrames, window: Window, pose: Matrix4) -> Told:
+def _assumed_edges(frames: EdgeFrames, window: Window, pose: Matrix4) -> AssumedEdges:
     """The range edges of one level of a window at `pose` (4, 4)."""
     counts, pairs = np.diff(frames.first_point), window.pairs
     frame = np.repeat(np.arange(len(pairs)), counts)
@@ -187,11 +187,11 @@ def _told(frames: EdgeFrames, window: Window, pose: Matrix4) -> Told:
     passing = -(velocity[frame] + np.cross(turn[frame], xyz_m))
     begin_ns, end_ns = pairs[0].stamp_ns, pairs[-1].stamp_ns
     elapsed = np.array([(pair.stamp_ns - begin_ns) / max(end_ns - begin_ns, 1) - 0.5 for pair in pairs])
-    as_told = Told(frames, pose, passing.T.astype(np.float32, order="C"), np.zeros((3, len(frame)), np.float32))
-    uv_px, _ = as_told.pixels(np.zeros(SIZE))
+    assumed = AssumedEdges(frames, pose, passing.T.astype(np.float32, order="C"), np.zeros((3, len(frame)), np.float32))
+    uv_px, _ = assumed.pixels(np.zeros(SIZE))
     row = np.clip(uv_px[:, 1] / frames.camera.height - 0.5, -0.5, 0.5)
     share = moves[frame] * np.stack([np.ones(len(frame)), elapsed[frame], row])
-    return replace(as_told, share=share.astype(np.float32))
+    return replace(assumed, share=share.astype(np.float32))
 
 
 def moves(window: Window) -> bool:
@@ -199,16 +199,16 @@ def moves(window: Window) -> bool:
     return any(pair.motion is not None and pair.motion.reaches(SLOWEST_MPS) for pair in window.pairs)
 
 
-def _moved_by_lens(told: Camera, camera: Camera, uv_px: NDArray[np.float64], place: int) -> NDArray[np.float64]:
+def _moved_by_lens(assumed: Camera, camera: Camera, uv_px: NDArray[np.float64], place: int) -> NDArray[np.float64]:
     """(E, 2) how pixels (E, 2) of a camera move with one place of the lens, in units of the lens `told`."""
     moved = np.zeros_like(uv_px)
     if place == LENS.start:
-        moved[:, 0] = told.fx
+        moved[:, 0] = assumed.fx
     elif place == LENS.start + 1:
-        moved[:, 1] = told.fy
+        moved[:, 1] = assumed.fy
     else:
-        moved[:, 0] = (uv_px[:, 0] - camera.cx) * told.fx / camera.fx
-        moved[:, 1] = (uv_px[:, 1] - camera.cy) * told.fy / camera.fy
+        moved[:, 0] = (uv_px[:, 0] - camera.cx) * assumed.fx / camera.fx
+        moved[:, 1] = (uv_px[:, 1] - camera.cy) * assumed.fy / camera.fy
     return moved
 
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coec.calibration.confidence.budget import systematic
-from coec.calibration.confidence.grain import grain_of
+from coec.calibration.confidence.budget import systematic_shifts
+from coec.calibration.confidence.grain import sensor_resolution
 from coec.calibration.confidence.landscape import Landscape
-from coec.calibration.confidence.loosened import Loosened
+from coec.calibration.confidence.loosened import RelaxedAssumption
 from coec.calibration.confidence.modes import Rivals, with_modes
 from coec.calibration.confidence.noise import measure_noise
 from coec.calibration.confidence.ridges import widened
@@ -23,7 +23,7 @@ def measure_uncertainty(
     pose: Matrix4,
     moved: Sequence[int],
     rivals: Sequence[Rivals],
-    loosened: Sequence[Loosened],
+    relaxed: Sequence[RelaxedAssumption],
     window: Window,
     held_m: float,
 ) -> Uncertainty:
@@ -44,7 +44,7 @@ def measure_uncertainty(
     whole = np.full((6, 6), np.nan)
     whole[np.ix_(axes, axes)] = covariance
     axis_of_sweep = pose[:3, 2]  # the third axis of the LiDAR
-    shared = systematic(landscape.cells.sight, grain_of(window, pose, held_m), axes, axis_of_sweep)
-    for one in loosened:
+    shared = systematic_shifts(landscape.cells.points, sensor_resolution(window, pose, held_m), axes, axis_of_sweep)
+    for one in relaxed:
         shared[one.name] = one.believed * np.where(np.isin(np.arange(6), axes), one.shift, 0.0)
-    return Uncertainty(whole, shared, noise.looks)
+    return Uncertainty(whole, shared, noise.independent_samples)

@@ -15,7 +15,7 @@ from math import fsum, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.told import REACH, SHIFTS, SIZE, Told
+from coec.calibration.confidence.told import REACH, SHIFTS, SIZE, AssumedEdges
 from coec.calibration.search.bounded import Box, maximum_in
 from coec.geometry.edges.alignment import LEAST_SQUARE
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, SHARP_SIGMA_PX
@@ -42,7 +42,7 @@ SHARP_STEP_PX = 2.0 * SHARP_SIGMA_PX
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ways:
+class ParameterSubset:
     """The directions of a climb, n of them.
 
     Attributes:
@@ -59,7 +59,9 @@ class Ways:
     residual: NDArray[np.float64]
 
     @classmethod
-    def of(cls, sharp: Told, at: NDArray[np.float64], base: tuple[int, ...], free: tuple[int, ...]) -> Ways:
+    def of(
+        cls, sharp: AssumedEdges, at: NDArray[np.float64], base: tuple[int, ...], free: tuple[int, ...]
+    ) -> ParameterSubset:
         """The directions about a deviation (12,): the places `base` move already, the places `free` are set free.
 
         Raises:
@@ -117,43 +119,47 @@ class Ways:
         return sqrt(max(square, 0.0))
 
 
-def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> NDArray[np.float64]:
+def local_ascent(
+    levels: Sequence[AssumedEdges], subset: ParameterSubset, start: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """The deviation (12,) of the most significant alignment on the last level next to `start` (12,). The levels before
     it lead there."""
-    sharpest, widest = levels[-1].frames.camera.width, ways.widest
+    sharpest, widest = levels[-1].frames.camera.width, subset.widest
     at = start
     for level in levels:
         last = level is levels[-1]
         blur_px = SHARP_STEP_PX if last else BLUR_SIGMA_PX * sharpest / level.frames.camera.width
-        step = np.minimum(blur_px * ways.steps, widest)
+        step = np.minimum(blur_px * subset.steps, widest)
         begin = at
 
-        def scores(points: NDArray[np.float64], level: Told = level, begin: NDArray[np.float64] = begin) -> list[float]:
-            found: list[float] = _scores(level, begin + ways.combined(points)).tolist()
-            return found
+        def scores(
+            points: NDArray[np.float64], level: AssumedEdges = level, begin: NDArray[np.float64] = begin
+        ) -> list[float]:
+            values: list[float] = _scores(level, begin + subset.combined(points)).tolist()
+            return values
 
         box = Box(-2.0 * widest, 2.0 * widest, step, (SETTLING if last else LEADING) * step)
-        found, _ = maximum_in(box, scores, np.zeros(len(step)), MAX_EVALUATIONS)
-        at = begin + ways.combined(found[None])[0]
+        best, _ = maximum_in(box, scores, np.zeros(len(step)), MAX_EVALUATIONS)
+        at = begin + subset.combined(best[None])[0]
     return at
 
 
 def ends_along(
-    places: Sequence[int], levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]
+    places: Sequence[int], levels: Sequence[AssumedEdges], subset: ParameterSubset, start: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
     """The deviations (12,) at which climbs from about `start` (12,) end; `places` are those of the free ones that the
     pose answers almost entirely. They make a long ridge, whose dents hold a climb: beside the one that the levels lead,
     others begin on the last level, at the best points of a lattice of these places. Without such places there is one.
     """
-    led = climbed(levels, ways, start)
+    led = local_ascent(levels, subset, start)
     if not places:
         return [led]
-    lattice = ways.lattice(places, start)
+    lattice = subset.lattice(places, start)
     best = np.argsort(-_scores(levels[-1], lattice), kind="stable")[:BEGINS]
-    return [led, *(climbed(levels[-1:], ways, lattice[k]) for k in best)]
+    return [led, *(local_ascent(levels[-1:], subset, lattice[k]) for k in best)]
 
 
-def _scores(level: Told, deviations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _scores(level: AssumedEdges, deviations: NDArray[np.float64]) -> NDArray[np.float64]:
     """(K,) what a climb makes large, at each of K deviations (K, 12). It costs half a unit at the end of the reach, so
     that what the window does not show stays as assumed."""
     unlike = deviations[:, SHIFTS.stop :] / REACH[SHIFTS.stop :]

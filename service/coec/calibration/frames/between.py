@@ -17,9 +17,9 @@ from coec.calibration.ports import ImageReducer
 from coec.calibration.types import FramePair, LidarFrame, Matrix4
 from coec.config import WindowConfig
 from coec.errors import DecodeError
-from coec.geometry.edges.scan_lines import BAND_RAD, telling
+from coec.geometry.edges.scan_lines import BAND_RAD, distinct_rings
 
-NS_PER_S = 1_000_000_000
+NS_PER_S_BETWEEN = 1_000_000_000
 MIB = 2**20
 
 POINTS = 12_000
@@ -31,7 +31,7 @@ BEYOND_RAD = radians(6.0)
 
 
 @dataclass(slots=True)
-class _Slice:
+class _ThinnedSlice:
     """The open slice. From the stamp `next_ns` on a pair lies far enough from those before it; None before the first
     pair. From the stamp `afforded_ns` on there are bytes for another pair."""
 
@@ -51,16 +51,18 @@ class BetweenPairs:
         """`half_view_rad` is the largest angle from the optical axis at which the image has a pixel."""
         self._images = images
         self._half_view_rad = half_view_rad
-        self._open: _Slice | None = None
+        self._open: _ThinnedSlice | None = None
 
     def begin(self, config: WindowConfig, start_ns: int, length_ns: int) -> None:
         """Begins a slice that is cut by `config`. If its chosen pairs will be so near to each other that they show the
         time as well, it has no pairs between."""
-        spacing_ns = round(config.between_s * NS_PER_S)
-        wanted = config.between_mib > 0 and length_ns >= 2 * spacing_ns * config.pairs
-        self._open = _Slice(start_ns, length_ns, spacing_ns, config.between_mib * MIB, start_ns) if wanted else None
+        spacing_ns = round(config.between_s * NS_PER_S_BETWEEN)
+        enabled = config.between_mib > 0 and length_ns >= 2 * spacing_ns * config.pairs
+        self._open = (
+            _ThinnedSlice(start_ns, length_ns, spacing_ns, config.between_mib * MIB, start_ns) if enabled else None
+        )
 
-    def chosen(self, stamp_ns: int) -> None:
+    def on_selected(self, stamp_ns: int) -> None:
         """The window has chosen a pair of this stamp; the next pair between has to keep its distance from it."""
         if self._open is not None:
             self._open.next_ns = stamp_ns + self._open.spacing_ns
@@ -115,7 +117,7 @@ def _near_the_view(xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4, angle_ra
 
 def _rows(lidar: LidarFrame, of: NDArray[np.int64]) -> NDArray[np.int64]:
     """The row of each point: its ring, or, without rings, its band of elevation."""
-    ring = telling(lidar.ring)
+    ring = distinct_rings(lidar.ring)
     if ring is not None:
         return ring[of].astype(np.int64)
     x_m, y_m, z_m = lidar.xyz_m[of].T

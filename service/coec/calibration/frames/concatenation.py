@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.cones import Rings, elevation_rad
 
-Doubles = NDArray[np.float64]
+DoublesOfConcatenation = NDArray[np.float64]
 
-APART_M = 0.3
+MIN_SEPARATION_M = 0.3
 """Origins nearer to each other than this count as one: the height of a sensor."""
 
 THIN_RAD = math.radians(0.25)
@@ -50,7 +50,7 @@ class SeveralOrigins:
         cause, setting: as in `ApparentOrigin`.
     """
 
-    cones: tuple[Doubles, Doubles]
+    cones: tuple[DoublesOfConcatenation, DoublesOfConcatenation]
 
     cause: ClassVar[str] = "cloud_concatenated"
     setting: ClassVar[str] = "source"
@@ -81,7 +81,7 @@ def several_origins(rings: Rings, before: SeveralOrigins | None = None) -> Sever
     if rest is None or len(fits) - end < BLOCK * len(fits) or not _ends(fits, end):
         return None
     second = _beginning(rest, guesses)
-    if second is None or math.dist(cones[:3], second[1][:3]) < APART_M:
+    if second is None or math.dist(cones[:3], second[1][:3]) < MIN_SEPARATION_M:
         return None
     around = [_sectors(rings.xyz_m[:end], cones), _sectors(rings.xyz_m[end:], second[1])]
     if (around[0] & around[1]).sum() < COMMON * min(sectors.sum() for sectors in around):
@@ -89,7 +89,9 @@ def several_origins(rings: Rings, before: SeveralOrigins | None = None) -> Sever
     return SeveralOrigins((cones, second[1]))
 
 
-def _beginning(rings: Rings, guesses: tuple[Doubles, ...]) -> tuple[Rings, Doubles] | None:
+def _beginning(
+    rings: Rings, guesses: tuple[DoublesOfConcatenation, ...]
+) -> tuple[Rings, DoublesOfConcatenation] | None:
     """The longest block at the beginning of the points that lies on cones, and those cones; None if none does."""
     for share in BEGINNINGS:
         block = rings.part(0, int(share * len(rings.xyz_m)))
@@ -103,13 +105,13 @@ def _beginning(rings: Rings, guesses: tuple[Doubles, ...]) -> tuple[Rings, Doubl
     return None
 
 
-def _fits(rings: Rings, block: Rings, cones: Doubles) -> NDArray[np.bool_]:
+def _fits(rings: Rings, block: Rings, cones: DoublesOfConcatenation) -> NDArray[np.bool_]:
     """(N,) whether each point lies on the beam of its ring in the block; rings that are not in the block have no
     beam."""
     beams_rad = np.full(int(rings.names.max()) + 1, np.nan)
     beams_rad[block.names] = block.beams_rad(cones)
-    beside_rad = elevation_rad(rings.xyz_m, cones) - beams_rad[rings.names[rings.number]]
-    return np.asarray(np.abs(beside_rad) <= BELONGS_RAD)
+    deviation_rad = elevation_rad(rings.xyz_m, cones) - beams_rad[rings.names[rings.number]]
+    return np.asarray(np.abs(deviation_rad) <= BELONGS_RAD)
 
 
 def _ends(fits: NDArray[np.bool_], end: int) -> bool:
@@ -117,7 +119,7 @@ def _ends(fits: NDArray[np.bool_], end: int) -> bool:
     return bool(fits[:end].mean() >= WITHIN and fits[end:].mean() <= BEYOND)
 
 
-def _sectors(xyz_m: Doubles, cones: Doubles) -> NDArray[np.bool_]:
+def _sectors(xyz_m: DoublesOfConcatenation, cones: DoublesOfConcatenation) -> NDArray[np.bool_]:
     """(SECTORS,) whether each sector holds points, seen from the tip of the cones."""
     ray_m = xyz_m - cones[:3]
     sector = ((np.arctan2(ray_m[:, 1], ray_m[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS

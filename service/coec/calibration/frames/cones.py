@@ -75,9 +75,9 @@ class Rings:
         cones = np.zeros(5)
         for _ in range(STEPS):
             deviation = self.deviations_rad(cones)
-            kept = np.abs(deviation) <= 3 * NORMAL * np.median(np.abs(deviation))
+            inliers = np.abs(deviation) <= 3 * NORMAL * np.median(np.abs(deviation))
             slopes = np.stack([self._slope(cones, step) for step in STEP * np.eye(5)], axis=1)
-            change = np.linalg.lstsq(slopes[kept], -deviation[kept], rcond=1e-6)[0]
+            change = np.linalg.lstsq(slopes[inliers], -deviation[inliers], rcond=1e-6)[0]
             cones = cones + np.clip(change, -LONGEST, LONGEST)
             if float(np.linalg.norm(change)) < STEP:
                 break

@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 from coec.calibration.ports import ImageReader
 from coec.calibration.types import CameraFrame
 
-MOST_KEPT_BYTES = 64_000_000
+MAX_CACHED_BYTES = 64_000_000
 """Most bytes of decoded images that are kept: twenty-five of 2.5 megapixels. Their edge maps take as much, and each
 image is dropped when its maps are made. Images beyond this are decoded again."""
 
 
-class DecodedOnce:
+class CachedImages:
     """An image reader that keeps images from their first use to their second."""
 
     def __init__(self, images: ImageReader) -> None:
         self._images = images
-        self._kept: dict[int, NDArray[np.uint8]] = {}
+        self._cache: dict[int, NDArray[np.uint8]] = {}
         self._bytes = 0
 
     def first(self, frame: CameraFrame) -> NDArray[np.uint8]:
@@ -28,8 +28,8 @@ class DecodedOnce:
             DecodeError: the image cannot be decoded within the limits.
         """
         grey = self._images.grey(frame)
-        if id(frame) not in self._kept and self._bytes + grey.nbytes <= MOST_KEPT_BYTES:
-            self._kept[id(frame)] = grey
+        if id(frame) not in self._cache and self._bytes + grey.nbytes <= MAX_CACHED_BYTES:
+            self._cache[id(frame)] = grey
             self._bytes += grey.nbytes
         return grey
 
@@ -39,8 +39,8 @@ class DecodedOnce:
         Raises:
             DecodeError: the image cannot be decoded within the limits.
         """
-        kept = self._kept.pop(id(frame), None)
-        if kept is None:
+        cached = self._cache.pop(id(frame), None)
+        if cached is None:
             return self._images.grey(frame)
-        self._bytes -= kept.nbytes
-        return kept
+        self._bytes -= cached.nbytes
+        return cached

@@ -206,13 +206,13 @@ def _at_pixels(cells: Cells, cell_px: int, width: int, height: int) -> Cells:
 
 def _grown(cells: Cells) -> Cells:
     """The cells and the eight neighbours of each."""
-    return ~_least_around(~cells, outside=True)
+    return ~_least_around(~cells, border=True)
 
 
-def _least_around(values: NDArray[Value], outside: int | bool) -> NDArray[Value]:
+def _least_around(values: NDArray[Value], border: int | bool) -> NDArray[Value]:
     """The least value of each cell and its eight neighbours, along one axis after the other; beyond the border the
     value is `outside`."""
-    padded = np.pad(values, 1, constant_values=outside)
+    padded = np.pad(values, 1, constant_values=border)
     columns = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
     return np.asarray(np.minimum(np.minimum(columns[:-2], columns[1:-1]), columns[2:]))
 
@@ -251,7 +251,7 @@ def _labels(cells: Cells) -> NDArray[np.int64]:
     big = cells.size + 1
     spread = np.where(cells, own, big)
     while True:
-        least = _least_around(spread, outside=big)
+        least = _least_around(spread, border=big)
         # Follow the chain of least indices: halves the rounds that a long group would need.
         least = np.where(cells, np.minimum(least, spread), big)
         flat = np.append(least.ravel(), big)

@@ -16,17 +16,17 @@ EVERY = slice(None)
 """All points, without a copy."""
 
 
-def compensate(pair: FramePair, rig: Rig, *, enabled: bool, chosen: Choice = EVERY) -> NDArray[np.float32]:
+def compensate(pair: FramePair, rig: Rig, *, enabled: bool, selection: Choice = EVERY) -> NDArray[np.float32]:
     """(N, 3) float32: the chosen points of the sweep in the LiDAR frame at the camera stamp.
 
     Per-point time comes with the cloud, or follows from azimuth (`rig.sweep`). Without either, the whole sweep is moved
     from its stamp to the camera's. Without ego-motion nothing is moved. If only the rotation is known, points are
     turned and not shifted.
     """
-    xyz_m = np.ascontiguousarray(pair.lidar.xyz_m[chosen])
+    xyz_m = np.ascontiguousarray(pair.lidar.xyz_m[selection])
     if not enabled or pair.motion is None:
         return xyz_m
-    dt_s = _point_offsets_s(pair.lidar, xyz_m, rig.sweep, chosen)
+    dt_s = _point_offsets_s(pair.lidar, xyz_m, rig.sweep, selection)
     dt_s += (pair.lidar.stamp_ns - pair.camera.stamp_ns) * 1e-9
     angular, linear = sensor_twist(pair.motion, rig.T_lidar_ego)
     return deskew(xyz_m, dt_s, angular, linear)
@@ -57,8 +57,8 @@ def sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.fl
 
 
 def _point_offsets_s(
-    lidar: LidarFrame, xyz_m: NDArray[np.float32], sweep: SweepTiming | None, chosen: Choice
+    lidar: LidarFrame, xyz_m: NDArray[np.float32], sweep: SweepTiming | None, selection: Choice
 ) -> NDArray[np.float64]:
     if lidar.time_offset_s is not None:
-        return lidar.time_offset_s[chosen].astype(np.float64)
+        return lidar.time_offset_s[selection].astype(np.float64)
     return np.zeros(len(xyz_m)) if sweep is None else azimuth_offsets_s(xyz_m, sweep)

@@ -14,11 +14,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.concatenation import APART_M, SeveralOrigins, several_origins
+from coec.calibration.frames.concatenation import MIN_SEPARATION_M, SeveralOrigins, several_origins
 from coec.calibration.frames.cones import Rings
 from coec.calibration.types import LidarFrame, Matrix4
 
-Doubles = NDArray[np.float64]
+DoublesOfOrigin = NDArray[np.float64]
 
 POINTS = 6000
 """How many evenly chosen points are used: some hundred per ring of a 64-beam sensor."""
@@ -77,7 +77,7 @@ def from_origin(sweep: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str) -> Lid
 def apparent_origin(sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
     """From where the points look measured, if they contradict the origin of their frame; None if they do not, or if
     that is unknown. See `OriginCheck`."""
-    return OriginCheck().look(sweep)
+    return OriginCheck().inspect(sweep)
 
 
 class OriginCheck:
@@ -90,11 +90,11 @@ class OriginCheck:
     """
 
     def __init__(self) -> None:
-        self._cones: Doubles | None = None
+        self._cones: DoublesOfOrigin | None = None
         self._several: SeveralOrigins | None = None
         self._unexplained = 0
 
-    def look(self, sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
+    def inspect(self, sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
         """From where the points of a sweep look measured, if they contradict the origin of their frame."""
         rings = None if self._unexplained >= GIVE_UP else _rings(sweep)
         if rings is None:
@@ -113,12 +113,12 @@ class OriginCheck:
             return several
         x, y, z = cones[:3].tolist()
         spread_rad = rings.spread_rad(cones)
-        return ApparentOrigin((x, y, z), spread_rad, stated_rad) if math.hypot(x, y, z) >= APART_M else None
+        return ApparentOrigin((x, y, z), spread_rad, stated_rad) if math.hypot(x, y, z) >= MIN_SEPARATION_M else None
 
-    def _one_of(self, rings: Rings, stated_rad: float) -> Doubles | None:
+    def _one_of(self, rings: Rings, stated_rad: float) -> DoublesOfOrigin | None:
         """The cones of a single LiDAR, if they explain the rings."""
 
-        def explain(cones: Doubles) -> bool:
+        def explain(cones: DoublesOfOrigin) -> bool:
             return rings.spread_rad(cones) <= EXPLAINED * stated_rad
 
         if self._cones is None or not explain(self._cones):

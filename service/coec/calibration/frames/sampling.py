@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from coec.calibration.types import FramePair
 from coec.config import MonitorConfig, WindowConfig
 
-NS_PER_S = 1_000_000_000
+NS_PER_S_SAMPLING = 1_000_000_000
 
 SPAN_PERIODS = 6
 """Periods that the pairs of one check may span. The slowest useful stream, with a pair per period, fills the four pairs
@@ -39,7 +39,7 @@ class CheckSampler:
 
     def __init__(self, config: MonitorConfig) -> None:
         self._config = config
-        self._period_ns = round(config.period_s * NS_PER_S)
+        self._period_ns = round(config.period_s * NS_PER_S_SAMPLING)
         self._pairs: list[FramePair] = []
         self._new = 0
         self._period = self._cell = -1
@@ -53,7 +53,7 @@ class CheckSampler:
             self._new = 0
         self._last_ns = stamp_ns
         oldest_ns = stamp_ns - SPAN_PERIODS * self._period_ns
-        self._pairs = [kept for kept in self._pairs if kept.stamp_ns >= oldest_ns]
+        self._pairs = [earlier for earlier in self._pairs if earlier.stamp_ns >= oldest_ns]
         period, cell = stamp_ns // self._period_ns, stamp_ns * self._config.pairs // self._period_ns
         check = None
         if period != self._period and self._new > 0 and len(self._pairs) >= self._config.min_pairs:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate, sensor_twist
 from coec.calibration.objective.differences import FrameScores, across, along
-from coec.calibration.objective.edges import EdgeWitness, build_edges
+from coec.calibration.objective.edges import EdgeCue, build_edges
 from coec.calibration.ports import ImageReader
 from coec.calibration.search.bounded import Box, maximum_in
 from coec.calibration.steps import of_both
@@ -31,7 +31,7 @@ from coec.config import CalibrationConfig, TimeOffsetConfig
 from coec.geometry import se3
 from coec.geometry.deskew import deskew
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
-from coec.geometry.edges.charts import climb
+from coec.geometry.edges.charts import pattern_search
 from coec.geometry.linear import solved
 
 OFFSET = 6
@@ -106,29 +106,29 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
     twists = [sensor_twist(pair.motion, rig.T_lidar_ego) for pair in moving if pair.motion is not None]
     spread = _spread(np.array([angular for angular, _ in twists]))
 
-    def points(frame: int, chosen: NDArray[np.int64]) -> NDArray[np.float32]:
-        return compensate(moving[frame], rig, enabled=True, chosen=chosen)
+    def points(frame: int, selection: NDArray[np.int64]) -> NDArray[np.float32]:
+        return compensate(moving[frame], rig, enabled=True, selection=selection)
 
     edges = build_edges(moving, points, (images.grey(pair.camera) for pair in moving), rig)
     rotated, offset_s = _coarse(edges, twists, pose, limits)
     scores = _scores(edges.whole, twists, rotated)
-    found = _maximum(lambda x: float(scores(x[None])[0].mean()), offset_s, limits)
-    sigma_s = _sigma(scores, found, limits)
-    return _judged(float(found[OFFSET]), sigma_s, spread, limits)
+    optimum = _maximum(lambda x: float(scores(x[None])[0].mean()), offset_s, limits)
+    sigma_s = _sigma(scores, optimum, limits)
+    return _judged(float(optimum[OFFSET]), sigma_s, spread, limits)
 
 
 def _judged(offset_s: float, sigma_s: float, spread: float, limits: TimeOffsetConfig) -> TimeOffset:
     least, known_s = radians(limits.min_turn_spread_deg_per_s), sigma_s if np.isfinite(sigma_s) else nan
     if spread < least:
-        told = f"the turn rate varies by {np.degrees(spread):.1f} deg/s only; {np.degrees(least):.1f} are needed"
-        return TimeOffset(offset_s, known_s, spread, False, f"{told}: a straight drive looks like a shifted mount")
+        text = f"the turn rate varies by {np.degrees(spread):.1f} deg/s only; {np.degrees(least):.1f} are needed"
+        return TimeOffset(offset_s, known_s, spread, False, f"{text}: a straight drive looks like a shifted mount")
     if abs(offset_s) > AT_BOUND * limits.reach_s:
         return TimeOffset(offset_s, nan, spread, False, "the best offset lies at the bound of the search")
     if isnan(known_s):
         return TimeOffset(offset_s, nan, spread, False, "the offset rests on too few frames, or has no maximum")
     if sigma_s > limits.max_sigma_s:
-        told = f"the offset is known to {1e3 * sigma_s:.1f} ms only, limit {1e3 * limits.max_sigma_s:.1f} ms"
-        return TimeOffset(offset_s, sigma_s, spread, False, told)
+        text = f"the offset is known to {1e3 * sigma_s:.1f} ms only, limit {1e3 * limits.max_sigma_s:.1f} ms"
+        return TimeOffset(offset_s, sigma_s, spread, False, text)
     return TimeOffset(offset_s, sigma_s, spread, True, f"seen in turns of {np.degrees(spread):.1f} deg/s spread")
 
 
@@ -160,7 +160,7 @@ def _moved(
     return moved
 
 
-def _coarse(edges: EdgeWitness, twists: list[Twist], pose: Matrix4, limits: TimeOffsetConfig) -> tuple[Matrix4, float]:
+def _coarse(edges: EdgeCue, twists: list[Twist], pose: Matrix4, limits: TimeOffsetConfig) -> tuple[Matrix4, float]:
     """The pose, only turned, and the offset with the highest significance on a grid of offsets."""
     turns = np.array([radians(0.5)] * 3 + [0.0] * 3)
     steps = round(limits.reach_s / PROFILE_STEP_S)
@@ -169,7 +169,7 @@ def _coarse(edges: EdgeWitness, twists: list[Twist], pose: Matrix4, limits: Time
     ends = []
     for offset_s in offsets_s.tolist():
         moved = replace(charts, xyz_m=_moved(charts.xyz_m, charts.frame, twists, offset_s))
-        ends.append(climb(moved, pose[None], turns, 3, pose, np.array([TURN_RAD, 0.0])))
+        ends.append(pattern_search(moved, pose[None], turns, 3, pose, np.array([TURN_RAD, 0.0])))
     best = int(np.argmax([z[0] for _, z in ends]))
     return ends[best][0][0], float(offsets_s[best])
 
@@ -199,18 +199,18 @@ def _maximum(
     reach, steps = np.array([TURN_RAD] * 3 + [limits.reach_s]), STEPS[fitted]
     start = np.array([0.0, 0.0, 0.0, offset_s])
     box = Box(-reach, reach, steps, TOLERANCE * steps)
-    found, _ = maximum_in(box, lambda points: [score(full(point)) for point in points], start, MAX_EVALUATIONS)
-    return full(found)
+    best, _ = maximum_in(box, lambda points: [score(full(point)) for point in points], start, MAX_EVALUATIONS)
+    return full(best)
 
 
-def _sigma(scores: FrameScores, found: NDArray[np.float64], limits: TimeOffsetConfig) -> float:
+def _sigma(scores: FrameScores, optimum: NDArray[np.float64], limits: TimeOffsetConfig) -> float:
     """Standard deviation of the offset, seconds; infinite if the score has no maximum or rests on a single frame.
 
     It comes from leaving out one frame at a time (Efron 1982), each by its Newton step, because a frame in a sharp turn
     has so much leverage on the offset that its residual says nothing about its error. Added to it is the error that the
     position of the mount, taken as known, causes in the offset: ∂dt/∂t = -(H⁻¹·H_t).
     """
-    of_frames, of_shifts, gradients = _derivatives(scores, found)
+    of_frames, of_shifts, gradients = _derivatives(scores, optimum)
     count = len(of_frames)
     whole = of_frames.sum(axis=0)
     centred = gradients - gradients.mean(axis=0)
@@ -226,13 +226,13 @@ def _sigma(scores: FrameScores, found: NDArray[np.float64], limits: TimeOffsetCo
 
 
 def _derivatives(
-    scores: FrameScores, found: NDArray[np.float64]
+    scores: FrameScores, optimum: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Central differences of each frame's score: negative Hessians over the fitted axes (F, 4, 4) and of the fitted
     axes with the translation (F, 4, 3), and gradients (F, 4)."""
 
     def at(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-        return scores(found + shifts)
+        return scores(optimum + shifts)
 
     gradients, second = along(at, STEPS, FITTED)
     hessians = np.zeros((gradients.shape[1], len(FITTED), len(FITTED)))

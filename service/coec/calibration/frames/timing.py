@@ -54,7 +54,7 @@ def explained_by_nuisance(
     rig: Rig,
     level: EdgeFrames,
     expected: Matrix4,
-    found: Matrix4,
+    rotation_optimum: Matrix4,
     pose_optimum: Matrix4,
     min_significance: float,
     zooms: Sequence[float] = ZOOMS,
@@ -71,14 +71,14 @@ def explained_by_nuisance(
         min_significance: below this nothing is explained.
         zooms: factors on the focal length to try.
     """
-    null, at_found = frame_alignment(level, expected).significance, frame_alignment(level, found)
-    turned, shifted = at_found.significance, frame_alignment(level, pose_optimum).significance
+    null, at_optimum = frame_alignment(level, expected).significance, frame_alignment(level, rotation_optimum)
+    turned, shifted = at_optimum.significance, frame_alignment(level, pose_optimum).significance
     least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
     best, explanation = 0.0, None
     for again, motions, cause in _hypotheses(edges, rig, level, zooms):
         unmoved = alignment_of_each(again, expected @ motions).significance
-        moved = alignment_of_each(again, found @ motions)
-        agree = float((moved.strength > at_found.strength).mean()) >= FRAMES_AGREE
+        moved = alignment_of_each(again, rotation_optimum @ motions)
+        agree = float((moved.strength > at_optimum.strength).mean()) >= FRAMES_AGREE
         gains = agree and moved.significance >= least_gain * turned
         enough = unmoved >= max(AS_GOOD * max(turned, shifted), BETTER * null)
         reached = max(unmoved if enough else 0.0, moved.significance if gains else 0.0)

@@ -29,7 +29,7 @@ NS_PER_S = 1_000_000_000
 CELLS = 180
 """Cells of the table of directions in view, from the optical axis to its opposite (1° each) and all around it (2°)."""
 
-LOOKS_PER_BIN = 16
+INSPECTIONS_PER_BIN = 16
 """Pairs of a bin that are inspected before it stays empty. Each inspection decodes an image, and a camera that is
 dirty, dark or standing for an hour must not cost a decode of every frame."""
 
@@ -52,7 +52,7 @@ class PairBetween:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptPairs:
+class CarriedOverPairs:
     """Pairs of a recorded window that also count for the next one.
 
     Attributes:
@@ -69,24 +69,24 @@ class KeptPairs:
 
 
 @dataclass(frozen=True, slots=True)
-class SliceEnded:
+class SliceClosed:
     """The end of a slice in which at least one pair was chosen. `pairs` includes those that were `kept` for it; the
     slice is `complete` if they are enough for a window."""
 
     window_id: str
     pairs: int
     complete: bool
-    kept: KeptPairs | None = None
+    carried_over: CarriedOverPairs | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class KeptForgotten:
+class CarriedOverDropped:
     """The kept pairs are too far in time from the slice that begins, and will be in no other window."""
 
-    kept: KeptPairs
+    carried_over: CarriedOverPairs
 
 
-Event = PairSelected | PairBetween | SliceEnded | KeptForgotten
+WindowEvent = PairSelected | PairBetween | SliceClosed | CarriedOverDropped
 
 
 @dataclass(slots=True)
@@ -95,7 +95,7 @@ class _Slice:
     start_ns: int
     length_ns: int
     filled: set[int]
-    next_look_ns: int
+    next_inspection_ns: int
 
 
 class WindowCutter:
@@ -115,7 +115,7 @@ class WindowCutter:
         self._next_config = config
         self._hurried_ns: int | None = None
         self._open: _Slice | None = None
-        self._kept: KeptPairs | None = None
+        self._carried_over: CarriedOverPairs | None = None
         self.rejections: Counter[str] = Counter()
         self.last_quality: ImageQuality | None = None
 
@@ -124,14 +124,14 @@ class WindowCutter:
         """The configuration of the open slice, or of the next one if none is open."""
         return self._config if self._open else self._next_config
 
-    def use(self, config: WindowConfig) -> None:
+    def reconfigure(self, config: WindowConfig) -> None:
         """Sets the configuration for the next slice; the open one keeps its own."""
         self._next_config = config
 
     @property
     def selected(self) -> int:
         """Number of pairs of the open slice so far: those chosen, and those kept for it."""
-        return len(self._open.filled) + self._kept_pairs if self._open else 0
+        return len(self._open.filled) + self._carried_over_pairs if self._open else 0
 
     @property
     def slice_end_ns(self) -> int | None:
@@ -143,10 +143,10 @@ class WindowCutter:
         """Stamp of the pair that opened the slice; None when none is open."""
         return self._open.start_ns if self._open else None
 
-    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[Event]:
+    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[WindowEvent]:
         """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, at which its points must be in view. A
         slice with kept pairs ends as soon as it has as many pairs as any slice."""
-        events: list[Event] = [*self._end_before(pair.stamp_ns)]
+        events: list[WindowEvent] = [*self._end_before(pair.stamp_ns)]
         if self._open is None:
             events += self._forget_before(pair.stamp_ns)
             window_id = f"{self._rig.pair}-{pair.stamp_ns}"
@@ -156,20 +156,20 @@ class WindowCutter:
             self._between.begin(self._config, pair.stamp_ns, length_ns)
             self._hurried_ns = None
         if self._select(self._open, pair, T_camera_lidar):
-            self._between.chosen(pair.stamp_ns)
+            self._between.on_selected(pair.stamp_ns)
             events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
-            if self._kept is not None and self.selected >= self._config.pairs:
+            if self._carried_over is not None and self.selected >= self._config.pairs:
                 events += self.finish()
         elif (between := self._between.offer(pair, T_camera_lidar)) is not None:
             events.append(PairBetween(self._open.window_id, between))
         return events
 
-    def keep(self, kept: KeptPairs) -> None:
+    def carry_over(self, carried_over: CarriedOverPairs) -> None:
         """Adds kept pairs to the open window, or else to the next one. They replace earlier kept pairs, which are a
         part of them or from another time."""
-        self._kept = kept
+        self._carried_over = carried_over
 
-    def advance(self, stamp_ns: int) -> list[SliceEnded]:
+    def advance(self, stamp_ns: int) -> list[SliceClosed]:
         """Ends the open slice if sensor time has passed its end although no pair came."""
         return self._end_before(stamp_ns) if self.slice_end_ns and stamp_ns >= self.slice_end_ns else []
 
@@ -178,31 +178,31 @@ class WindowCutter:
         length."""
         self._hurried_ns = round(slice_s * NS_PER_S)
 
-    def finish(self) -> list[SliceEnded]:
+    def finish(self) -> list[SliceClosed]:
         """Ends the open slice now. If it has too few pairs for a window, the kept pairs stay for the next one."""
-        ended, pairs, kept = self._open, self.selected, self._kept
+        closed, pairs, carried_over = self._open, self.selected, self._carried_over
         self._open = None
-        if ended is None or not ended.filled:
+        if closed is None or not closed.filled:
             return []
         complete = pairs >= self._config.min_pairs
         if complete:
-            self._kept = None
-        return [SliceEnded(ended.window_id, pairs, complete, kept if complete else None)]
+            self._carried_over = None
+        return [SliceClosed(closed.window_id, pairs, complete, carried_over if complete else None)]
 
     @property
-    def _kept_pairs(self) -> int:
-        return self._kept.pairs if self._kept is not None else 0
+    def _carried_over_pairs(self) -> int:
+        return self._carried_over.pairs if self._carried_over is not None else 0
 
-    def _forget_before(self, start_ns: int) -> list[KeptForgotten]:
+    def _forget_before(self, start_ns: int) -> list[CarriedOverDropped]:
         """Drops kept pairs that do not lie within one slice length before the slice that begins: they are older, or
         newer because sensor time stepped back."""
-        kept = self._kept
-        if kept is None or 0 <= start_ns - kept.last_ns <= round(self._config.slice_s * NS_PER_S):
+        carried_over = self._carried_over
+        if carried_over is None or 0 <= start_ns - carried_over.last_ns <= round(self._config.slice_s * NS_PER_S):
             return []
-        self._kept = None
-        return [KeptForgotten(kept)]
+        self._carried_over = None
+        return [CarriedOverDropped(carried_over)]
 
-    def _end_before(self, stamp_ns: int) -> list[SliceEnded]:
+    def _end_before(self, stamp_ns: int) -> list[SliceClosed]:
         """Ends the open slice if the stamp lies outside it, also because sensor time stepped back."""
         if self._open is None or 0 <= stamp_ns - self._open.start_ns < self._open.length_ns:
             return []
@@ -211,15 +211,15 @@ class WindowCutter:
     def _select(self, current: _Slice, pair: FramePair, T_camera_lidar: Matrix4) -> bool:
         bin_ns = current.length_ns // self._config.pairs
         index = min((pair.stamp_ns - current.start_ns) // bin_ns, self._config.pairs - 1)
-        if index in current.filled or pair.stamp_ns < current.next_look_ns:
+        if index in current.filled or pair.stamp_ns < current.next_inspection_ns:
             return False
         reason = self._objection(pair, T_camera_lidar)
         if reason is not None:
             self.rejections[reason] += 1
-            current.next_look_ns = pair.stamp_ns + bin_ns // LOOKS_PER_BIN
+            current.next_inspection_ns = pair.stamp_ns + bin_ns // INSPECTIONS_PER_BIN
             return False
         current.filled.add(index)
-        current.next_look_ns = pair.stamp_ns + bin_ns // 2
+        current.next_inspection_ns = pair.stamp_ns + bin_ns // 2
         return True
 
     def _objection(self, pair: FramePair, T_camera_lidar: Matrix4) -> str | None:

@@ -160,12 +160,14 @@ def _meet_one(
     residual = np.einsum("ni,ni->n", plane.normal, point - plane.centre + bias[0] * ray_a)
     with np.errstate(invalid="ignore"):
         flat = (thickness < THICKEST_M) & (narrow > NARROWEST * wide) & (narrow > np.maximum(thickness, NARROWEST_M))
-        kept = flat & (plane.used >= LEAST_NEIGHBOURS) & (np.abs(residual) < reach_m)
-    point, normal = point[kept], plane.normal[kept]
-    by_bias = np.column_stack([np.einsum("ni,ni->n", normal, ray_a[kept]), -np.einsum("ni,ni->n", normal, ray_b[kept])])
+        valid = flat & (plane.used >= LEAST_NEIGHBOURS) & (np.abs(residual) < reach_m)
+    point, normal = point[valid], plane.normal[valid]
+    by_bias = np.column_stack(
+        [np.einsum("ni,ni->n", normal, ray_a[valid]), -np.einsum("ni,ni->n", normal, ray_b[valid])]
+    )
     jacobian = np.column_stack([np.cross(point, normal), normal, by_bias])
     # How far a normal may lean: the noise along it over the extent of its points (least squares of a plane).
-    leans = thickness[kept, None] / (np.sqrt(plane.used[kept, None]) * plane.spread[kept, 1:])
-    leaning = leans[:, :, None] * plane.axes[kept]
+    leans = thickness[valid, None] / (np.sqrt(plane.used[valid, None]) * plane.spread[valid, 1:])
+    leaning = leans[:, :, None] * plane.axes[valid]
     tilt = np.concatenate([np.cross(point[:, None, :], leaning), leaning], axis=2)
-    return residual[kept], jacobian, tilt, np.full(int(kept.sum()), number, np.int64), point
+    return residual[valid], jacobian, tilt, np.full(int(valid.sum()), number, np.int64), point

@@ -22,7 +22,7 @@ SPACING_NS = 2 * NS_PER_S
 """Time between these pairs: some ten metres further on other surfaces are in view, and a mount is hardly ever hit in
 between."""
 
-APART_NS = 60_000_000
+MAX_STAMP_DIFFERENCE_NS = 60_000_000
 """Most difference between the stamps of a pair: half a turn at 10 Hz, and a little."""
 
 LATEST_NS = 400_000_000
@@ -36,7 +36,7 @@ CANDIDATES_HELD = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class SweepSet:
     """Pairs of sweeps, in the order of their stamps."""
 
     pairs: tuple[SweepPair, ...]
@@ -53,7 +53,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Missed:
+class MissedSweep:
     """A sweep of a that was due but not taken, with the cause: no sweep of b is near (`no_sweep`), no ego-motion with a
     velocity is known (`no_ego_motion`), the vehicle stands (`standing`), or points have no time (`no_point_time`)."""
 
@@ -61,7 +61,7 @@ class Missed:
     cause: str
 
 
-Found = list[Look | Missed]
+SampledSweeps = list[SweepSet | MissedSweep]
 
 
 class SweepSampler:
@@ -108,7 +108,7 @@ class SweepSampler:
         """Number of sweeps that are kept."""
         return len(self._candidates) + len(self._sweeps) + 2 * len(self._taken)
 
-    def push_a(self, sweep: LidarFrame) -> Found:
+    def push_a(self, sweep: LidarFrame) -> SampledSweeps:
         """Takes the next sweep of a; returns the looks and misses that became certain."""
         before_ns = self._time_a.latest_ns
         if self._time_a.refusal(sweep.stamp_ns) is not None:
@@ -124,21 +124,21 @@ class SweepSampler:
                 self.losses["overrun"] += 1
         return self._decided()
 
-    def push_b(self, sweep: LidarFrame) -> Found:
+    def push_b(self, sweep: LidarFrame) -> SampledSweeps:
         """Takes the next sweep of b, likewise."""
         before_ns = self._time_b.latest_ns
         if self._time_b.refusal(sweep.stamp_ns) is not None:
             return []
         if before_ns is not None and sweep.stamp_ns < before_ns:
             self._sweeps.clear()
-        _, after_ns = self._instant_before(sweep.stamp_ns + APART_NS)
-        if after_ns <= LATEST_NS + 2 * APART_NS:
+        _, after_ns = self._instant_before(sweep.stamp_ns + MAX_STAMP_DIFFERENCE_NS)
+        if after_ns <= LATEST_NS + 2 * MAX_STAMP_DIFFERENCE_NS:
             self._sweeps.append(sweep)
             if len(self._sweeps) > SWEEPS_HELD:
                 self._sweeps.popleft()
         return self._decided()
 
-    def push_motion(self, motion: EgoMotion) -> Found:
+    def push_motion(self, motion: EgoMotion) -> SampledSweeps:
         """Takes the next ego-motion, likewise."""
         before_ns = self._time_motion.latest_ns
         if self._time_motion.refusal(motion.stamp_ns) is not None:
@@ -160,14 +160,14 @@ class SweepSampler:
         number = min(within_ns // SPACING_NS, PAIRS - 1)
         return (period, number), within_ns - number * SPACING_NS
 
-    def _decided(self) -> Found:
-        found: Found = []
+    def _decided(self) -> SampledSweeps:
+        results: SampledSweeps = []
         while self._candidates and self._is_certain(self._candidates[0].stamp_ns):
             taken = self._take(self._candidates.popleft())
             if taken is not None:
-                found.append(taken)
+                results.append(taken)
         self._forget()
-        return found
+        return results
 
     def _is_certain(self, stamp_ns: int) -> bool:
         """Whether later frames can no longer change what belongs to a sweep of a, or are overdue."""
@@ -177,34 +177,34 @@ class SweepSampler:
         others = (self._time_b.latest_ns, self._time_motion.latest_ns)
         return all(other_ns is not None and other_ns >= stamp_ns for other_ns in others)
 
-    def _take(self, a: LidarFrame) -> Look | Missed | None:
+    def _take(self, a: LidarFrame) -> SweepSet | MissedSweep | None:
         """What becomes of a sweep of a; None if its look is not complete yet."""
         (period, number), _ = self._instant_before(a.stamp_ns)
         if self._taken and (number == 0 or self._taken[0].a.stamp_ns // self._period_ns != period):
             self.losses["incomplete"] += len(self._taken)
             self._taken.clear()
         pair = self._pair_of(a)
-        if isinstance(pair, Missed):
+        if isinstance(pair, MissedSweep):
             self.losses[pair.cause] += 1
             return pair
         self._taken.append(pair)
         if len(self._taken) < PAIRS:
             return None
-        look = Look(tuple(self._taken))
+        sweep_set = SweepSet(tuple(self._taken))
         self._taken.clear()
-        return look
+        return sweep_set
 
-    def _pair_of(self, a: LidarFrame) -> SweepPair | Missed:
+    def _pair_of(self, a: LidarFrame) -> SweepPair | MissedSweep:
         b = min(self._sweeps, key=lambda sweep: abs(sweep.stamp_ns - a.stamp_ns), default=None)
         motion = motion_at(list(self._motions), a.stamp_ns, self._motion_tolerance_ns)
-        if b is None or abs(b.stamp_ns - a.stamp_ns) > APART_NS:
-            return Missed(a.stamp_ns, "no_sweep")
+        if b is None or abs(b.stamp_ns - a.stamp_ns) > MAX_STAMP_DIFFERENCE_NS:
+            return MissedSweep(a.stamp_ns, "no_sweep")
         if motion is None or motion.linear_mps is None:
-            return Missed(a.stamp_ns, "no_ego_motion")
+            return MissedSweep(a.stamp_ns, "no_ego_motion")
         if motion.stays_below(self._min_speed_mps):
-            return Missed(a.stamp_ns, "standing")
+            return MissedSweep(a.stamp_ns, "standing")
         if any(sweep.time_offset_s is None and not timed for sweep, timed in ((a, self._timed_a), (b, self._timed_b))):
-            return Missed(a.stamp_ns, "no_point_time")
+            return MissedSweep(a.stamp_ns, "no_point_time")
         return SweepPair(a, b, motion)
 
     def _forget(self) -> None:
@@ -212,6 +212,6 @@ class SweepSampler:
         latest_ns = self._time_a.latest_ns
         if latest_ns is None:
             return
-        needed_ns = (self._candidates[0].stamp_ns if self._candidates else latest_ns) - APART_NS
+        needed_ns = (self._candidates[0].stamp_ns if self._candidates else latest_ns) - MAX_STAMP_DIFFERENCE_NS
         while self._sweeps and self._sweeps[0].stamp_ns < needed_ns:
             self._sweeps.popleft()

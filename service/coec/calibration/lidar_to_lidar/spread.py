@@ -19,13 +19,13 @@ from coec.calibration.lidar_to_lidar.sweeps import Cloud
 from coec.calibration.lidar_to_lidar.types import Met
 from coec.geometry.linear import congruent, eigen, inverted
 
-Doubles = NDArray[np.float64]
+DoublesOfSpread = NDArray[np.float64]
 
 AZIMUTHS, ELEVATIONS = 8, 2
 """Sectors of the surroundings of a: by azimuth, and above or below its horizon."""
 CLOCK_S = 0.001
 """By how much the clocks of two synchronised LiDARs (PTP, or a pulse per second) may differ, s."""
-GRAIN_RAD, GRAIN_M = radians(0.01), 0.002
+RESOLUTION_RAD, RESOLUTION_M = radians(0.01), 0.002
 """Error of angle and place that all points of a LiDAR may have in common: the steps of azimuth and range in the packets
 of common sensors (VLP-16, HDL-64E: 0.01° and 2 mm)."""
 LEANING = 2.0
@@ -33,7 +33,9 @@ LEANING = 2.0
 no better than a variance of a dozen neighbours."""
 
 
-def covariance_of(met: Met, weight: Doubles, prior: Doubles, noise_m: float, clouds: Sequence[Cloud]) -> Doubles:
+def covariance_of(
+    met: Met, weight: DoublesOfSpread, prior: DoublesOfSpread, noise_m: float, clouds: Sequence[Cloud]
+) -> DoublesOfSpread:
     """The covariance (8, 8) of ξ and of the range biases of a and b.
 
     Args:
@@ -45,32 +47,32 @@ def covariance_of(met: Met, weight: Doubles, prior: Doubles, noise_m: float, clo
     """
     known = np.diag(prior**-2.0)
     weighted = met.jacobian * weight[:, None]
-    told = np.einsum("ni,nj->ij", weighted, met.jacobian) / noise_m**2
+    measured = np.einsum("ni,nj->ij", weighted, met.jacobian) / noise_m**2
     pretended = np.zeros((8, 8))
     pretended[:6, :6] = np.einsum("n,nki,nkj->ij", weight, met.tilt, met.tilt) / noise_m**2
-    information = _held(told - LEANING * pretended, prior) + known
+    information = _held(measured - LEANING * pretended, prior) + known
     scattered = np.array(scatter(_cells(met, weighted * met.residual[:, None]))) / noise_m**4 + known
     covariance = np.array(congruent(inverted(information.tolist()), scattered.tolist()))
     # An error of the clocks is a shift and a turn along the way, alike in all pairs.
     moved = np.zeros(8)
     moved[:6] = CLOCK_S * np.mean([cloud.twist for cloud in clouds], axis=0)
-    grain = np.diag(2.0 * np.array([GRAIN_RAD] * 3 + [GRAIN_M] * 3 + [0.0] * 2) ** 2)  # of either LiDAR
-    return _no_wider(covariance, prior) + np.outer(moved, moved) + grain
+    resolution = np.diag(2.0 * np.array([RESOLUTION_RAD] * 3 + [RESOLUTION_M] * 3 + [0.0] * 2) ** 2)  # of either LiDAR
+    return _no_wider(covariance, prior) + np.outer(moved, moved) + resolution
 
 
-def _held(information: Doubles, prior: Doubles) -> Doubles:
+def _held(information: DoublesOfSpread, prior: DoublesOfSpread) -> DoublesOfSpread:
     """The matrix without its negative eigenvalues, with each unknown in units of its prior."""
     unit = prior[:, None] * prior
     return _reshaped(information * unit, lambda value: max(value, 0.0)) / unit
 
 
-def _no_wider(covariance: Doubles, prior: Doubles) -> Doubles:
+def _no_wider(covariance: DoublesOfSpread, prior: DoublesOfSpread) -> DoublesOfSpread:
     """The covariance combined with the prior, because a scatter that few points hold may be wider than the prior."""
     unit = prior[:, None] * prior
     return _reshaped(covariance / unit, lambda value: max(value, 0.0) / (1.0 + max(value, 0.0))) * unit
 
 
-def _reshaped(symmetric: Doubles, of: Callable[[float], float]) -> Doubles:
+def _reshaped(symmetric: DoublesOfSpread, of: Callable[[float], float]) -> DoublesOfSpread:
     """The matrix (8, 8) with its eigenvalues replaced by a function of them."""
     result = np.zeros((8, 8))
     for value, vector in eigen(symmetric.tolist()):
@@ -78,7 +80,7 @@ def _reshaped(symmetric: Doubles, of: Callable[[float], float]) -> Doubles:
     return result
 
 
-def _cells(met: Met, score: Doubles) -> Doubles:
+def _cells(met: Met, score: DoublesOfSpread) -> DoublesOfSpread:
     """(8, pairs, sectors) sums of the score (N, 8) over each pair and sector."""
     azimuth = np.arctan2(met.place[:, 1], met.place[:, 0])
     around = np.minimum(((azimuth / (2 * np.pi) + 0.5) * AZIMUTHS).astype(np.int64), AZIMUTHS - 1)

@@ -14,16 +14,16 @@ from math import degrees, fsum, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.window import KeptPairs
+from coec.calibration.frames.window import CarriedOverPairs
 from coec.calibration.lifecycle import policy
 from coec.calibration.lifecycle.alarm_record import AlarmRecord
-from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
+from coec.calibration.lifecycle.states import TRANSITIONS, HealthEvent, HealthState
 from coec.calibration.monitor.change_detector import (
     ACCUSING,
     ACQUITTAL_PERIODS,
     BLIND_AT,
     AlarmLevels,
-    Finding,
+    MonitorOutcome,
     MonitorState,
     Observation,
     after_window,
@@ -34,7 +34,7 @@ from coec.calibration.monitor.change_detector import (
 )
 from coec.calibration.monitor.change_detector import after_observation as check_taken
 from coec.calibration.monitor.sensor_faults import CAUSES, Cause
-from coec.calibration.tracker import Measurement, StepState, Track, absorb, fits, prior_sigma
+from coec.calibration.tracker import Measurement, StepState, Track, fits, prior_sigma, update_track
 from coec.calibration.types import INTRINSICS_OFF, Decision, Estimate, Matrix4, MovedWithin, Reason, Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import CoecError
@@ -77,7 +77,7 @@ class Provenance(StrEnum):
     RESTORED = "restored"
 
 
-class Status(StrEnum):
+class CalibrationStatus(StrEnum):
     """How the latest calibration ended; `not_accepted` before the first."""
 
     NOT_ACCEPTED = "not_accepted"
@@ -100,7 +100,7 @@ class CommandRefusedError(CoecError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class PendingEstimate:
     """A pose (4, 4) from an accepted estimate that waits for `apply`; why it waits, and whether it contradicts the
     served pose, being too far from it for both to be right."""
 
@@ -111,7 +111,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Hold:
+class ExtrinsicHold:
     """A person holds the extrinsic: since when (wall clock, ns since 1970), who, and why, in their words; None and
     empty if unknown."""
 
@@ -129,7 +129,7 @@ class Health:
 
 
 @dataclass(frozen=True, slots=True)
-class Rules:
+class PairRules:
     """The configuration that the owner of the vehicle has set."""
 
     policy: PolicyConfig
@@ -169,7 +169,7 @@ class PairState:
 
     T_camera_lidar: Matrix4
     provenance: Provenance
-    status: Status
+    status: CalibrationStatus
     valid_from_ns: int
     latest: Estimate | None = None
     accepted: Estimate | None = None
@@ -177,14 +177,14 @@ class PairState:
     health: HealthState = HealthState.UNKNOWN
     reasons: tuple[Reason, ...] = (NOT_EVALUATED,)
     unseen_from: Health | None = None
-    pending: Candidate | None = None
-    hold: Hold | None = None
+    pending: PendingEstimate | None = None
+    hold: ExtrinsicHold | None = None
     proven: bool = False
     track: Track | None = None
     monitor: MonitorState = field(default_factory=MonitorState)
     flagged_since_ns: int | None = None
     poor_since_ns: int | None = None
-    changes: tuple[policy.Change, ...] = ()
+    changes: tuple[policy.AppliedChange, ...] = ()
     record: AlarmRecord = field(default_factory=AlarmRecord)
 
     @property
@@ -195,7 +195,7 @@ class PairState:
 
 def initial_state(rig: Rig) -> PairState:
     """The first state: nominal extrinsic, not accepted, nothing looked at."""
-    return PairState(rig.T_camera_lidar_nominal, Provenance.NOMINAL, Status.NOT_ACCEPTED, 0)
+    return PairState(rig.T_camera_lidar_nominal, Provenance.NOMINAL, CalibrationStatus.NOT_ACCEPTED, 0)
 
 
 def restored(state: PairState) -> PairState:
@@ -205,7 +205,7 @@ def restored(state: PairState) -> PairState:
         state = replace(state, provenance=Provenance.RESTORED)
     # The mount may have moved since, and the vehicle too.
     monitor = replace(state.monitor, acquitted_ns=None, unacquitted=0, stood=False, standstill=None)
-    return _unseen(replace(state, monitor=monitor), Event.RESTARTED, RESTARTED)
+    return _unseen(replace(state, monitor=monitor), HealthEvent.RESTARTED, RESTARTED)
 
 
 def moved(estimate: Estimate, pose: Matrix4, rig: Rig) -> Estimate:
@@ -219,7 +219,7 @@ def agrees(T_one: Matrix4, T_other: Matrix4, rules: PolicyConfig) -> bool:
     return policy.agrees(policy.step_between(T_one, T_other), rules)
 
 
-def happened(state: PairState, event: Event, *reasons: Reason) -> PairState:
+def happened(state: PairState, event: HealthEvent, *reasons: Reason) -> PairState:
     """The state after an event: the table decides on health, and the given reasons replace the old ones."""
     return replace(state, health=TRANSITIONS[state.seen, event], reasons=reasons, unseen_from=None)
 
@@ -227,18 +227,18 @@ def happened(state: PairState, event: Event, *reasons: Reason) -> PairState:
 # --- windows --------------------------------------------------------------------------------------------------------
 
 
-def before_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules) -> PairState:
+def before_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: PairRules) -> PairState:
     """The state when a window was solved, before `after_estimate`. If the window is accepted and its pose is elsewhere
     than an extrinsic that the monitor suspects, there are two witnesses: the mount has moved, even if the next step
     corrects it at once."""
     mixed = state.flagged_since_ns is not None and window_start_ns < state.flagged_since_ns
     if estimate.verdict.decision is Decision.FAILED or mixed or not _accused_elsewhere(state, estimate, rules):
         return state
-    return _unless_red(state, Event.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
+    return _unless_red(state, HealthEvent.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
 
 
 def after_estimate(
-    state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules, now_ns: int | None = None
+    state: PairState, estimate: Estimate, window_start_ns: int, rules: PairRules, now_ns: int | None = None
 ) -> PairState:
     """The state after a window was solved.
 
@@ -249,28 +249,28 @@ def after_estimate(
     """
     state = replace(state, latest=estimate, failures=())
     if estimate.verdict.decision is Decision.FAILED:
-        state = replace(state, status=Status.FAILED)
-        moved = _well_told_move(estimate)
-        if estimate.verdict.tells_another_lens:
-            return _poor(state, Event.DATA_CAUSE, estimate.data_stamp_ns, CAUSES[INTRINSICS_OFF].as_reason())
+        state = replace(state, status=CalibrationStatus.FAILED)
+        moved = _unambiguous_move(estimate)
+        if estimate.verdict.shows_another_lens:
+            return _poor(state, HealthEvent.DATA_CAUSE, estimate.data_stamp_ns, CAUSES[INTRINSICS_OFF].as_reason())
         # In a tunnel two poses fit as well as before and after a step: checks that acquit later pairs outweigh that.
-        if (moved is None and estimate.verdict.cannot_tell) or (moved is not None and _is_outweighed(state, moved)):
+        if (moved is None and estimate.verdict.is_inconclusive) or (moved is not None and _is_outweighed(state, moved)):
             return state
         # If the camera moved within the window, the end of the window shows where it is now.
         latest = estimate.optimum.T_camera_lidar if moved is None else moved.T_after
         if agrees(state.T_camera_lidar, latest, rules.policy):
             return state
-        return _unless_red(state, Event.REFUSED_ELSEWHERE, *estimate.verdict.reasons)
-    state = replace(state, status=Status.ACCEPTED)
+        return _unless_red(state, HealthEvent.REFUSED_ELSEWHERE, *estimate.verdict.reasons)
+    state = replace(state, status=CalibrationStatus.ACCEPTED)
     if state.flagged_since_ns is not None and window_start_ns < state.flagged_since_ns:
         return state
     track = _tracked(state, estimate, rules)
     state = replace(state, track=track)
     if track.step is StepState.SUSPECTED and track.candidate is not None:
         step = policy.step_between(state.T_camera_lidar, track.candidate.T_camera_lidar)
-        why = Reason("step_suspected", f"The latest window differs by {_told(step)}; the next one decides.")
-        pending = Candidate(track.candidate.T_camera_lidar, estimate, why, contradicts=True)
-        return _unless_red(replace(state, pending=pending), Event.STEP_SUSPECTED, why)
+        why = Reason("step_suspected", f"The latest window differs by {_step_text(step)}; the next one decides.")
+        pending = PendingEstimate(track.candidate.T_camera_lidar, estimate, why, contradicts=True)
+        return _unless_red(replace(state, pending=pending), HealthEvent.STEP_SUSPECTED, why)
     # A track of one window has that window's pose to the last bit.
     pose = estimate.optimum.T_camera_lidar if track.windows <= 1 else track.T_camera_lidar
     return _applied_or_waiting(state, pose, estimate, estimate.data_stamp_ns, rules, now_ns)
@@ -291,74 +291,74 @@ def _data_cause(monitor: MonitorState) -> Cause | None:
     return None if cause is None or cause.code == BENT_MOUNT else cause
 
 
-def _well_told_move(estimate: Estimate) -> MovedWithin | None:
+def _unambiguous_move(estimate: Estimate) -> MovedWithin | None:
     """The move within a window; None if there is none or if another reason also makes the window doubtful."""
-    return estimate.moved if estimate.verdict.tells_two_poses else None
+    return estimate.moved if estimate.verdict.shows_two_poses else None
 
 
-def window_wanted_since(state: PairState) -> int | None:
+def urgent_window_since(state: PairState) -> int | None:
     """The sensor time since which pairs are wanted for an urgent window; None if none is urgent. It is urgent if the
     monitor accuses the served extrinsic; if the camera moved within the latest window and health is `suspect` or
     `miscalibrated`; or if checks have made health `suspect`."""
     if state.monitor.outcome in ACCUSING and state.flagged_since_ns is not None:
         return state.flagged_since_ns
-    moved = None if state.latest is None else _well_told_move(state.latest)
+    moved = None if state.latest is None else _unambiguous_move(state.latest)
     if moved is not None and state.seen in (HealthState.SUSPECT, HealthState.MISCALIBRATED):
         return moved.first_after_ns
     return state.flagged_since_ns if state.seen is HealthState.SUSPECT else None
 
 
-def kept_for_next(estimate: Estimate) -> KeptPairs | None:
+def carried_over_pairs(estimate: Estimate) -> CarriedOverPairs | None:
     """The pairs of a window that come after the camera moved within it: the next window may use them as its own. None
     if there are none."""
     moved = estimate.moved
     if moved is None or not moved.pairs_after:
         return None
-    return KeptPairs(estimate.window_id, moved.first_after_ns, estimate.data_stamp_ns, moved.pairs_after)
+    return CarriedOverPairs(estimate.window_id, moved.first_after_ns, estimate.data_stamp_ns, moved.pairs_after)
 
 
-def told_by_rig(estimate: Estimate, covariance: NDArray[np.float64]) -> Estimate:
+def with_rig_covariance(estimate: Estimate, covariance: NDArray[np.float64]) -> Estimate:
     """The estimate with the uncertainty of all pairs of the rig together: their covariance (6, 6), NaN on axes that it
     does not determine."""
     return replace(estimate, uncertainty=replace(estimate.uncertainty, noise=covariance, systematic={}))
 
 
-def after_joint(state: PairState, joint: Estimate, stamp_ns: int, rules: Rules) -> PairState:
+def after_joint(state: PairState, joint: Estimate, stamp_ns: int, rules: PairRules) -> PairState:
     """The state after a sensor of the pair moved and the windows of all its pairs together said where it is, decided at
     the sensor time `stamp_ns`. The track starts again from that pose. The policy applies, and so does a hold."""
     pose = joint.optimum.T_camera_lidar
     track = Track.initial(pose, prior_sigma(rules.tracker), stamp_ns)
-    track = absorb(track, replace(Measurement.of(joint), stamp_ns=stamp_ns), rules.tracker)
+    track = update_track(track, replace(Measurement.from_estimate(joint), stamp_ns=stamp_ns), rules.tracker)
     return _applied_or_waiting(replace(state, track=track), pose, joint, stamp_ns, rules)
 
 
 def after_failure(state: PairState, reason: Reason) -> PairState:
     """The state after a window from which no estimate could be made. The served extrinsic and its health stay, because
     this says nothing about them."""
-    return replace(state, status=Status.FAILED, failures=(reason,))
+    return replace(state, status=CalibrationStatus.FAILED, failures=(reason,))
 
 
-def _tracked(state: PairState, estimate: Estimate, rules: Rules) -> Track:
+def _tracked(state: PairState, estimate: Estimate, rules: PairRules) -> Track:
     """The track with the estimate in it. It starts anew from the estimate if there is no track yet, or if the monitor
     already accuses the served extrinsic and the estimate is elsewhere: then two witnesses agree that the mount
     moved."""
-    measurement = Measurement.of(estimate)
+    measurement = Measurement.from_estimate(estimate)
     pose = estimate.optimum.T_camera_lidar
     track = state.track
     if track is None or _accused_elsewhere(state, estimate, rules):
         track = Track.initial(pose, prior_sigma(rules.tracker), estimate.data_stamp_ns)
     doubted = state.monitor.unacquitted > 0 or state.seen in (HealthState.SUSPECT, HealthState.MISCALIBRATED)
-    return absorb(track, measurement, rules.tracker, doubted=doubted)
+    return update_track(track, measurement, rules.tracker, doubted=doubted)
 
 
-def _accused_elsewhere(state: PairState, estimate: Estimate, rules: Rules) -> bool:
+def _accused_elsewhere(state: PairState, estimate: Estimate, rules: PairRules) -> bool:
     """Whether the monitor accuses the served extrinsic, and the estimate is too far from it for both to be right."""
     accused = state.monitor.outcome in ACCUSING
     return accused and not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
 
 
 def _applied_or_waiting(
-    state: PairState, pose: Matrix4, estimate: Estimate, stamp_ns: int, rules: Rules, now_ns: int | None = None
+    state: PairState, pose: Matrix4, estimate: Estimate, stamp_ns: int, rules: PairRules, now_ns: int | None = None
 ) -> PairState:
     """The state after an accepted pose (4, 4) that rests on data up to the sensor time `stamp_ns`; for `now_ns` see
     `after_estimate`."""
@@ -370,15 +370,15 @@ def _applied_or_waiting(
     if state.hold is not None:
         waits = Reason("held", "The extrinsic is held by command: the candidate waits for its release.")
     if waits is None:
-        change = policy.Change(estimate.data_stamp_ns, tuple(abs(float(value)) for value in step))
+        change = policy.AppliedChange(estimate.data_stamp_ns, tuple(abs(float(value)) for value in step))
         served = replace(_served(state, pose, estimate), changes=(*past, change))
         return _confirmed(served, state.T_camera_lidar, estimate, stamp_ns, rules, now_ns)
     close = policy.agrees(step, rules.policy)
-    state = replace(state, pending=Candidate(pose, estimate, waits, contradicts=not close))
+    state = replace(state, pending=PendingEstimate(pose, estimate, waits, contradicts=not close))
     if close:
         return _confirmed(state, state.T_camera_lidar, estimate, stamp_ns, rules, now_ns)
-    why = Reason("candidate_waits", f"An accepted window differs by {_told(step)} from what is served.")
-    return happened(state, Event.CONTRADICTED, why, waits)
+    why = Reason("candidate_waits", f"An accepted window differs by {_step_text(step)} from what is served.")
+    return happened(state, HealthEvent.CONTRADICTED, why, waits)
 
 
 def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
@@ -396,13 +396,13 @@ def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
 
 
 def _confirmed(
-    state: PairState, T_before: Matrix4, estimate: Estimate, stamp_ns: int, rules: Rules, now_ns: int | None
+    state: PairState, T_before: Matrix4, estimate: Estimate, stamp_ns: int, rules: PairRules, now_ns: int | None
 ) -> PairState:
     """The state after a window with data up to the sensor time `stamp_ns` was accepted, and its combination with
     earlier ones is served, or agrees with what is served; `T_before` (4, 4) was served before. If the window vouches
     for that, what the monitor had against it is dropped, as far as the window could judge it; causes in the data stay.
     A window that lies beside it, as while the mount drifts, renews and clears nothing."""
-    if not fits(state.T_camera_lidar, replace(Measurement.of(estimate), stamp_ns=stamp_ns)):
+    if not fits(state.T_camera_lidar, replace(Measurement.from_estimate(estimate), stamp_ns=stamp_ns)):
         return replace(state, proven=True)
     monitor = after_window(
         state.monitor,
@@ -411,26 +411,26 @@ def _confirmed(
         solved_translation=bool(estimate.solved[3:].all()),
         agrees=agrees(T_before, state.T_camera_lidar, rules.policy),
     )
-    accused = monitor.outcome in (Finding.SUSPECT, Finding.CONFIRMED)
+    accused = monitor.outcome in (MonitorOutcome.SUSPECT, MonitorOutcome.CONFIRMED)
     since_ns = (state.flagged_since_ns or state.valid_from_ns) if accused else None
     state = replace(state, proven=True, monitor=monitor, flagged_since_ns=since_ns)
     if accused:
-        event = Event.MOUNT_MOVED if monitor.outcome is Finding.CONFIRMED else Event.SUSPECTED
+        event = HealthEvent.MOUNT_MOVED if monitor.outcome is MonitorOutcome.CONFIRMED else HealthEvent.SUSPECTED
         return _unless_red(state, event, TRANSLATION_OPEN)
     if not is_acquitted(monitor, stamp_ns if now_ns is None else now_ns, rules.monitor):
         text = "A window confirms the extrinsic, but its last pairs are old; no check has acquitted it since."
-        return happened(state, Event.CONFIRMED_EARLIER, Reason(NOT_ACQUITTED, text))
+        return happened(state, HealthEvent.CONFIRMED_EARLIER, Reason(NOT_ACQUITTED, text))
     cause = _data_cause(monitor)
     if cause is None:
-        return _well_again(state, Event.CONFIRMED_BY_WINDOW, stamp_ns)
-    after = happened(happened(state, Event.CONFIRMED_BY_WINDOW), Event.DATA_CAUSE, cause.as_reason())
+        return _well_again(state, HealthEvent.CONFIRMED_BY_WINDOW, stamp_ns)
+    after = happened(happened(state, HealthEvent.CONFIRMED_BY_WINDOW), HealthEvent.DATA_CAUSE, cause.as_reason())
     return after if state.seen is HealthState.DEGRADED else replace(after, poor_since_ns=stamp_ns)
 
 
 # --- the monitor, and time ------------------------------------------------------------------------------------------
 
 
-def after_observation(state: PairState, observation: Observation, rules: Rules) -> PairState:
+def after_observation(state: PairState, observation: Observation, rules: PairRules) -> PairState:
     """The state after the monitor checked the served extrinsic. One check decides nothing: `MonitorState` adds them
     up."""
     monitor = check_taken(state.monitor, observation, rules.alarm)
@@ -438,9 +438,9 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
     if (observation.flagged or observation.undecided) and not observation.causes:
         if since_ns is None:
             # Without a clear check before, nothing shows that earlier pairs were better.
-            was_clear = state.monitor.outcome is Finding.CLEAR
+            was_clear = state.monitor.outcome is MonitorOutcome.CLEAR
             since_ns = observation.pair_stamps_ns[0] if was_clear else state.valid_from_ns
-    elif monitor.outcome in (Finding.CLEAR, Finding.UNKNOWN):
+    elif monitor.outcome in (MonitorOutcome.CLEAR, MonitorOutcome.UNKNOWN):
         since_ns = None
     elif since_ns is None and monitor.outcome in ACCUSING:
         # All checks together accuse the extrinsic, but none by itself: then all pairs count as flagged.
@@ -448,27 +448,27 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
     state = replace(state, monitor=monitor, flagged_since_ns=since_ns)
     cause = _data_cause(monitor)
     if cause is not None:
-        return _poor(state, Event.DATA_CAUSE, observation.stamp_ns, cause.as_reason())
-    if monitor.outcome is Finding.CONFIRMED:
-        return happened(state, Event.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
-    if monitor.outcome is Finding.SUSPECT:
+        return _poor(state, HealthEvent.DATA_CAUSE, observation.stamp_ns, cause.as_reason())
+    if monitor.outcome is MonitorOutcome.CONFIRMED:
+        return happened(state, HealthEvent.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
+    if monitor.outcome is MonitorOutcome.SUSPECT:
         text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to decide."
-        return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
-    if monitor.outcome is Finding.AT_ODDS:
+        return _unless_red(state, HealthEvent.SUSPECTED, Reason("monitor_suspects", text))
+    if monitor.outcome is MonitorOutcome.AT_ODDS:
         text = "The latest checks accuse the mount, but do not add up to a move; a window is being taken to decide."
-        return _poor(state, Event.AT_ODDS, observation.stamp_ns, Reason("checks_at_odds", text))
+        return _poor(state, HealthEvent.AT_ODDS, observation.stamp_ns, Reason("checks_at_odds", text))
     if monitor.unacquitted > 0:
         return _not_renewed(state, observation, rules)
     # A clear monitor does not outweigh an accepted window that contradicts the served extrinsic.
     if state.pending is None or not state.pending.contradicts:
         if state.proven:
-            return _well_again(state, Event.CLEAR, observation.stamp_ns)
-        after = _well_again(state, Event.NO_OBJECTION, observation.stamp_ns, NOT_EVALUATED)
+            return _well_again(state, HealthEvent.CLEAR, observation.stamp_ns)
+        after = _well_again(state, HealthEvent.NO_OBJECTION, observation.stamp_ns, NOT_EVALUATED)
         return after if after.health is not state.seen or after.reasons == (SETTLING,) else _seen_again(state)
     return state
 
 
-def _not_renewed(state: PairState, observation: Observation, rules: Rules) -> PairState:
+def _not_renewed(state: PairState, observation: Observation, rules: PairRules) -> PairState:
     """The state after a check that neither acquits nor makes the monitor accuse. Health stays as it is for three
     periods from the last acquitting check; then the cause that explains most checks is the answer."""
     monitor = state.monitor
@@ -480,13 +480,13 @@ def _not_renewed(state: PairState, observation: Observation, rules: Rules) -> Pa
     cause = leading_cause({code: weight for code, weight in monitor.blind.items() if weight >= least.get(code, 1.0)})
     if cause is not None and cause.code == BENT_MOUNT:
         text = "The latest checks accuse the mount, and none acquits it."
-        return _poor(state, Event.SUSPECTED, observation.stamp_ns, Reason("monitor_suspects", text))
+        return _poor(state, HealthEvent.SUSPECTED, observation.stamp_ns, Reason("monitor_suspects", text))
     text = "No check of the latest pairs can confirm the extrinsic: their edges are faint, or do not fit well enough."
     why = Reason(NOT_ACQUITTED, text) if cause is None else cause.as_reason()
-    return _poor(state, Event.NOT_ACQUITTED, observation.stamp_ns, why)
+    return _poor(state, HealthEvent.NOT_ACQUITTED, observation.stamp_ns, why)
 
 
-def _poor(state: PairState, event: Event, stamp_ns: int, why: Reason) -> PairState:
+def _poor(state: PairState, event: HealthEvent, stamp_ns: int, why: Reason) -> PairState:
     """The state after an event because of which the data cannot be judged, or the mount cannot be acquitted, at this
     sensor time."""
     after = _unless_red(state, event, why)
@@ -494,13 +494,13 @@ def _poor(state: PairState, event: Event, stamp_ns: int, why: Reason) -> PairSta
     return after if goes_on else replace(after, poor_since_ns=stamp_ns)
 
 
-def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason) -> PairState:
+def _well_again(state: PairState, event: HealthEvent, stamp_ns: int, *reasons: Reason) -> PairState:
     """The state after an event at this sensor time that makes a pair healthy, unless its poor stretch began less than
     `SETTLING_NS` before."""
     since_ns = state.poor_since_ns
     # A window decides a suspicion; a check that acquits does not end it at once.
     settles = state.seen is HealthState.DEGRADED or (
-        state.seen is HealthState.SUSPECT and event is not Event.CONFIRMED_BY_WINDOW
+        state.seen is HealthState.SUSPECT and event is not HealthEvent.CONFIRMED_BY_WINDOW
     )
     if settles and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
         return replace(_seen_again(state), reasons=(SETTLING,))
@@ -509,7 +509,7 @@ def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason)
 
 def overdue(state: PairState, why: Reason) -> PairState:
     """The state after no check was completed in time, for this reason; the last known state is added to the reasons."""
-    return _by_the_clock(state, Event.OVERDUE, why)
+    return _by_the_clock(state, HealthEvent.OVERDUE, why)
 
 
 def aged(state: PairState, age_s: float, stale_after_s: float) -> PairState:
@@ -517,10 +517,10 @@ def aged(state: PairState, age_s: float, stale_after_s: float) -> PairState:
     if age_s <= stale_after_s:
         return state
     text = f"No check has been completed for {age_s:.0f} s, more than {stale_after_s:.0f} s."
-    return _by_the_clock(state, Event.AGED, Reason("stale", text))
+    return _by_the_clock(state, HealthEvent.AGED, Reason("stale", text))
 
 
-def _by_the_clock(state: PairState, event: Event, why: Reason) -> PairState:
+def _by_the_clock(state: PairState, event: HealthEvent, why: Reason) -> PairState:
     """The state after an event of the clock: it is reported until something is looked at, and then forgotten."""
     after = _unseen(state, event, why)
     return (
@@ -536,12 +536,12 @@ def _seen_again(state: PairState) -> PairState:
     return state if seen is None else replace(state, health=seen.state, reasons=seen.reasons, unseen_from=None)
 
 
-def _unseen(state: PairState, event: Event, why: Reason) -> PairState:
+def _unseen(state: PairState, event: HealthEvent, why: Reason) -> PairState:
     if TRANSITIONS[state.health, event] is state.health:
         return state
     known = [reason for reason in state.reasons if reason.code == LAST_KNOWN]
-    told = "; ".join(reason.text for reason in state.reasons)
-    known = known or [Reason(LAST_KNOWN, f"Last known: {state.health.value}{'. ' if told else '.'}{told}")]
+    text = "; ".join(reason.text for reason in state.reasons)
+    known = known or [Reason(LAST_KNOWN, f"Last known: {state.health.value}{'. ' if text else '.'}{text}")]
     return happened(state, event, why, *known)
 
 
@@ -556,13 +556,13 @@ def time_stepped_back(state: PairState, stamp_ns: int) -> PairState:
         monitor=replace(state.monitor, last_stamps_ns=(), acquitted_ns=None, unacquitted=0, standstill=None),
     )
     why = Reason("time_stepped_back", "The clock of the sensors stepped back; nothing has been looked at since.")
-    return _unseen(state, Event.TIME_STEPPED_BACK, why)
+    return _unseen(state, HealthEvent.TIME_STEPPED_BACK, why)
 
 
 # --- commands -------------------------------------------------------------------------------------------------------
 
 
-def apply_pending(state: PairState, rules: Rules) -> PairState:
+def apply_pending(state: PairState, rules: PairRules) -> PairState:
     """The state after a person accepts the candidate; the limits of the policy do not bind people. It has to be checked
     before it counts as healthy: the window that found it may be hours old.
 
@@ -579,7 +579,7 @@ def apply_pending(state: PairState, rules: Rules) -> PairState:
     return replace(state, proven=True, track=track)
 
 
-def rolled_back(state: PairState, pose: Matrix4, estimate: Estimate, rules: Rules) -> PairState:
+def rolled_back(state: PairState, pose: Matrix4, estimate: Estimate, rules: PairRules) -> PairState:
     """The state after a person returns to an earlier accepted calibration. It has to be looked at again before it
     counts as healthy.
 
@@ -609,7 +609,7 @@ def reset(state: PairState, rig: Rig) -> PairState:
     return replace(state, provenance=Provenance.NOMINAL, valid_from_ns=0, accepted=None, proven=False, track=None)
 
 
-def held(state: PairState, hold: Hold) -> PairState:
+def held(state: PairState, hold: ExtrinsicHold) -> PairState:
     """The state after a person freezes the extrinsic: estimates go on, but none is applied."""
     return replace(state, hold=hold)
 
@@ -632,7 +632,7 @@ def after_commissioning(state: PairState, T_commissioned: Matrix4) -> PairState:
 def _replaced(state: PairState, pose: Matrix4, text: str) -> PairState:
     state = replace(state, T_camera_lidar=pose, pending=None, monitor=MonitorState(), flagged_since_ns=None, changes=())
     state = replace(state, poor_since_ns=None)
-    return happened(state, Event.REPLACED, Reason("replaced", text))
+    return happened(state, HealthEvent.REPLACED, Reason("replaced", text))
 
 
 def _refuse_if_held(state: PairState) -> None:
@@ -640,7 +640,7 @@ def _refuse_if_held(state: PairState) -> None:
         raise CommandRefusedError("held", 'The extrinsic is held: release it first with `hold` and {"release": true}.')
 
 
-def _unless_red(state: PairState, event: Event, *reasons: Reason) -> PairState:
+def _unless_red(state: PairState, event: HealthEvent, *reasons: Reason) -> PairState:
     """The state after an event. If the pair stays miscalibrated, the reasons for that stay too, before the new ones."""
     after = happened(state, event, *reasons)
     if state.health is after.health is HealthState.MISCALIBRATED:
@@ -656,7 +656,7 @@ _RED = (BENT_MOUNT, "candidate_waits")
 """Codes of the reasons for which a pair is miscalibrated."""
 
 
-def _told(step: NDArray[np.float64]) -> str:
+def _step_text(step: NDArray[np.float64]) -> str:
     """A step (6,) in a few words."""
     angle_deg = degrees(se3.rotation_angle_rad(se3.perturbation(step)))
     metres = sqrt(fsum(float(value) ** 2 for value in step[3:]))

@@ -19,7 +19,7 @@ AXES = ("pitch", "yaw", "roll", "x", "y", "z")
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class AppliedChange:
     """A step of the served extrinsic that no person ordered: sensor time, and |rx ry rz tx ty tz| (rad, m)."""
 
     stamp_ns: int
@@ -31,7 +31,9 @@ def step_between(T_before: Matrix4, T_after: Matrix4) -> NDArray[np.float64]:
     return np.asarray(se3.difference(T_after, T_before), dtype=np.float64)
 
 
-def objection(step: NDArray[np.float64], past: Iterable[Change], stamp_ns: int, policy: PolicyConfig) -> Reason | None:
+def objection(
+    step: NDArray[np.float64], past: Iterable[AppliedChange], stamp_ns: int, policy: PolicyConfig
+) -> Reason | None:
     """Why a step (6,) must wait for a person; None when it may be applied.
 
     Args:
@@ -57,7 +59,7 @@ def objection(step: NDArray[np.float64], past: Iterable[Change], stamp_ns: int, 
     return None
 
 
-def remembered(past: Iterable[Change], stamp_ns: int) -> tuple[Change, ...]:
+def remembered(past: Iterable[AppliedChange], stamp_ns: int) -> tuple[AppliedChange, ...]:
     """The changes that still count at `stamp_ns`."""
     return tuple(change for change in past if abs(stamp_ns - change.stamp_ns) < NS_PER_DAY)
 

@@ -34,7 +34,7 @@ STATES: Mapping[HealthState, str] = MappingProxyType(
 )
 
 
-class Event(StrEnum):
+class HealthEvent(StrEnum):
     """What can happen to the health of a pair."""
 
     CONFIRMED_BY_WINDOW = "window_agrees"
@@ -56,26 +56,26 @@ class Event(StrEnum):
     RESTARTED = "restarted"
 
 
-MEANING: Mapping[Event, str] = MappingProxyType(
+MEANING: Mapping[HealthEvent, str] = MappingProxyType(
     {
-        Event.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
-        Event.CONFIRMED_EARLIER: "an accepted window is served, or agrees, but its data are older than three periods",
-        Event.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
-        Event.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
-        Event.REFUSED_ELSEWHERE: "a window was refused, but it, or its end, shows a pose other than what is served",
-        Event.CLEAR: "a check acquits an extrinsic that a window has confirmed",
-        Event.NO_OBJECTION: "a check acquits an extrinsic that no window has confirmed",
-        Event.SUSPECTED: "the monitor suspects that the mount has moved, or checks accuse it and none acquits it "
+        HealthEvent.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
+        HealthEvent.CONFIRMED_EARLIER: "an accepted window is served, or agrees, but its data are older than three periods",
+        HealthEvent.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
+        HealthEvent.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
+        HealthEvent.REFUSED_ELSEWHERE: "a window was refused, but it, or its end, shows a pose other than what is served",
+        HealthEvent.CLEAR: "a check acquits an extrinsic that a window has confirmed",
+        HealthEvent.NO_OBJECTION: "a check acquits an extrinsic that no window has confirmed",
+        HealthEvent.SUSPECTED: "the monitor suspects that the mount has moved, or checks accuse it and none acquits it "
         "for three periods",
-        Event.MOUNT_MOVED: "the monitor is certain that the mount has moved",
-        Event.AT_ODDS: "checks accuse the mount, but do not add up to a move",
-        Event.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
-        Event.NOT_ACQUITTED: "three periods passed in which checks were completed, and none acquits the extrinsic",
-        Event.OVERDUE: "no check has been completed for three periods of the monitor",
-        Event.AGED: "no check has been completed for `stale_after_s`",
-        Event.REPLACED: "a person replaced the extrinsic (apply, rollback, reset)",
-        Event.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing has been checked in the new time",
-        Event.RESTARTED: "the service was started again: nothing has been checked since",
+        HealthEvent.MOUNT_MOVED: "the monitor is certain that the mount has moved",
+        HealthEvent.AT_ODDS: "checks accuse the mount, but do not add up to a move",
+        HealthEvent.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
+        HealthEvent.NOT_ACQUITTED: "three periods passed in which checks were completed, and none acquits the extrinsic",
+        HealthEvent.OVERDUE: "no check has been completed for three periods of the monitor",
+        HealthEvent.AGED: "no check has been completed for `stale_after_s`",
+        HealthEvent.REPLACED: "a person replaced the extrinsic (apply, rollback, reset)",
+        HealthEvent.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing has been checked in the new time",
+        HealthEvent.RESTARTED: "the service was started again: nothing has been checked since",
     }
 )
 
@@ -86,28 +86,28 @@ _U, _H, _S, _M, _D, _A = HealthState
 #   (CONFIRMED_BY_WINDOW), and ends after three periods without one. Red (miscalibrated) ends only by
 #   a window that agrees, by a person, or step by step by a monitor that stays clear; neither silence nor bad data hides
 #   it. A window that cannot tell or failed is no event, because it says nothing of the mount.
-_ROWS: Mapping[Event, tuple[HealthState, ...]] = {
+_ROWS: Mapping[HealthEvent, tuple[HealthState, ...]] = {
     #                            unknown healthy suspect miscal. degraded stale
-    Event.CONFIRMED_BY_WINDOW: (_H, _H, _H, _H, _H, _H),
-    Event.CONFIRMED_EARLIER: (_U, _U, _U, _U, _U, _U),
-    Event.CONTRADICTED: (_M, _M, _M, _M, _M, _M),
-    Event.STEP_SUSPECTED: (_S, _S, _S, _M, _S, _S),
-    Event.REFUSED_ELSEWHERE: (_S, _S, _S, _M, _S, _S),
-    Event.CLEAR: (_H, _H, _H, _S, _H, _H),
-    Event.NO_OBJECTION: (_U, _H, _S, _S, _U, _U),
-    Event.SUSPECTED: (_S, _S, _S, _M, _S, _S),
-    Event.MOUNT_MOVED: (_M, _M, _M, _M, _M, _M),
-    Event.AT_ODDS: (_D, _D, _S, _M, _D, _D),
-    Event.DATA_CAUSE: (_D, _D, _D, _M, _D, _D),
-    Event.NOT_ACQUITTED: (_D, _D, _S, _M, _D, _D),
-    Event.OVERDUE: (_U, _D, _S, _M, _D, _A),
-    Event.AGED: (_U, _A, _A, _M, _A, _A),
-    Event.REPLACED: (_U, _U, _U, _U, _U, _U),
-    Event.TIME_STEPPED_BACK: (_U, _U, _S, _M, _U, _U),
-    Event.RESTARTED: (_U, _U, _S, _M, _U, _U),
+    HealthEvent.CONFIRMED_BY_WINDOW: (_H, _H, _H, _H, _H, _H),
+    HealthEvent.CONFIRMED_EARLIER: (_U, _U, _U, _U, _U, _U),
+    HealthEvent.CONTRADICTED: (_M, _M, _M, _M, _M, _M),
+    HealthEvent.STEP_SUSPECTED: (_S, _S, _S, _M, _S, _S),
+    HealthEvent.REFUSED_ELSEWHERE: (_S, _S, _S, _M, _S, _S),
+    HealthEvent.CLEAR: (_H, _H, _H, _S, _H, _H),
+    HealthEvent.NO_OBJECTION: (_U, _H, _S, _S, _U, _U),
+    HealthEvent.SUSPECTED: (_S, _S, _S, _M, _S, _S),
+    HealthEvent.MOUNT_MOVED: (_M, _M, _M, _M, _M, _M),
+    HealthEvent.AT_ODDS: (_D, _D, _S, _M, _D, _D),
+    HealthEvent.DATA_CAUSE: (_D, _D, _D, _M, _D, _D),
+    HealthEvent.NOT_ACQUITTED: (_D, _D, _S, _M, _D, _D),
+    HealthEvent.OVERDUE: (_U, _D, _S, _M, _D, _A),
+    HealthEvent.AGED: (_U, _A, _A, _M, _A, _A),
+    HealthEvent.REPLACED: (_U, _U, _U, _U, _U, _U),
+    HealthEvent.TIME_STEPPED_BACK: (_U, _U, _S, _M, _U, _U),
+    HealthEvent.RESTARTED: (_U, _U, _S, _M, _U, _U),
 }
 
-TRANSITIONS: Mapping[tuple[HealthState, Event], HealthState] = MappingProxyType(
+TRANSITIONS: Mapping[tuple[HealthState, HealthEvent], HealthState] = MappingProxyType(
     {(before, event): after for event, row in _ROWS.items() for before, after in zip(HealthState, row, strict=True)}
 )
 """The state after an event, for every state and every event."""
@@ -116,7 +116,7 @@ TRANSITIONS: Mapping[tuple[HealthState, Event], HealthState] = MappingProxyType(
 def markdown() -> str:
     """The table for the documentation: a line per event, a column per state; · means that nothing changes."""
     rows = [["", *(state.value for state in HealthState)]]
-    for event in Event:
+    for event in HealthEvent:
         after = [TRANSITIONS[state, event] for state in HealthState]
         marks = ["·" if new is old else new.value for old, new in zip(HealthState, after, strict=True)]
         rows.append([event.value, *marks])

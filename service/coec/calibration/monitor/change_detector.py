@@ -14,16 +14,16 @@ from math import fsum, isfinite, log, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.commissioning.baseline import Drift
+from coec.calibration.commissioning.baseline import BaselineDrift
 from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.monitor.hypotheses import (
     MOST_STEP,
-    Axes,
     Hypotheses,
+    TestedAxes,
     after_check,
     learnt_distance2,
 )
-from coec.calibration.monitor.likelihood import AXES, FARTHER, WEAK_TIMES, Three, Told, plus, three
+from coec.calibration.monitor.likelihood import AXES, FARTHER, WEAK_TIMES, CheckMeasurement, Three, plus, three
 from coec.calibration.monitor.mount_scatter import LOOSE_AT, MountScatter
 from coec.calibration.monitor.sensor_faults import (
     BENT_MOUNT,
@@ -37,12 +37,12 @@ from coec.calibration.monitor.sensor_faults import (
 from coec.calibration.types import Metric
 from coec.config import MonitorConfig
 
-ROTATIONS = Axes(three([radians(2.5)] * 3), (three([radians(0.3)] * 3), three([radians(2.0)] * 3)))
-TRANSLATIONS = Axes((0.1, 0.1, 0.1), ((0.03, 0.03, 0.03), (0.1, 0.1, 0.1)))
+ROTATIONS = TestedAxes(three([radians(2.5)] * 3), (three([radians(0.3)] * 3), three([radians(2.0)] * 3)))
+TRANSLATIONS = TestedAxes((0.1, 0.1, 0.1), ((0.03, 0.03, 0.03), (0.1, 0.1, 0.1)))
 """The reach of bad checks (1.8 to 2.5° and 6 to 8 cm or more, on simulated drives through tunnels, open roads and
 nights), and the moves that are looked for: the creep of a mount, and a knock (rad, m)."""
 
-QUESTIONS = len(ROTATIONS.moves) + len(TRANSLATIONS.moves)
+TESTS_PER_CHECK = len(ROTATIONS.moves) + len(TRANSLATIONS.moves)
 """Number of hypotheses that begin at every check; each of them may accuse."""
 
 CLEARS_AT = 0.4
@@ -95,7 +95,7 @@ def _unknown() -> NDArray[np.float64]:
     return np.full(6, np.nan)
 
 
-class Finding(StrEnum):
+class MonitorOutcome(StrEnum):
     """What the checks so far say. `unknown`: no check could tell yet. `at_odds`: the checks accuse the mount but do not
     add up to a move, because they put it elsewhere every time, or already did at the first check."""
 
@@ -106,7 +106,7 @@ class Finding(StrEnum):
     CONFIRMED = "confirmed"
 
 
-ACCUSING = frozenset({Finding.SUSPECT, Finding.CONFIRMED, Finding.AT_ODDS})
+ACCUSING = frozenset({MonitorOutcome.SUSPECT, MonitorOutcome.CONFIRMED, MonitorOutcome.AT_ODDS})
 """Findings because of which a window is wanted soon, and a window that finds another pose is a second witness. A mount
 that moved beyond the reach of a check leads to `at_odds`, too."""
 
@@ -159,7 +159,7 @@ class Observation:
     causes: tuple[Cause, ...]
     first_derivative: NDArray[np.float64] = field(default_factory=_unknown)
     second_derivative: NDArray[np.float64] = field(default_factory=_unknown)
-    drift: Drift | None = None
+    drift: BaselineDrift | None = None
     dirty: tuple[int, ...] = ()
     textured: int = 0
     standing_stamps_ns: tuple[int, ...] = ()
@@ -199,7 +199,7 @@ class AlarmLevels:
 def alarm_level(config: MonitorConfig, hours: float) -> float:
     """Evidence, nats, that a right mount reaches once in so many hours on average, or more rarely, with one check per
     period. It is the logarithm of the number of hypotheses that begin in that time."""
-    return log(max(QUESTIONS * hours * S_PER_H / config.period_s, 1.0))
+    return log(max(TESTS_PER_CHECK * hours * S_PER_H / config.period_s, 1.0))
 
 
 def alarm_levels(config: MonitorConfig) -> AlarmLevels:
@@ -209,7 +209,7 @@ def alarm_levels(config: MonitorConfig) -> AlarmLevels:
 
 
 @dataclass(frozen=True, slots=True)
-class Offset:
+class OffsetEstimate:
     """Where a check puts the mount from the served extrinsic on three axes (rad or m), and per axis the variance of
     what separates it from other checks of the same place."""
 
@@ -228,8 +228,8 @@ class Standstill:
     """
 
     acquits: bool
-    rotation: Offset | None
-    translation: Offset | None
+    rotation: OffsetEstimate | None
+    translation: OffsetEstimate | None
     contradicted: bool = False
 
     @classmethod
@@ -245,15 +245,17 @@ class Standstill:
         return _differ(self.rotation, other.rotation) or _differ(self.translation, other.translation)
 
 
-def _offset(observation: Observation, axes: slice) -> Offset | None:
-    measured = told_by(observation, axes, None)
+def _offset(observation: Observation, axes: slice) -> OffsetEstimate | None:
+    measured = measurement_on_axes(observation, axes, None)
     if measured is None:
         return None
     # Pairs that were taken before the vehicle stood have the error of another place.
-    return Offset(measured.offset, measured.noise if observation.stands else plus(measured.noise, measured.place))
+    return OffsetEstimate(
+        measured.offset, measured.noise if observation.stands else plus(measured.noise, measured.place)
+    )
 
 
-def _differ(one: Offset | None, other: Offset | None) -> bool:
+def _differ(one: OffsetEstimate | None, other: OffsetEstimate | None) -> bool:
     if one is None or other is None:
         return False
     rows = zip(one.mean, other.mean, one.variance, other.variance, strict=True)
@@ -285,7 +287,7 @@ class MonitorState:
         scatter: how far the mount moves from one check to the next.
     """
 
-    outcome: Finding = Finding.UNKNOWN
+    outcome: MonitorOutcome = MonitorOutcome.UNKNOWN
     turned: Hypotheses = field(default_factory=Hypotheses)
     shifted: Hypotheses = field(default_factory=Hypotheses)
     blind: Mapping[str, float] = field(default_factory=dict)
@@ -321,7 +323,7 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
     judges = not codes
     scatter = state.scatter
     if judges and fresh > 0.0:
-        scatter = scatter.after(told_by(observation, ROTATION_AXES, None), ROTATIONS.reach, fresh)
+        scatter = scatter.after(measurement_on_axes(observation, ROTATION_AXES, None), ROTATIONS.reach, fresh)
         if scatter.evidence >= LOOSE_AT:
             codes.add(MOUNT_LOOSE.code)
     after = replace(
@@ -340,7 +342,7 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
     # One check at a right place does not outweigh those that put the mount elsewhere.
     acquits = not codes and _vouches(state, observation) and after.evidence < levels.clear
     place = _standstill_after(state, observation, acquits=acquits, judges=judges) if stands else None
-    if place is not None and place.contradicted and acquits and after.outcome is Finding.CLEAR:
+    if place is not None and place.contradicted and acquits and after.outcome is MonitorOutcome.CLEAR:
         place = Standstill.of(observation, acquits=True)
     return replace(
         after,
@@ -373,7 +375,7 @@ def after_window(
         last_stamps_ns=state.last_stamps_ns,
     )
     outcome = _outcome(state.outcome, after, levels)
-    return replace(after, outcome=outcome if outcome is not Finding.CLEAR else Finding.UNKNOWN)
+    return replace(after, outcome=outcome if outcome is not MonitorOutcome.CLEAR else MonitorOutcome.UNKNOWN)
 
 
 def is_acquitted(state: MonitorState, now_ns: int, config: MonitorConfig) -> bool:
@@ -398,7 +400,7 @@ def doubtful_after(doubtful: float, weak: bool, fresh: float) -> float:
     return DOUBTFUL_CHECKS if weak else max(doubtful - fresh, 0.0)
 
 
-def share_told(state: MonitorState, observation: Observation) -> float:
+def new_share(state: MonitorState, observation: Observation) -> float:
     """The share of a check that is new compared with the checks before it, 0 to 1; see `after_observation`."""
     fresh, repeated = _novelty(state, observation)
     return 0.0 if repeated else fresh
@@ -450,7 +452,7 @@ def _vouches(state: MonitorState, observation: Observation) -> bool:
     """Whether a check acquits the pose, and puts the mount where earlier checks and the one before it did, as far as
     streets differ."""
     for axes, tests in ((ROTATION_AXES, state.turned), (TRANSLATION_AXES, state.shifted)):
-        measured = told_by(observation, axes, None)
+        measured = measurement_on_axes(observation, axes, None)
         if measured is None:
             continue
         if tests.right is not None and tests.right.wider(measured.place).distance2(measured) > LEARNED2:
@@ -466,13 +468,13 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     camera stays, too."""
     most = levels.suspect if observation.weak or observation.stands else levels.most
     turned, shifted, astray2 = state.turned, state.shifted, state.astray2
-    told = told_by(observation, ROTATION_AXES, turned.before)
-    if told is not None:
-        turned = after_check(turned, told, ROTATIONS, fresh, most)
-        astray2 = learnt_distance2(turned, told.rig)
-    told = told_by(observation, TRANSLATION_AXES, shifted.before)
-    if told is not None:
-        shifted = after_check(shifted, told, TRANSLATIONS, fresh, most)
+    measurement = measurement_on_axes(observation, ROTATION_AXES, turned.before)
+    if measurement is not None:
+        turned = after_check(turned, measurement, ROTATIONS, fresh, most)
+        astray2 = learnt_distance2(turned, measurement.rig)
+    measurement = measurement_on_axes(observation, TRANSLATION_AXES, shifted.before)
+    if measurement is not None:
+        shifted = after_check(shifted, measurement, TRANSLATIONS, fresh, most)
     step = fresh * (WEAK_SHARE if observation.weak else 1.0)
     # Checks that are all too far off with edges that insist on nothing come from images and sweeps of different times.
     if not observation.flagged and not (observation.undecided and observation.distance2 > 1.0):
@@ -483,7 +485,7 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     return replace(state, turned=turned, shifted=shifted, at_odds=at_odds, astray2=astray2, counted=counted)
 
 
-def told_by(observation: Observation, axes: slice, before: Three | None) -> Told | None:
+def measurement_on_axes(observation: Observation, axes: slice, before: Three | None) -> CheckMeasurement | None:
     """What a check says about three axes; None unless it determines all of them. `before` is the offset of the check
     before it."""
     columns = (observation.offset, observation.sigma, observation.noise, observation.place)
@@ -493,7 +495,7 @@ def told_by(observation: Observation, axes: slice, before: Three | None) -> Told
     scene = observation.dispersion
     times = max(WEAK_TIMES, scene) if observation.weak else scene
     farther2 = sum((FARTHER * value) ** 2 for value in offset)
-    return Told(
+    return CheckMeasurement(
         offset=three(offset),
         noise=three([(times * n) ** 2 + farther2 for n in noise]),
         place=three([(scene * p) ** 2 for p in place]),
@@ -511,7 +513,7 @@ def diagnose(state: MonitorState) -> Cause | None:
     # Against a mount that moved, causes in the data have to explain as many checks as it does.
     if total >= BLIND_AT and total >= state.blind.get(BENT_MOUNT.code, 0.0):
         return leading_cause(of_data)
-    return BENT_MOUNT if state.outcome is Finding.CONFIRMED else None
+    return BENT_MOUNT if state.outcome is MonitorOutcome.CONFIRMED else None
 
 
 def leading_cause(weights: Mapping[str, float]) -> Cause | None:
@@ -532,14 +534,14 @@ def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: floa
     return {block: min(dirt.get(block, 0.0) + fresh, DIRTY_CHECKS + 1.0) for block in sorted(dirty)}
 
 
-def _outcome(before: Finding, after: MonitorState, levels: AlarmLevels) -> Finding:
+def _outcome(before: MonitorOutcome, after: MonitorState, levels: AlarmLevels) -> MonitorOutcome:
     """The finding, with hysteresis: a suspicion or confirmation lasts until little evidence is left for it."""
     evidence = after.evidence
     if evidence >= levels.confirmed:
-        return Finding.CONFIRMED
-    if before is Finding.CONFIRMED and evidence >= levels.clear:
+        return MonitorOutcome.CONFIRMED
+    if before is MonitorOutcome.CONFIRMED and evidence >= levels.clear:
         return before
-    if evidence >= levels.suspect or (before is Finding.SUSPECT and evidence >= levels.clear):
-        return Finding.SUSPECT
+    if evidence >= levels.suspect or (before is MonitorOutcome.SUSPECT and evidence >= levels.clear):
+        return MonitorOutcome.SUSPECT
     astray = after.astray2 > ASTRAY2 and after.counted >= AT_ODDS_AT and not after.vouched
-    return Finding.AT_ODDS if astray or after.at_odds >= AT_ODDS_AT else Finding.CLEAR
+    return MonitorOutcome.AT_ODDS if astray or after.at_odds >= AT_ODDS_AT else MonitorOutcome.CLEAR

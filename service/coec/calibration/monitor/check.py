@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from coec.calibration.confidence.landscape import Landscape
 from coec.calibration.confidence.noise import measure_noise
-from coec.calibration.estimators import Sight, depth_features
-from coec.calibration.monitor.laid_edges import LaidEdges, lay, placed
-from coec.calibration.monitor.neighbourhood import REACH_RAD, ROTATION_DOF, search
+from coec.calibration.estimators import WindowData, depth_features
+from coec.calibration.monitor.laid_edges import ProjectedEdges, placed, project_edges
+from coec.calibration.monitor.neighbourhood import REACH_RAD, ROTATION_DOF, search_local_optima
 from coec.calibration.monitor.sensor_faults import SceneFacts
 from coec.calibration.monitor.sensors import (
     OUTLINE_RAD,
@@ -59,7 +59,7 @@ class CheckInput:
 
     rig: Rig
     pairs: tuple[FramePair, ...]
-    edges: LaidEdges
+    edges: ProjectedEdges
     scenes: tuple[SceneFacts, ...]
     features: Callable[[], tuple[Features, ...]]
 
@@ -101,7 +101,7 @@ class Check:
     edges: float
     edges_at_best: float
     edges_in_view: int
-    looks: float
+    independent_samples: float
     scatter_rad: NDArray[np.float64]
     of_rotation: Support
     of_pose: Support
@@ -109,7 +109,7 @@ class Check:
     overlap: float
 
 
-def gather(sight: Sight, beyond_rad: float = 0.0) -> CheckInput:
+def gather(data: WindowData, beyond_rad: float = 0.0) -> CheckInput:
     """Prepares the sensors of one pair, each by itself, and joins them.
 
     Args:
@@ -119,15 +119,15 @@ def gather(sight: Sight, beyond_rad: float = 0.0) -> CheckInput:
     Raises:
         CalibrationError: an image cannot be decoded, or is not of the camera's size.
     """
-    window = sight.window
+    window = data.window
     rig, pose = window.rig, window.T_camera_lidar_start
     sweeps = [prepare_sweep(pair.lidar) for pair in window.pairs]
     counted = seen_part(rig, sweeps, pose, OUTLINE_RAD)
-    wanted = seen_part(rig, sweeps, pose, OUTLINE_RAD + beyond_rad) if beyond_rad > 0.0 else counted
+    required = seen_part(rig, sweeps, pose, OUTLINE_RAD + beyond_rad) if beyond_rad > 0.0 else counted
     # The third column of a rotation is where it takes the third axis.
     upright = rig.T_camera_lidar_nominal[:2, 2]
-    images = prepare_images(sight.greys(), len(window.pairs), rig.camera, rig.mask, upright, counted, wanted)
-    return join(sight, sweeps, images, REACH_RAD + beyond_rad)
+    images = prepare_images(data.greys(), len(window.pairs), rig.camera, rig.mask, upright, counted, required)
+    return join(data, sweeps, images, REACH_RAD + beyond_rad)
 
 
 def seen_part(rig: Rig, sweeps: Sequence[PreparedSweep], pose: Matrix4, reach_rad: float) -> Rectangle:
@@ -137,12 +137,12 @@ def seen_part(rig: Rig, sweeps: Sequence[PreparedSweep], pose: Matrix4, reach_ra
     return Rectangle(0, 0, rig.camera.width, rig.camera.height) if part is None else part
 
 
-def join(sight: Sight, sweeps: Sequence[PreparedSweep], images: PreparedImages, reach_rad: float) -> CheckInput:
+def join(data: WindowData, sweeps: Sequence[PreparedSweep], images: PreparedImages, reach_rad: float) -> CheckInput:
     """Joins what was prepared for two sensors into the input of a check of their pair. Sweeps and images are those of
     the pairs of `sight`, in order. Poses within `reach_rad` of the start of `sight` can be checked."""
-    window = sight.window
+    window = data.window
     pose = window.T_camera_lidar_start
-    edges = lay(window.rig, window.pairs, sweeps, images, pose, reach_rad, compensated=sight.compensated)
+    edges = project_edges(window.rig, window.pairs, sweeps, images, pose, reach_rad, compensated=data.compensated)
     scenes = tuple(
         SceneFacts(
             pair.stamp_ns,
@@ -153,34 +153,34 @@ def join(sight: Sight, sweeps: Sequence[PreparedSweep], images: PreparedImages, 
         )
         for pair, picture, sweep in zip(window.pairs, images.facts, sweeps, strict=True)
     )
-    features = cache(lambda: tuple(depth_features(sight, pose, DEPTH_POINTS)))
+    features = cache(lambda: tuple(depth_features(data, pose, DEPTH_POINTS)))
     return CheckInput(window.rig, window.pairs, edges, scenes, features)
 
 
 def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) -> Check:
     """A check at `pose` (4, 4)."""
     edges = evidence.edges
-    found = search(edges, pose)
-    cells = edges.cells(found.T_rotation)
-    landscape = Landscape.about(cells, found.T_rotation, tuple(range(ROTATION_DOF)))
+    optima = search_local_optima(edges, pose)
+    cells = edges.cells(optima.T_rotation)
+    landscape = Landscape.about(cells, optima.T_rotation, tuple(range(ROTATION_DOF)))
     noise = measure_noise(landscape)
-    poses = (se3.perturb(pose, expected.rotation), found.T_pose, se3.perturb(pose, expected.pose))
+    poses = (se3.perturb(pose, expected.rotation), optima.T_pose, se3.perturb(pose, expected.pose))
     at_expected_turn, at_pose, at_expected_pose = cells.at(np.stack(poses))
     whole, sharp = edges.whole.frames, edges.sharp.frames
     return Check(
         pairs=len(evidence.pairs),
-        T_rotation=found.T_rotation,
-        T_pose=found.T_pose,
-        offset_rotation=se3.difference(found.T_rotation, pose),
-        offset_pose=se3.difference(found.T_pose, pose),
+        T_rotation=optima.T_rotation,
+        T_pose=optima.T_pose,
+        offset_rotation=se3.difference(optima.T_rotation, pose),
+        offset_pose=se3.difference(optima.T_pose, pose),
         edges=frame_alignment(whole, pose).significance,
-        edges_at_best=frame_alignment(whole, found.T_rotation).significance,
-        edges_in_view=_in_view(sharp, found.T_rotation),
-        looks=1.0 if noise is None else noise.looks,
+        edges_at_best=frame_alignment(whole, optima.T_rotation).significance,
+        edges_in_view=_in_view(sharp, optima.T_rotation),
+        independent_samples=1.0 if noise is None else noise.independent_samples,
         scatter_rad=np.zeros(3) if noise is None else np.sqrt(np.diag(noise.covariance)),
         of_rotation=support(landscape.centre, at_expected_turn),
         of_pose=support(at_pose, at_expected_pose),
-        contrast=found.contrast,
+        contrast=optima.contrast,
         overlap=_in_view(sharp, pose) / max(len(sharp.weight), 1),
     )
 

@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from coec.calibration.commissioning.baseline import (
     Accuracy,
     Baseline,
-    Drift,
+    BaselineDrift,
     MonitorLimits,
     street_sigma,
     uncommissioned,
 )
 from coec.calibration.commissioning.quantiles import chi2_quantile
-from coec.calibration.estimators import sight_of
+from coec.calibration.estimators import prepare_window_data
 from coec.calibration.frames.sampling import drives
 from coec.calibration.frames.timing import ZOOMS, explained_by_nuisance
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import AT_POSE, Check, CheckInput, Expected, check_at, gather
-from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
+from coec.calibration.monitor.depth_witness import DepthCue, depth_cue
 from coec.calibration.monitor.dispersion import dispersion
 from coec.calibration.monitor.neighbourhood import MIN_CONTRAST, NEAR_SHARE, POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import data_causes, dirty_blocks
@@ -64,7 +64,7 @@ lane marking then decide, the same in every pair. On simulated drives, all check
 0.6° off and were clear by the other figures had 5 to 130; those that ended right had 150 and more, except some on
 highways."""
 
-MIN_LOOKS = 2.0
+MIN_INDEPENDENT_SAMPLES = 2.0
 """If the pairs of a moving vehicle are worth fewer independent looks, the edges of a check count as faint. Frames that
 say the same although the vehicle has moved on, as between the guard rails of a highway, are all wrong if one is, and so
 is the next check. Checks of simulated highways with 64 beams are at 1.2 to 1.9 of 6 and put right mounts 3 to 10 cm
@@ -90,7 +90,7 @@ class Faint(StrEnum):
     """What a check with faint edges has too little of."""
 
     EDGES_IN_VIEW = "edges_in_view"
-    LOOKS = "looks"
+    INDEPENDENT_SAMPLES = "looks"
     SIGNIFICANCE = "significance"
     CONTRAST = "contrast"
 
@@ -114,12 +114,12 @@ def observe(
     Raises:
         CalibrationError: fewer than `MIN_PAIRS` pairs, or an image or its depth cannot be decoded.
     """
-    evidence, seen = _look(window, depth, images, config, baseline)
+    evidence, seen = _check(window, depth, images, config, baseline)
     pose = window.T_camera_lidar_start
-    told = judge_check(evidence, seen, pose, baseline)
-    if told.causes or not (told.flagged or told.undecided or told.weak):
-        return told
-    return with_depth(told, ask_depth(evidence, seen, pose, config), baseline)
+    observation = judge_check(evidence, seen, pose, baseline)
+    if observation.causes or not (observation.flagged or observation.undecided or observation.weak):
+        return observation
+    return with_depth(observation, depth_cue(evidence, seen, pose, config), baseline)
 
 
 @on_one_thread()
@@ -131,18 +131,18 @@ def diagnose(
     Raises:
         CalibrationError: as `observe`.
     """
-    evidence, seen = _look(window, depth, images, config, baseline)
+    evidence, seen = _check(window, depth, images, config, baseline)
     pose = window.T_camera_lidar_start
-    told = judge_check(evidence, seen, pose, baseline)
-    return with_depth(told, ask_depth(evidence, seen, pose, config), baseline)
+    observation = judge_check(evidence, seen, pose, baseline)
+    return with_depth(observation, depth_cue(evidence, seen, pose, config), baseline)
 
 
-def _look(
+def _check(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
 ) -> tuple[CheckInput, Check]:
     if len(window.pairs) < MIN_PAIRS:
         raise CalibrationError(f"a check needs {MIN_PAIRS} pairs, there are {len(window.pairs)}")
-    evidence = gather(sight_of(window, depth, images, config, Silence()))
+    evidence = gather(prepare_window_data(window, depth, images, config, Silence()))
     return evidence, check_at(evidence, window.T_camera_lidar_start, expected_of(baseline))
 
 
@@ -151,18 +151,18 @@ def expected_of(baseline: Baseline | None) -> Expected:
     return AT_POSE if baseline is None else Expected(baseline.rotation.expected, baseline.pose.expected)
 
 
-def with_depth(told: Observation, depth: DepthWitness, baseline: Baseline | None) -> Observation:
+def with_depth(observation: Observation, depth: DepthCue, baseline: Baseline | None) -> Observation:
     """A check with what depth says of its pose added: figures for the reader, and the paper's verdict. The decision
     stays that of the edges."""
     limits = UNCOMMISSIONED if baseline is None else baseline.monitor
     return replace(
-        told,
+        observation,
         metrics=(
             Metric("mi", depth.mi, limits.min_mi, at_least=True),
             Metric("f1", depth.f1, limits.max_f1, at_least=False),
             Metric("f2", depth.f2, limits.min_f2, at_least=True),
             Metric("agreement_deg", degrees(depth.agreement_rad), degrees(limits.max_agreement_rad), at_least=False),
-            *told.metrics,
+            *observation.metrics,
         ),
         flagged_by_paper=None if baseline is None else limits.of_paper.flags(depth),
         first_derivative=depth.first_derivative,
@@ -177,11 +177,11 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
     rotation, accuracy = uncommissioned(camera) if baseline is None else (baseline.rotation, baseline.pose)
     of_rotation, of_pose = over_limits(seen, rotation, accuracy, limits)
     metrics = _metrics(seen, of_rotation, of_pose, limits)
-    said = opinion(seen, rotation, accuracy, limits)
+    judgement = opinion(seen, rotation, accuracy, limits)
     faint = faintness(evidence.pairs, seen, limits)
     causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
     dirty, textured = ((), 0) if baseline is None or causes else dirty_blocks(evidence.scenes, baseline.scene)
-    if not causes and not faint & {Faint.EDGES_IN_VIEW, Faint.LOOKS}:
+    if not causes and not faint & {Faint.EDGES_IN_VIEW, Faint.INDEPENDENT_SAMPLES}:
         # Few edges fit another clock as well as they fit another mount.
         explained = explained_by_nuisance(
             evidence.edges.measured,
@@ -206,8 +206,8 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
         place=street_sigma(camera),
         dispersion=dispersion(seen.contrast),
         distance2=max(of_rotation, of_pose),
-        flagged=said is Opinion.FLAGGED,
-        undecided=said is Opinion.UNDECIDED,
+        flagged=judgement is Opinion.FLAGGED,
+        undecided=judgement is Opinion.UNDECIDED,
         weak=bool(faint),
         has_power=not faint & {Faint.SIGNIFICANCE, Faint.CONTRAST} and _pairs_agree(seen, camera),
         flagged_by_paper=None,
@@ -229,7 +229,7 @@ def faintness(pairs: Sequence[FramePair], seen: Check, limits: MonitorLimits) ->
     short = {
         Faint.EDGES_IN_VIEW: seen.edges_in_view < MIN_EDGES_IN_VIEW * seen.pairs,
         # While a vehicle stands its checks count as one anyway.
-        Faint.LOOKS: seen.looks < MIN_LOOKS and drives(pairs),
+        Faint.INDEPENDENT_SAMPLES: seen.independent_samples < MIN_INDEPENDENT_SAMPLES and drives(pairs),
         Faint.SIGNIFICANCE: edges_per_pair(seen) < limits.min_edges_per_pair,
         Faint.CONTRAST: seen.contrast < MIN_CONTRAST,
     }
@@ -249,11 +249,13 @@ def opinion(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimi
     acquits if neither optimum is farther off than it is at a right pose. Near a wrong pose a ripple may hold an optimum
     half-way; if the edges gain by going there, the check does not acquit."""
     undecided = False
-    for over, said in zip(over_limits(seen, rotation, pose, limits), (seen.of_rotation, seen.of_pose), strict=True):
-        tells = seen.contrast >= TELLING_CONTRAST or said.kept < LOST_SHARE
-        if said.insists and over > limits.insisted_share and tells:
+    for over, preference in zip(
+        over_limits(seen, rotation, pose, limits), (seen.of_rotation, seen.of_pose), strict=True
+    ):
+        conclusive = seen.contrast >= TELLING_CONTRAST or preference.retained < LOST_SHARE
+        if preference.insists and over > limits.insisted_share and conclusive:
             return Opinion.FLAGGED
-        undecided |= over > 1.0 or (said.gained and over > limits.insisted_share)
+        undecided |= over > 1.0 or (preference.gained and over > limits.insisted_share)
     return Opinion.UNDECIDED if undecided else Opinion.CLEAR
 
 
@@ -267,10 +269,10 @@ def edges_per_pair(seen: Check) -> float:
     return seen.edges_at_best / float(np.sqrt(max(seen.pairs, 1)))
 
 
-def _drift(seen: Check, baseline: Baseline) -> Drift:
+def _drift(seen: Check, baseline: Baseline) -> BaselineDrift:
     """How far the local optimum of a check lies from the commissioned calibration, over six degrees of freedom."""
     value = se3.difference(seen.T_pose, baseline.T_camera_lidar) - baseline.pose.bias
-    return Drift(value, baseline.pose.sigma(seen.pairs))
+    return BaselineDrift(value, baseline.pose.sigma(seen.pairs))
 
 
 def _metrics(seen: Check, of_rotation: float, of_pose: float, limits: MonitorLimits) -> tuple[Metric, ...]:
@@ -285,8 +287,8 @@ def _metrics(seen: Check, of_rotation: float, of_pose: float, limits: MonitorLim
     )
 
 
-def _support(name: str, said: Support) -> tuple[Metric, ...]:
+def _support(name: str, preference: Support) -> tuple[Metric, ...]:
     return (
-        Metric(f"edges_kept_{name}", said.kept, NEAR_SHARE, at_least=True),
-        Metric(f"certainty_{name}", said.certainty, CERTAIN, at_least=False),
+        Metric(f"edges_kept_{name}", preference.retained, NEAR_SHARE, at_least=True),
+        Metric(f"certainty_{name}", preference.certainty, CERTAIN, at_least=False),
     )

@@ -23,7 +23,7 @@ from coec.geometry import se3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DepthWitness:
+class DepthCue:
     """What mutual information says of a pose (Borer et al. 2023). Derivatives are over rx ry rz tx ty tz; equation (2)
     uses those of the rotations.
 
@@ -50,7 +50,7 @@ class DepthWitness:
         return float(np.min(self.second_derivative[:ROTATION_DOF]))
 
 
-def ask_depth(evidence: CheckInput, seen: Check, pose: Matrix4, config: CalibrationConfig) -> DepthWitness:
+def depth_cue(evidence: CheckInput, seen: Check, pose: Matrix4, config: CalibrationConfig) -> DepthCue:
     """What depth says of `pose` (4, 4), at which the edges say `seen`.
 
     Raises:
@@ -62,7 +62,7 @@ def ask_depth(evidence: CheckInput, seen: Check, pose: Matrix4, config: Calibrat
     first_derivative, second_derivative = axis_derivatives(depth, pose)
     rotation = config.search.model_copy(update={"dof": ROTATION_DOF})
     there = polish(depth, seen.T_rotation, rotation, Silence()).T_camera_lidar
-    return DepthWitness(
+    return DepthCue(
         mi=depth.evaluate(pose).mi,
         first_derivative=first_derivative,
         second_derivative=second_derivative,

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import fsum, log
 
-from coec.calibration.monitor.likelihood import Belief, Three, Told, plus, score, three
+from coec.calibration.monitor.likelihood import CheckMeasurement, OffsetPosterior, Three, plus, score, three
 
 LEAST_STEP, MOST_STEP = -5.0, 6.0
 """Most nats by which one check may speak against a test, and for it: no check decides alone, and three acquit."""
@@ -49,7 +49,7 @@ OLDEST = 8192
 
 
 @dataclass(frozen=True, slots=True)
-class Axes:
+class TestedAxes:
     """Three axes that are tested together.
 
     Attributes:
@@ -76,9 +76,9 @@ class Hypothesis:
     kind: int
     age: float
     evidence: float
-    moved: Belief
-    right: Belief
-    rig: Belief
+    moved: OffsetPosterior
+    right: OffsetPosterior
+    rig: OffsetPosterior
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class Hypotheses:
     """All running tests over three axes, the youngest first; where a right mount has been so far; and the offset of the
     last check."""
 
-    right: Belief | None = None
+    right: OffsetPosterior | None = None
     running: tuple[Hypothesis, ...] = ()
     before: Three | None = None
 
@@ -96,20 +96,22 @@ class Hypotheses:
         return max(reversed(self.running), key=lambda test: test.evidence, default=None)
 
 
-def after_check(tests: Hypotheses, told: Told, axes: Axes, share: float, most: float) -> Hypotheses:
+def after_check(
+    tests: Hypotheses, measurement: CheckMeasurement, axes: TestedAxes, share: float, most: float
+) -> Hypotheses:
     """The tests after one more check that counts by `share`, 0 to 1. The check raises no test above the evidence
     `most`; a test that is above it already keeps its evidence."""
-    right = tests.right if tests.right is not None else Belief((0.0, 0.0, 0.0), told.rig)
-    begun = [_begun(kind, right, told, axes) for kind in range(len(axes.moves))]
-    running = [_continued(test, told, axes, share, most) for test in (*begun, *tests.running)]
-    scored = score(told, right.wider(_farthest(told.place)), axes.reach)
+    right = tests.right if tests.right is not None else OffsetPosterior((0.0, 0.0, 0.0), measurement.rig)
+    started = [_started(kind, right, measurement, axes) for kind in range(len(axes.moves))]
+    running = [_continued(test, measurement, axes, share, most) for test in (*started, *tests.running)]
+    scored = score(measurement, right.wider(_farthest(measurement.place)), axes.reach)
     # Neighbouring checks share the error of their street: about the rig they say no more than one street can.
-    of_rig = plus(told.noise, told.place)
+    of_rig = plus(measurement.noise, measurement.place)
     # Faint checks of one place are all off alike, however many there are: nothing is learnt of the rig from them.
-    learnt = right if told.weak else right.after(replace(told, noise=of_rig), scored, share)
+    learnt = right if measurement.weak else right.after(replace(measurement, noise=of_rig), scored, share)
     least = three([max(v, n / OLDEST) for v, n in zip(learnt.variance, of_rig, strict=True)])
     learnt = replace(learnt, variance=least)
-    return Hypotheses(learnt, _thinned(running), told.offset)
+    return Hypotheses(learnt, _thinned(running), measurement.offset)
 
 
 def learnt_distance2(tests: Hypotheses, rig: Three) -> float:
@@ -122,8 +124,8 @@ def learnt_distance2(tests: Hypotheses, rig: Three) -> float:
     return fsum(m * m / (r - v) for m, v, r in rows if r > v)
 
 
-def _begun(kind: int, right: Belief, told: Told, axes: Axes) -> Hypothesis:
-    street = right.wider(_farthest(told.place))
+def _started(kind: int, right: OffsetPosterior, measurement: CheckMeasurement, axes: TestedAxes) -> Hypothesis:
+    street = right.wider(_farthest(measurement.place))
     moves = three([sigma * sigma for sigma in axes.moves[kind]])
     return Hypothesis(kind, 0.0, 0.0, street.wider(moves), street, right)
 
@@ -133,17 +135,19 @@ def _farthest(place: Three) -> Three:
     return three([PLACE_TIMES**2 * variance for variance in place])
 
 
-def _continued(test: Hypothesis, told: Told, axes: Axes, share: float, most: float) -> Hypothesis:
-    of_move, of_right = (score(told, belief, axes.reach) for belief in (test.moved, test.right))
+def _continued(
+    test: Hypothesis, measurement: CheckMeasurement, axes: TestedAxes, share: float, most: float
+) -> Hypothesis:
+    of_move, of_right = (score(measurement, posterior, axes.reach) for posterior in (test.moved, test.right))
     step = min(max(of_move.log_density - of_right.log_density, LEAST_STEP), MOST_STEP)
     evidence = test.evidence + share * step
     if step > 0.0:
         evidence = min(evidence, max(most, test.evidence))
-    age, moved = test.age + share, test.moved.after(told, of_move, share)
-    worth = _worth(moved, test.rig.wider(_scatter(told.street, age)), axes.moves[test.kind])
+    age, moved = test.age + share, test.moved.after(measurement, of_move, share)
+    log_prior_odds = _log_prior_odds(moved, test.rig.wider(_scatter(measurement.street, age)), axes.moves[test.kind])
     # Not below 0: a test that began before the mount moved would be too far behind to tell a small move.
-    evidence = min(evidence, max(worth, 0.0))
-    return Hypothesis(test.kind, age, evidence, moved, test.right.after(told, of_right, share), test.rig)
+    evidence = min(evidence, max(log_prior_odds, 0.0))
+    return Hypothesis(test.kind, age, evidence, moved, test.right.after(measurement, of_right, share), test.rig)
 
 
 def _scatter(street: Three, age: float) -> Three:
@@ -152,7 +156,7 @@ def _scatter(street: Three, age: float) -> Three:
     return three([SCATTER**2 * variance * min(STAY / age, 1.0) for variance in street])
 
 
-def _worth(moved: Belief, right: Belief, move: Three) -> float:
+def _log_prior_odds(moved: OffsetPosterior, right: OffsetPosterior, move: Three) -> float:
     """How much likelier a mount at the mean of `moved` was beforehand as one that moved than as a right one, nats.
     `move`: standard deviations of a move."""
     rows = zip(moved.mean, right.mean, right.variance, move, strict=True)
@@ -161,7 +165,7 @@ def _worth(moved: Belief, right: Belief, move: Three) -> float:
 
 def _thinned(running: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
     """The tests to keep: for every kind of move those at ages that grow by a factor, and always the leading one."""
-    kept: list[Hypothesis] = []
+    retained: list[Hypothesis] = []
     for kind in sorted({test.kind for test in running}):
         of_kind = [test for test in running if test.kind == kind and test.age <= OLDEST]
         leading = max(reversed(of_kind), key=lambda test: test.evidence)
@@ -172,5 +176,5 @@ def _thinned(running: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
             crowded = sparse and older is not None and older <= THINNING * sparse[-1].age
             if test is leading or not crowded:
                 sparse.append(test)
-        kept += sparse
-    return tuple(kept)
+        retained += sparse
+    return tuple(retained)

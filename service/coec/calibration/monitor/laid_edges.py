@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.monitor.sensors import MapLevel, PreparedImages, PreparedSweep
-from coec.calibration.objective.cells import COLUMNS, ROWS, Cells, SightLines, sectors
+from coec.calibration.objective.cells import COLUMNS, ROWS, Cells, PointsInView, sectors
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.geometry.cameras import in_image
 from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, alignment_of_parts
@@ -25,7 +25,7 @@ CELL_STEP = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LaidLevel:
+class ProjectedLevel:
     """Range edges on the maps of one level, and the blur of these maps, an angle about the optical axis."""
 
     frames: EdgeFrames
@@ -33,7 +33,7 @@ class LaidLevel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LaidEdges:
+class ProjectedEdges:
     """The range edges that can come into view, on maps of several levels: the same points in the same order on each.
 
     Attributes:
@@ -43,9 +43,9 @@ class LaidEdges:
         measured: the pairs, their sweeps reduced to these range edges, before motion compensation.
     """
 
-    sharp: LaidLevel
-    whole: LaidLevel
-    bands: tuple[LaidLevel, ...]
+    sharp: ProjectedLevel
+    whole: ProjectedLevel
+    bands: tuple[ProjectedLevel, ...]
     measured: tuple[FramePair, ...]
 
     @property
@@ -54,9 +54,9 @@ class LaidEdges:
         first = self.sharp.frames.first_point
         return np.repeat(np.arange(len(first) - 1), np.diff(first))
 
-    def of(self, indices: Sequence[int]) -> LaidEdges:
+    def of(self, indices: Sequence[int]) -> ProjectedEdges:
         """The edges of some of the pairs alone, by their indices."""
-        return LaidEdges(
+        return ProjectedEdges(
             _level_of(self.sharp, indices),
             _level_of(self.whole, indices),
             tuple(_level_of(band, indices) for band in self.bands),
@@ -79,11 +79,11 @@ class LaidEdges:
             scales = len(frames.maps) / np.sqrt(np.maximum(squares, LEAST_SQUARE))
             return np.asarray(of_sectors.strength * scales[:, None, None])
 
-        sight = SightLines(p_camera[seen], frames.weight[seen].astype(np.float64), self.frame[seen])
-        return Cells(at, CELL_STEP * self.bands[0].blur_rad, sight)
+        points = PointsInView(p_camera[seen], frames.weight[seen].astype(np.float64), self.frame[seen])
+        return Cells(at, CELL_STEP * self.bands[0].blur_rad, points)
 
 
-def lay(
+def project_edges(
     rig: Rig,
     pairs: Sequence[FramePair],
     sweeps: Sequence[PreparedSweep],
@@ -92,7 +92,7 @@ def lay(
     reach_rad: float,
     *,
     compensated: bool,
-) -> LaidEdges:
+) -> ProjectedEdges:
     """Lays the range edges that come within the prepared part of the images at a pose (4, 4), or within `reach_rad` of
     it.
 
@@ -115,11 +115,11 @@ def lay(
     first_point = np.concatenate([[0], np.cumsum([len(weight) for weight in weights])]).astype(np.int64)
     xyz_m, weight = np.ascontiguousarray(np.concatenate(points_m).T), np.concatenate(weights)
 
-    def laid(level: MapLevel) -> LaidLevel:
-        return LaidLevel(EdgeFrames(level.camera, xyz_m, weight, first_point, level.maps), level.blur_rad)
+    def projected(level: MapLevel) -> ProjectedLevel:
+        return ProjectedLevel(EdgeFrames(level.camera, xyz_m, weight, first_point, level.maps), level.blur_rad)
 
-    bands = tuple(laid(band) for band in images.bands)
-    return LaidEdges(laid(images.sharp), laid(images.whole), bands, tuple(measured))
+    bands = tuple(projected(band) for band in images.bands)
+    return ProjectedEdges(projected(images.sharp), projected(images.whole), bands, tuple(measured))
 
 
 _PIXELS_PER_BLUR = 2.0
@@ -139,7 +139,7 @@ def _may_be_seen(level: MapLevel, xyz_m: NDArray[np.float32], pose: Matrix4, mar
     return np.asarray(valid & across & (v >= -margin_px) & (v < camera.height + margin_px))
 
 
-def _level_of(level: LaidLevel, indices: Sequence[int]) -> LaidLevel:
+def _level_of(level: ProjectedLevel, indices: Sequence[int]) -> ProjectedLevel:
     frames = level.frames
     first = frames.first_point
     rows = np.concatenate([np.arange(first[i], first[i + 1]) for i in indices])

@@ -43,7 +43,7 @@ Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class CheckMeasurement:
     """What one check says about three axes (rad or m).
 
     Attributes:
@@ -66,7 +66,7 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class OffsetPosterior:
     """Where the mount is thought to be: mean and variance per axis (rad or m, and squared); and how far the last check
     was a bad one under this belief, 0 to 1."""
 
@@ -74,23 +74,23 @@ class Belief:
     variance: Three
     astray: float = 0.0
 
-    def after(self, told: Told, scored: Scored, share: float) -> Belief:
+    def after(self, measurement: CheckMeasurement, scored: Scored, share: float) -> OffsetPosterior:
         """The belief after a check that has the score `scored` under it and counts by `share`, 0 to 1."""
         # The farther out a good check lies, the less it weighs (the weight of the Student distribution, at most 1).
-        weight = share * scored.good * min((FREEDOM + AXES) / (FREEDOM + self.distance2(told)), 1.0)
-        precision = [1.0 / v + weight / n for v, n in zip(self.variance, told.noise, strict=True)]
+        weight = share * scored.good * min((FREEDOM + AXES) / (FREEDOM + self.distance2(measurement)), 1.0)
+        precision = [1.0 / v + weight / n for v, n in zip(self.variance, measurement.noise, strict=True)]
         variance = [1.0 / p for p in precision]
-        rows = zip(self.mean, told.offset, variance, told.noise, strict=True)
+        rows = zip(self.mean, measurement.offset, variance, measurement.noise, strict=True)
         mean = [m + v * weight / n * (y - m) for m, y, v, n in rows]
-        return Belief(three(mean), three(variance), 1.0 - scored.good)
+        return OffsetPosterior(three(mean), three(variance), 1.0 - scored.good)
 
-    def wider(self, variance: Three) -> Belief:
+    def wider(self, variance: Three) -> OffsetPosterior:
         """The belief with `variance` added to its own."""
-        return Belief(self.mean, plus(self.variance, variance), self.astray)
+        return OffsetPosterior(self.mean, plus(self.variance, variance), self.astray)
 
-    def distance2(self, told: Told) -> float:
+    def distance2(self, measurement: CheckMeasurement) -> float:
         """Squared distance of a check from the mean, in standard deviations."""
-        rows = zip(told.offset, self.mean, self.variance, told.noise, strict=True)
+        rows = zip(measurement.offset, self.mean, self.variance, measurement.noise, strict=True)
         return fsum((y - m) ** 2 / (v + n) for y, m, v, n in rows)
 
 
@@ -123,23 +123,23 @@ class Scored:
     good: float
 
 
-def score(told: Told, belief: Belief, reach: Three) -> Scored:
+def score(measurement: CheckMeasurement, posterior: OffsetPosterior, reach: Three) -> Scored:
     """The score of a check if the mount is where it is believed. `reach`: standard deviations of bad checks, per
     axis."""
-    bad = BAD_SHARE_WEAK if told.weak else BAD_SHARE + belief.astray * (BAD_AFTER_BAD - BAD_SHARE)
-    good = log(1.0 - bad) + log_density(told.offset, belief.mean, plus(belief.variance, told.noise))
-    astray = log(bad) + _log_density_of_bad(told, reach)
+    bad = BAD_SHARE_WEAK if measurement.weak else BAD_SHARE + posterior.astray * (BAD_AFTER_BAD - BAD_SHARE)
+    good = log(1.0 - bad) + log_density(measurement.offset, posterior.mean, plus(posterior.variance, measurement.noise))
+    astray = log(bad) + _log_density_of_bad(measurement, reach)
     most = max(good, astray)
     total = most + log(exp(good - most) + exp(astray - most))
     return Scored(total, exp(good - total))
 
 
-def _log_density_of_bad(told: Told, reach: Three) -> float:
-    again = SAME_AGAIN_WEAK if told.weak else SAME_AGAIN
-    anywhere = log_density(told.offset, (0.0, 0.0, 0.0), three([r * r for r in reach]))
-    if told.before is None:
+def _log_density_of_bad(measurement: CheckMeasurement, reach: Three) -> float:
+    again = SAME_AGAIN_WEAK if measurement.weak else SAME_AGAIN
+    anywhere = log_density(measurement.offset, (0.0, 0.0, 0.0), three([r * r for r in reach]))
+    if measurement.before is None:
         return anywhere
     elsewhere = log(1.0 - again) + anywhere
-    same = log(again) + log_density(told.offset, told.before, plus(told.noise, told.noise))
+    same = log(again) + log_density(measurement.offset, measurement.before, plus(measurement.noise, measurement.noise))
     most = max(elsewhere, same)
     return most + log(exp(elsewhere - most) + exp(same - most))

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import exp, fsum, log, radians
 
-from coec.calibration.monitor.likelihood import BAD_SHARE, FREEDOM, Three, Told, plus, three
+from coec.calibration.monitor.likelihood import BAD_SHARE, FREEDOM, CheckMeasurement, Three, plus, three
 
 SWING_RAD = radians(0.3)
 """Standard deviation of the pose of a loose mount that is looked for."""
@@ -21,7 +21,7 @@ LOOSE_AT = 10.0
 """Evidence, nats, from which a mount is loose. At a check every five seconds a mount at rest reaches it on one of three
 axes once in ten hours at most, by the logarithm of the number of checks, as the other levels do."""
 
-LEAST_STEP, MOST_STEP, MOST = -2.0, 3.0, 13.0
+LEAST_SCATTER_STEP, MOST_SCATTER_STEP, MOST = -2.0, 3.0, 13.0
 """Bounds of one difference, and of the sum, nats: no pair of bad checks decides, and a mount that was tightened is
 forgotten after three or four checks."""
 
@@ -45,7 +45,7 @@ class MountScatter:
         """The evidence on the axis that scatters most, nats."""
         return max(self.of_axes)
 
-    def distance2(self, measured: Told) -> float:
+    def distance2(self, measured: CheckMeasurement) -> float:
         """Squared distance between a check and the last one with clear edges, in standard deviations of a mount at
         rest; 0 before the first."""
         if self.before is None or self.variance is None:
@@ -54,7 +54,7 @@ class MountScatter:
         rows = zip(measured.offset, self.before, at_rest, strict=True)
         return fsum((one - other) ** 2 / variance for one, other, variance in rows)
 
-    def after(self, measured: Told | None, reach: Three, share: float) -> MountScatter:
+    def after(self, measured: CheckMeasurement | None, reach: Three, share: float) -> MountScatter:
         """The sum after one more check that counts by `share`, 0 to 1. `measured` is what the check says of the
         rotations, None if it does not determine them; `reach` are the standard deviations of bad checks (rad). A check
         with faint edges says nothing of scatter."""
@@ -72,7 +72,7 @@ def _step(difference: float, at_rest: float, reach: float) -> float:
     """Log-likelihood ratio of a difference (rad) whose variance is `at_rest` if the mount does not move. Either of the
     two checks may be a bad one, whose standard deviation is `reach`."""
     loose, still = (_log_density(difference, variance, reach) for variance in (at_rest + 2.0 * SWING_RAD**2, at_rest))
-    return min(max(loose - still, LEAST_STEP), MOST_STEP)
+    return min(max(loose - still, LEAST_SCATTER_STEP), MOST_SCATTER_STEP)
 
 
 def _log_density(difference: float, variance: float, reach: float) -> float:

@@ -13,14 +13,14 @@ from math import cos, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.monitor.laid_edges import LaidEdges, LaidLevel
+from coec.calibration.monitor.laid_edges import ProjectedEdges, ProjectedLevel
 from coec.calibration.search.bounded import Box, maximum_in
 from coec.calibration.steps import POLISH_METRES_PER_RADIAN, of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.geometry.cover import moved_by, unit_ball
 from coec.geometry.edges.alignment import EdgeFrames, significances, smooth_significances
-from coec.geometry.edges.charts import keep_apart
+from coec.geometry.edges.charts import select_separated
 from coec.geometry.thinning import thinned
 
 REACH_RAD = radians(4.0)
@@ -36,7 +36,7 @@ MOST_POSES = 1_500
 COVER_POINTS = 2_000
 """Most range edges that score the cover; significance falls only with the root of their number."""
 
-BEGINNINGS, APART = 2, 1.5
+BEGINNINGS, MIN_SEPARATION = 2, 1.5
 """How many of the best poses of the cover begin a climb, and how many blurs they are apart."""
 
 FAIR_SHARE = 0.8
@@ -67,7 +67,7 @@ HOPELESS_SHARE = 0.7
 """A climb is not followed to the sharpest edges if on the finest band it has less than this share of the significance
 of the optimum next to the pose."""
 
-CLIMB_STEPS = 4.0
+ASCENT_STEPS = 4.0
 """Half-width of the box of a climb, in blurs."""
 
 TOLERANCE, LEADING_TOLERANCE = 0.01, 0.1
@@ -82,7 +82,7 @@ ROTATION_DOF, POSE_DOF = 3, 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Neighbourhood:
+class LocalOptima:
     """What was found near a pose.
 
     Attributes:
@@ -102,38 +102,40 @@ class _End:
     significance: float
 
 
-def search(edges: LaidEdges, pose: Matrix4) -> Neighbourhood:
+def search_local_optima(edges: ProjectedEdges, pose: Matrix4) -> LocalOptima:
     """The neighbourhood of a pose (4, 4)."""
     pose = np.ascontiguousarray(pose)
     coarsest, finest, sharp = edges.bands[-1], edges.bands[0], edges.sharp
     settled = of_both(finest.blur_rad, POLISH_METRES_PER_RADIAN)
-    near = _climb(sharp.frames, pose, settled[:ROTATION_DOF], TOLERANCE)
+    near = _ascend(sharp.frames, pose, settled[:ROTATION_DOF], TOLERANCE)
     fair = HOPELESS_SHARE * float(smooth_significances(finest.frames, near.pose[None])[0])
     cover = _cover(pose, coarsest.blur_rad)
     thin = coarsest.frames.of_points(thinned(len(coarsest.frames.weight), COVER_POINTS))
     z = significances(thin, cover)
     z_best = float(z.max())
     # The maximum of the sharpest edges next to the pose may be a ripple on a hill that is whole on the finest band.
-    ends = [_climb(finest.frames, near.pose, settled[:ROTATION_DOF], LEADING_TOLERANCE)]
-    apart = APART * coarsest.blur_rad
+    ends = [_ascend(finest.frames, near.pose, settled[:ROTATION_DOF], LEADING_TOLERANCE)]
+    separation = MIN_SEPARATION * coarsest.blur_rad
     z_near = float(significances(thin, near.pose[None])[0])
-    for number in keep_apart(cover, np.argsort(-z, kind="stable"), BEGINNINGS, _trace_of(apart)):
+    for number in select_separated(cover, np.argsort(-z, kind="stable"), BEGINNINGS, _trace_of(separation)):
         # A nearer beginning is on the same hill, unless it is higher than the maximum next to the pose. That maximum is
         # then a ripple on the slope, and the finest band, whose reach is a few tenths of a degree, may not lead off it.
-        if z[number] >= FAIR_SHARE * z_best and (_apart(cover[number], near.pose) > apart or z[number] > z_near):
+        if z[number] >= FAIR_SHARE * z_best and (
+            _angle_between(cover[number], near.pose) > separation or z[number] > z_near
+        ):
             ends.append(_led(edges.bands, cover[number]))
     best = near
     for end in ends:
-        if end.significance >= fair and _apart(end.pose, near.pose) >= SAME * finest.blur_rad:
-            end = _climb(sharp.frames, end.pose, settled[:ROTATION_DOF], TOLERANCE)
+        if end.significance >= fair and _angle_between(end.pose, near.pose) >= SAME * finest.blur_rad:
+            end = _ascend(sharp.frames, end.pose, settled[:ROTATION_DOF], TOLERANCE)
             best = max(best, end, key=lambda one: one.significance)
     there = _contrast(finest, best.pose)
     if best is not near and (there < MIN_CONTRAST or near.significance >= NEAR_SHARE * best.significance):
         best, there = near, _contrast(finest, near.pose)
-    return Neighbourhood(best.pose, _pose_of(edges, best), there)
+    return LocalOptima(best.pose, _pose_of(edges, best), there)
 
 
-def _contrast(band: LaidLevel, pose: Matrix4) -> float:
+def _contrast(band: ProjectedLevel, pose: Matrix4) -> float:
     """How far a pose stands above others at which the same sweeps lie on other parts of the images; standard
     deviations."""
     turned = np.tile(np.eye(4), (2 * OTHER_POSES, 1, 1))
@@ -146,30 +148,30 @@ def _contrast(band: LaidLevel, pose: Matrix4) -> float:
     return float((z[0] - z[1:].mean()) / max(float(z[1:].std()), 1e-9))
 
 
-def _pose_of(edges: LaidEdges, rotation: _End) -> Matrix4:
+def _pose_of(edges: ProjectedEdges, rotation: _End) -> Matrix4:
     """The optimum over six degrees of freedom next to the one over three, climbed to directly or by way of the finest
     band."""
     finest = edges.bands[0]
     settled = of_both(finest.blur_rad, POLISH_METRES_PER_RADIAN)
-    near = _climb(edges.sharp.frames, rotation.pose, settled, TOLERANCE)
-    led = _climb(finest.frames, rotation.pose, settled, LEADING_TOLERANCE)
+    near = _ascend(edges.sharp.frames, rotation.pose, settled, TOLERANCE)
+    led = _ascend(finest.frames, rotation.pose, settled, LEADING_TOLERANCE)
     if float(np.abs(se3.difference(led.pose, near.pose) / settled).max()) < SAME:
         return near.pose  # the way by the finest band leads to the same end
-    far = _climb(edges.sharp.frames, led.pose, settled, TOLERANCE)
+    far = _ascend(edges.sharp.frames, led.pose, settled, TOLERANCE)
     return near.pose if near.significance >= NEAR_SHARE * far.significance else far.pose
 
 
-def _led(bands: tuple[LaidLevel, ...], pose: Matrix4) -> _End:
+def _led(bands: tuple[ProjectedLevel, ...], pose: Matrix4) -> _End:
     """The end of a climb on the bands, from coarse to fine."""
     end = _End(pose, 0.0)
     for band in reversed(bands):
-        end = _climb(
+        end = _ascend(
             band.frames, end.pose, of_both(band.blur_rad, POLISH_METRES_PER_RADIAN)[:ROTATION_DOF], LEADING_TOLERANCE
         )
     return end
 
 
-def _climb(frames: EdgeFrames, start: Matrix4, step: NDArray[np.float64], tolerance: float) -> _End:
+def _ascend(frames: EdgeFrames, start: Matrix4, step: NDArray[np.float64], tolerance: float) -> _End:
     """The maximum next to a pose, along the first `len(step)` axes of ξ."""
     dof = len(step)
 
@@ -179,12 +181,12 @@ def _climb(frames: EdgeFrames, start: Matrix4, step: NDArray[np.float64], tolera
         return moved_by(start, np.ascontiguousarray(xi[:, :3]), np.ascontiguousarray(xi[:, 3:]))
 
     def scores(points: NDArray[np.float64]) -> list[float]:
-        found: list[float] = smooth_significances(frames, at(points)).tolist()
-        return found
+        values: list[float] = smooth_significances(frames, at(points)).tolist()
+        return values
 
-    reach = CLIMB_STEPS * step
-    found, _ = maximum_in(Box(-reach, reach, step, tolerance * step), scores, np.zeros(dof), MAX_EVALUATIONS)
-    end = at(found[None])
+    reach = ASCENT_STEPS * step
+    best, _ = maximum_in(Box(-reach, reach, step, tolerance * step), scores, np.zeros(dof), MAX_EVALUATIONS)
+    end = at(best[None])
     return _End(end[0], float(smooth_significances(frames, end)[0]))
 
 
@@ -199,5 +201,5 @@ def _trace_of(angle_rad: float) -> float:
     return 1.0 + 2.0 * cos(angle_rad)
 
 
-def _apart(one: Matrix4, other: Matrix4) -> float:
+def _angle_between(one: Matrix4, other: Matrix4) -> float:
     return se3.rotation_angle_rad(one @ se3.inverse(other))

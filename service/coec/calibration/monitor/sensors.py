@@ -93,12 +93,12 @@ def prepare_sweep(sweep: LidarFrame) -> PreparedSweep:
     """The range edges of a sweep, and what the sweep shows of the LiDAR. Only these points are placed, and only later,
     because every pair places them at the instant of another exposure."""
     seen = bearings(sweep.xyz_m)
-    found = range_edges(sweep.xyz_m, sweep.ring, seen)
-    offsets_s = None if sweep.time_offset_s is None else sweep.time_offset_s[found.index]
+    detected = range_edges(sweep.xyz_m, sweep.ring, seen)
+    offsets_s = None if sweep.time_offset_s is None else sweep.time_offset_s[detected.index]
     # The shift may come before motion compensation, which turns this tenth of a degree by two degrees at most.
-    xyz_m = sweep.xyz_m[found.index] + found.shift_m
+    xyz_m = sweep.xyz_m[detected.index] + detected.shift_m
     edges = LidarFrame(sweep.stamp_ns, sweep.frame_id, xyz_m, time_offset_s=offsets_s)
-    return PreparedSweep(edges, found.weight, sweep_facts(sweep.xyz_m, seen, len(found.index)))
+    return PreparedSweep(edges, detected.weight, sweep_facts(sweep.xyz_m, seen, len(detected.index)))
 
 
 def outline(camera: Camera, edges: Sequence[LidarFrame], pose: Matrix4, reach_rad: float) -> Rectangle | None:
@@ -130,7 +130,7 @@ def prepare_images(
     mask: NDArray[np.bool_] | None,
     upright: NDArray[np.float64],
     counted: Rectangle,
-    wanted: Rectangle,
+    required: Rectangle,
 ) -> PreparedImages:
     """Edge maps of the images of a camera, and what they show of the camera. Images are read one at a time, so `greys`
     (height, width) may decode each when it is asked for.
@@ -147,7 +147,7 @@ def prepare_images(
     """
     finest = math.ceil(math.log2(max(1.0, camera.width * camera.height / MAX_PIXELS)) / 2.0)
     coarsest = max(finest + 1, math.ceil(math.log2(COARSEST_BLUR_RAD / (BLUR_SIGMA_PX * pixel_rad(camera)))))
-    part = _aligned(wanted, camera, 2 << coarsest)
+    part = _aligned(required, camera, 2 << coarsest)
     lit = np.ones((part.height, part.width), np.bool_) if mask is None else np.ascontiguousarray(mask[part.slices])
     scales = EdgeScales(lit, finest, coarsest, upright, counted.within(part))
     facts: list[PictureFacts] = []

@@ -31,7 +31,7 @@ class Support:
         certainty: of the gain, in standard deviations of the scatter of frames and sectors; see `Landscape`.
     """
 
-    kept: float
+    retained: float
     certainty: float
 
     @property
@@ -42,7 +42,7 @@ class Support:
     @property
     def insists(self) -> bool:
         """Whether the gain is also large enough for another place to be believed instead of the one next to a pose."""
-        return self.gained and self.kept < NEAR_SHARE
+        return self.gained and self.retained < NEAR_SHARE
 
 
 def support(there: NDArray[np.float64], expected: NDArray[np.float64]) -> Support:

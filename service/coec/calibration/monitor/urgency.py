@@ -7,7 +7,7 @@ began later is ended as soon as it is enough for a window, or replaced by a shor
 
 from __future__ import annotations
 
-from coec.calibration.frames.window import SliceEnded, WindowCutter
+from coec.calibration.frames.window import SliceClosed, WindowCutter
 from coec.config import MonitorConfig, WindowConfig
 
 TRIES = 3
@@ -16,10 +16,10 @@ TRIES = 3
 MARGIN = 1.2
 """Factor by which a slice is longer than its pairs need at the rate at which they come."""
 
-NS_PER_S = 1_000_000_000
+NS_PER_S_URGENT = 1_000_000_000
 
 
-class Urgency:
+class UrgentWindow:
     """Hurries the `WindowCutter` of one pair while a window is wanted. Sensor time alone decides."""
 
     def __init__(self, monitor: MonitorConfig) -> None:
@@ -39,14 +39,14 @@ class Urgency:
         """The pair suspects a move and wants a window of frames since `since_ns`. It does not wait for its turn, as
         pairs do that the rig waits for."""
         if (self._since_ns is None or self._for_rig) and self._tries < TRIES:
-            self._want(since_ns, for_rig=False, longer_s=0.0)
+            self._request(since_ns, for_rig=False, longer_s=0.0)
             self._tries += 1
 
-    def wanted(self, since_ns: int, longer_s: float) -> None:
+    def request(self, since_ns: int, longer_s: float) -> None:
         """The rig waits for a window of frames since `since_ns`, whatever the pair itself suspects. The slice is
         `longer_s` longer than an urgent one, because the pairs of a sensor are solved one after the other."""
         if self._since_ns is None:
-            self._want(since_ns, for_rig=True, longer_s=longer_s)
+            self._request(since_ns, for_rig=True, longer_s=longer_s)
 
     def calm(self) -> None:
         """The suspicion is over. A window for which the rig waits is still wanted."""
@@ -59,11 +59,11 @@ class Urgency:
         self.calm()
         self._since_ns = None
 
-    def _want(self, since_ns: int, *, for_rig: bool, longer_s: float) -> None:
+    def _request(self, since_ns: int, *, for_rig: bool, longer_s: float) -> None:
         self._since_ns, self._hurried = since_ns, False
         self._for_rig, self._longer_s = for_rig, longer_s
 
-    def heed(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
+    def apply(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceClosed]:
         """Ends the slice of the cutter if necessary; to be called before a pair is offered to the cutter.
 
         Args:
@@ -85,7 +85,7 @@ class Urgency:
         waits_s = lacking * cutter.config.slice_s / cutter.config.pairs
         return [] if waits_s <= self._length_s(cutter.config, rate_hz) else self._hurry(cutter, rate_hz)
 
-    def ended(self, event: SliceEnded, cutter: WindowCutter, rate_hz: float | None) -> None:
+    def on_slice_closed(self, event: SliceClosed, cutter: WindowCutter, rate_hz: float | None) -> None:
         """A slice ended by itself. If it has enough pairs it is the window that was wanted; else the next one is
         hurried."""
         if self._since_ns is None or not self._hurried:
@@ -95,11 +95,11 @@ class Urgency:
         else:
             cutter.hurry(self._length_s(cutter.config, rate_hz))
 
-    def _hurry(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
-        ended = cutter.finish()
+    def _hurry(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceClosed]:
+        closed = cutter.finish()
         cutter.hurry(self._length_s(cutter.config, rate_hz))
         self._hurried = True
-        return ended
+        return closed
 
     def _length_s(self, window: WindowConfig, rate_hz: float | None) -> float:
         """Length of an urgent slice: as configured, or longer if pairs come slowly, but no longer than any other."""

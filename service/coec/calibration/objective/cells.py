@@ -20,7 +20,7 @@ apart, and 16 x 1 give the same standard deviations within a tenth (two simulate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SightLines:
+class PointsInView:
     """The points in view that settle a pose.
 
     Attributes:
@@ -48,7 +48,7 @@ class Cells:
 
     at: Callable[[NDArray[np.float64]], NDArray[np.float64]]
     step_rad: float
-    sight: SightLines
+    points: PointsInView
 
 
 def sectors(uv_px: NDArray[np.float64]) -> NDArray[np.int64]:

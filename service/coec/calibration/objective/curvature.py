@@ -36,9 +36,9 @@ class Curvature:
         return np.asarray(self.second_derivative[:3] / (score if score > 0.0 else np.nan))
 
 
-def measure_curvature(objective: Objective, pose: Matrix4, dof: int, kept: Collection[int] = ()) -> Curvature:
+def measure_curvature(objective: Objective, pose: Matrix4, dof: int, fixed: Collection[int] = ()) -> Curvature:
     """The curvature by central differences about `pose` (4, 4), on the first `dof` axes except those in `kept`."""
-    axes = [axis for axis in range(dof) if axis not in kept]
+    axes = [axis for axis in range(dof) if axis not in fixed]
     first, second = _derivatives(objective, pose, axes)
     return Curvature(_padded(first, axes), _padded(second, axes))
 
@@ -53,7 +53,7 @@ def _derivatives(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     def at(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
         poses = np.array([se3.perturb(pose, offset) for offset in offsets])
-        return np.array([found.frame_scores for found in objective.evaluate_each(poses)])
+        return np.array([evaluation.frame_scores for evaluation in objective.evaluate_each(poses)])
 
     gradients, second = along(at, of_both(objective.step_rad), axes)
     return gradients.mean(axis=1), -second.mean(axis=1)

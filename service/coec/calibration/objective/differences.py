@@ -17,8 +17,8 @@ def along(
     """Gradients and second derivatives, each (len(axes), F), along some of n axes; `steps` (n,) are the difference
     steps."""
     shifts = np.diag(steps)[list(axes)]
-    centre, *beside = at(np.concatenate([np.zeros((1, len(steps))), shifts, -shifts]))
-    plus, minus = np.array(beside[: len(axes)]), np.array(beside[len(axes) :])
+    centre, *neighbours = at(np.concatenate([np.zeros((1, len(steps))), shifts, -shifts]))
+    plus, minus = np.array(neighbours[: len(axes)]), np.array(neighbours[len(axes) :])
     of_axes = steps[list(axes), None]
     return (plus - minus) / (2.0 * of_axes), (plus + minus - 2.0 * centre) / of_axes**2
 
@@ -29,6 +29,6 @@ def across(at: FrameScores, steps: NDArray[np.float64], pairs: Sequence[tuple[in
     for i, j in pairs:
         both, against = shifts[i] + shifts[j], shifts[i] - shifts[j]
         offsets += [both, -both, against, -against]
-    found = at(np.array(offsets).reshape(-1, len(steps)))
+    values = at(np.array(offsets).reshape(-1, len(steps)))
     of_pairs = np.array([4.0 * steps[i] * steps[j] for i, j in pairs])[:, None]
-    return np.asarray((found[::4] + found[1::4] - found[2::4] - found[3::4]) / of_pairs)
+    return np.asarray((values[::4] + values[1::4] - values[2::4] - values[3::4]) / of_pairs)

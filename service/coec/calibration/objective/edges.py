@@ -47,7 +47,7 @@ Edges = TypeVar("Edges", EdgeFrames, EdgeCharts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EdgeWitness:
+class EdgeCue:
     """One witness in four forms: exact and sharp, exact and blurred, bands, and charts.
 
     Attributes:
@@ -121,9 +121,7 @@ Points = Callable[[int, NDArray[np.int64]], NDArray[np.float32]]
 """The chosen points of the sweep of a pair: (N, 3), motion-compensated."""
 
 
-def build_edges(
-    pairs: Sequence[FramePair], points: Points, greys: Iterable[NDArray[np.uint8]], rig: Rig
-) -> EdgeWitness:
+def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDArray[np.uint8]], rig: Rig) -> EdgeCue:
     """Range edges of the sweeps (found as measured, placed motion-compensated) and edge maps of the images.
 
     Args:
@@ -134,24 +132,24 @@ def build_edges(
     Raises:
         CalibrationError: no sweep has a range edge, or an image is not of the camera's size.
     """
-    found = [range_edges(pair.lidar.xyz_m, pair.lidar.ring) for pair in pairs]
-    first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in found])]).astype(np.int64)
+    detected = [range_edges(pair.lidar.xyz_m, pair.lidar.ring) for pair in pairs]
+    first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in detected])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError("no sweep has a jump in range: there is nothing to lay onto the edges of the images")
     # The shift is not compensated: motion compensation turns this tenth of a degree by two degrees at most.
-    xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(found)])
-    weight = np.concatenate([edges.weight for edges in found])
+    xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(detected)])
+    weight = np.concatenate([edges.weight for edges in detected])
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
     finest = min(finest, coarsest + 1 - BANDS)
     sharp, whole, *of_bands = _maps(rig, finest, coarsest, greys, len(pairs))
     points_m = np.ascontiguousarray(xyz_m.T)
 
-    def frames(level: int, maps: NDArray[np.int8], chosen: NDArray[np.int64]) -> EdgeFrames:
+    def frames(level: int, maps: NDArray[np.int8], indices: NDArray[np.int64]) -> EdgeFrames:
         # Halving drops a last odd row or column, but the scale is still a half.
         _, height, width = maps.shape
         camera = scaled(rig.camera, 0.5**level, 0.5**level)._replace(width=width, height=height)
-        first_chosen = np.searchsorted(chosen, first_point)
-        return EdgeFrames(camera, np.ascontiguousarray(points_m[:, chosen]), weight[chosen], first_chosen, maps)
+        first_index = np.searchsorted(indices, first_point)
+        return EdgeFrames(camera, np.ascontiguousarray(points_m[:, indices]), weight[indices], first_index, maps)
 
     every, ranked = np.arange(len(weight)), thinned(len(weight), RANKED_POINTS)
     levels = range(coarsest + 1 - BANDS, coarsest + 1)
@@ -162,8 +160,8 @@ def build_edges(
         edge_charts(bands[k].camera, bands[k].maps, blur_rad[k], points_m[:, ranked], weight[ranked], of_points)
         for k in (-1, -2)
     )
-    kept = thinned(len(ranked), THINNED_POINTS)
-    return EdgeWitness(
+    subset = thinned(len(ranked), THINNED_POINTS)
+    return EdgeCue(
         sharp=frames(finest, sharp, every),
         whole=frames(finest + 1, whole, every),
         blur_rad=_blur_rad(rig.camera, finest),
@@ -171,7 +169,7 @@ def build_edges(
         band_blur_rad=blur_rad,
         half_view_rad=half_field_of_view_rad(rig.camera, _lit(rig)),
         charts=(coarse, fine),
-        thinned=(coarse.of_points(kept), fine.of_points(kept)),
+        thinned=(coarse.of_points(subset), fine.of_points(subset)),
     )
 
 

@@ -13,8 +13,8 @@ from math import hypot, radians, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.cells import COLUMNS, ROWS, Cells, SightLines, sectors
-from coec.calibration.objective.edges import EdgeWitness, in_reach
+from coec.calibration.objective.cells import COLUMNS, ROWS, Cells, PointsInView, sectors
+from coec.calibration.objective.edges import EdgeCue, in_reach
 from coec.calibration.objective.mutual_information import Evaluation, MutualInformation, SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
@@ -134,8 +134,8 @@ class FusedObjective:
                 cells[k, :, -1] = of_depth.frame_scores / self._of_depth.deviation
             return cells
 
-        sight = SightLines(p_camera[seen], edges.weight[seen].astype(np.float64), frame[seen])
-        return Cells(at, CELL_STEP * self._step_rad, sight)
+        points = PointsInView(p_camera[seen], edges.weight[seen].astype(np.float64), frame[seen])
+        return Cells(at, CELL_STEP * self._step_rad, points)
 
 
 class Fusion:
@@ -151,7 +151,7 @@ class Fusion:
     ranking: tuple[FusedObjective, ...]
     settling: tuple[FusedObjective, FusedObjective]
 
-    def __init__(self, edges: EdgeWitness, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
+    def __init__(self, edges: EdgeCue, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
         self._edges, self._depth = edges, depth
         poses = sample_reach(start, reach, OTHER_POSES)
         self._of_depth = Scale.of(np.array([at.score for at in depth.evaluate_each(poses)]))

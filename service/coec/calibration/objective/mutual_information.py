@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.cells import Cells, SightLines
+from coec.calibration.objective.cells import Cells, PointsInView
 from coec.calibration.types import DepthMap, Matrix4, Rig
 from coec.config import ObjectiveConfig
 from coec.errors import CalibrationError
@@ -44,7 +44,7 @@ QUANTILE_SAMPLES = 65_536
 binomial deviation of the median), far inside a bin of 1/32."""
 
 
-SIGHT_POINTS = 20_000
+GEOMETRY_POINTS = 20_000
 """Number of points that stand for the geometry of a window if every point has the same weight."""
 
 
@@ -177,16 +177,16 @@ class MutualInformation:
     def cells(self, T_camera_lidar: Matrix4) -> Cells:
         """Cells by frames alone, with one sector: a histogram cannot be divided into parts."""
         frames = self._frames
-        chosen = thinned(frames.xyz_m.shape[1], SIGHT_POINTS)
-        xyz_m = frames.xyz_m[:, chosen].astype(np.float64)
+        indices = thinned(frames.xyz_m.shape[1], GEOMETRY_POINTS)
+        xyz_m = frames.xyz_m[:, indices].astype(np.float64)
         p_camera = np.einsum("ij,jn->ni", T_camera_lidar[:3, :3], xyz_m) + T_camera_lidar[:3, 3]
         uv_px, valid = project(frames.camera, p_camera)
         seen = valid & in_image(frames.camera, uv_px)
-        frame = np.searchsorted(frames.first_point, chosen, side="right") - 1
+        frame = np.searchsorted(frames.first_point, indices, side="right") - 1
         return Cells(
             lambda poses: np.array([at.frame_scores[:, None] for at in self.evaluate_each(poses)]),
             self.step_rad,
-            SightLines(p_camera[seen], np.ones(int(seen.sum())), frame[seen]),
+            PointsInView(p_camera[seen], np.ones(int(seen.sum())), frame[seen]),
         )
 
     def mi_of_unrelated(self, T_camera_lidar: Matrix4) -> float:
@@ -280,20 +280,20 @@ def _binned(
     config: ObjectiveConfig,
 ) -> BinnedFrames:
     """The points of each frame that may come into view, over its depth map (h·w + 1,), already binned."""
-    kept = [_visible(frame.xyz_m, reach, config) for frame in points]
-    kept = [rows[azimuth_order(f.xyz_m[rows])] for f, rows in zip(points, kept, strict=True)]
-    first_point = np.concatenate([[0], np.cumsum([len(rows) for rows in kept])]).astype(np.int64)
+    visible = [_visible(frame.xyz_m, reach, config) for frame in points]
+    visible = [rows[azimuth_order(f.xyz_m[rows])] for f, rows in zip(points, visible, strict=True)]
+    first_point = np.concatenate([[0], np.cumsum([len(rows) for rows in visible])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError(
             f"no LiDAR point from {config.min_range_m} m to {config.max_range_m} m can come into view from the start"
         )
-    xyz_m = np.ascontiguousarray(np.concatenate([f.xyz_m[rows] for f, rows in zip(points, kept, strict=True)]).T)
+    xyz_m = np.ascontiguousarray(np.concatenate([f.xyz_m[rows] for f, rows in zip(points, visible, strict=True)]).T)
     shift_m = float(np.linalg.norm(reach.start[:3, 3])) + reach.shift_m
     return BinnedFrames(
         camera=camera,
         xyz_m=xyz_m,
         range_bin=np.concatenate(
-            [_point_bins(f.of_points[rows], config.range_bins) for f, rows in zip(points, kept, strict=True)]
+            [_point_bins(f.of_points[rows], config.range_bins) for f, rows in zip(points, visible, strict=True)]
         ),
         first_point=first_point,
         depth_bin=depth_bin,
@@ -327,8 +327,8 @@ class _Reach:
 
 def _visible(xyz_m: NDArray[np.float32], reach: _Reach, config: ObjectiveConfig) -> NDArray[np.int64]:
     range_m = lengths(xyz_m)
-    kept = (range_m >= config.min_range_m) & (range_m <= config.max_range_m) & reach(xyz_m)
-    return np.flatnonzero(kept)
+    visible = (range_m >= config.min_range_m) & (range_m <= config.max_range_m) & reach(xyz_m)
+    return np.flatnonzero(visible)
 
 
 def _point_bins(values: NDArray[np.float32], bins: int) -> NDArray[np.unsignedinteger]:

@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.quantiles import chi2_quantile
-from coec.calibration.rig.evidence import Look
-from coec.calibration.rig.moves import SEEN, Moved, Posterior, who_moved
-from coec.calibration.rig.steps import History, steps_at
-from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
+from coec.calibration.rig.evidence import EdgeObservation
+from coec.calibration.rig.moves import SEEN, Moved, MovePosterior, who_moved
+from coec.calibration.rig.steps import EdgeHistory, steps_at
+from coec.calibration.rig.types import Edge, RigGraph, Sensor, SensorKind
 from coec.calibration.types import Matrix4, Reason
 from coec.geometry import dense
 
@@ -96,7 +96,7 @@ class SensorState:
     """
 
     name: str
-    kind: Kind
+    kind: SensorKind
     health: SensorHealth
     probability: float
     moved: Moved | None
@@ -117,9 +117,9 @@ class RigState:
         named: the sensors that moved.
     """
 
-    histories: Mapping[str, History]
-    posterior: Posterior | None = None
-    asked_ns: int = BEFORE_ALL_NS
+    histories: Mapping[str, EdgeHistory]
+    posterior: MovePosterior | None = None
+    attributed_ns: int = BEFORE_ALL_NS
     stepped_ns: int = BEFORE_ALL_NS
     claimed: Mapping[str, int] = field(default_factory=dict)
     named: frozenset[str] = frozenset()
@@ -131,9 +131,9 @@ class RigState:
         return of is None or (of.nobody >= CALM_AT and all(p < CALM_AT for p in of.disturbed.values()))
 
 
-def begun(graph: RigGraph) -> RigState:
+def initial(graph: RigGraph) -> RigState:
     """The state before any look: every edge is as the vehicle was built, with unknown uncertainty."""
-    return RigState({edge.name: History.at(edge.T_a_b, np.full(6, np.nan)) for edge in graph.edges})
+    return RigState({edge.name: EdgeHistory.at(edge.T_a_b, np.full(6, np.nan)) for edge in graph.edges})
 
 
 def served(state: RigState, edge: str, T_a_b: Matrix4, sigma: NDArray[np.float64]) -> RigState:
@@ -145,7 +145,7 @@ def served(state: RigState, edge: str, T_a_b: Matrix4, sigma: NDArray[np.float64
     """
     if edge not in state.histories:
         raise ValueError(f"{edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
-    return replace(state, histories={**state.histories, edge: History.served(T_a_b, sigma)})
+    return replace(state, histories={**state.histories, edge: EdgeHistory.served(T_a_b, sigma)})
 
 
 def settled(state: RigState) -> RigState:
@@ -157,23 +157,25 @@ def settled(state: RigState) -> RigState:
 def stepped(state: RigState) -> tuple[str, ...]:
     """The edges that lie elsewhere since `stepped_ns` than before, by more than chance."""
     return tuple(
-        name for name, history in state.histories.items() if history.told and _stepped(history, state.stepped_ns)
+        name
+        for name, history in state.histories.items()
+        if history.all_observations and _stepped(history, state.stepped_ns)
     )
 
 
-def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
+def after_edge_observation(state: RigState, graph: RigGraph, observation: EdgeObservation) -> RigState:
     """The state after one more look.
 
     Raises:
         ValueError: it is of no edge of the rig.
     """
-    state = _with(state, look)
-    if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
+    state = _with(state, observation)
+    if observation.stamp_ns - state.attributed_ns < EVERY_S * NS_PER_S:
         return state
-    return replace(_asked(state, graph, None), asked_ns=look.stamp_ns)
+    return replace(_with_attribution(state, graph, None), attributed_ns=observation.stamp_ns)
 
 
-def after_window(state: RigState, graph: RigGraph, look: Look) -> RigState:
+def after_window(state: RigState, graph: RigGraph, observation: EdgeObservation) -> RigState:
     """The state after an accepted window, given as a look at the stamp of its first frame.
 
     Who moved is asked at once, because the pair may serve the window's pose from now on, and after that the question is
@@ -183,18 +185,18 @@ def after_window(state: RigState, graph: RigGraph, look: Look) -> RigState:
     Raises:
         ValueError: it is of no edge of the rig.
     """
-    return _asked(_with(state, look), graph, look)
+    return _with_attribution(_with(state, observation), graph, observation)
 
 
-def _with(state: RigState, look: Look) -> RigState:
+def _with(state: RigState, observation: EdgeObservation) -> RigState:
     """The state with one more look, before anybody asks who moved."""
-    if look.edge not in state.histories:
-        raise ValueError(f"{look.edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
-    history = state.histories[look.edge].after(look, state.calm)
-    return replace(state, histories={**state.histories, look.edge: history})
+    if observation.edge not in state.histories:
+        raise ValueError(f"{observation.edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
+    history = state.histories[observation.edge].after(observation, state.calm)
+    return replace(state, histories={**state.histories, observation.edge: history})
 
 
-def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
+def _with_attribution(state: RigState, graph: RigGraph, window: EdgeObservation | None) -> RigState:
     """The state after asking who moved, by all looks. `window` is the look of an accepted window among them, if the
     window is the reason to ask."""
     histories = state.histories
@@ -229,17 +231,21 @@ def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
 
 
 def _likely_by(
-    window: Look, histories: Mapping[str, History], times_ns: list[int], stepped_ns: int, graph: RigGraph
+    window: EdgeObservation, histories: Mapping[str, EdgeHistory], times_ns: list[int], stepped_ns: int, graph: RigGraph
 ) -> set[str]:
     """The sensors that likely moved if an accepted window replaces all looks at its edge since `stepped_ns`. Those
     looks may all be bent alike, or come from a poor street; the window is another witness, with a search of its own."""
     history = histories[window.edge]
-    looks = tuple(look for look in history.looks if look.stamp_ns < stepped_ns or look is window)
-    by_window = _posterior({**histories, window.edge: replace(history, looks=looks)}, times_ns, graph)
+    observations = tuple(
+        observation
+        for observation in history.observations
+        if observation.stamp_ns < stepped_ns or observation is window
+    )
+    by_window = _posterior({**histories, window.edge: replace(history, observations=observations)}, times_ns, graph)
     return {name for name, p in by_window.sensors.items() if p >= LIKELY_AT}
 
 
-def _probable(of: Posterior) -> tuple[str, ...]:
+def _probable(of: MovePosterior) -> tuple[str, ...]:
     """The sensors that are probable enough to be named."""
     return tuple(name for name, p in of.sensors.items() if p >= NAMED_AT)
 
@@ -253,11 +259,11 @@ def _is_hidden(name: str, probable: Collection[str], graph: RigGraph) -> bool:
 def _is_news(name: str, graph: RigGraph, state: RigState) -> bool:
     """Whether a pair of a sensor was looked at since the last answer. Without this, one bad look could count in several
     answers while other pairs show other sensors."""
-    pairs = (state.histories[edge.name].looks for edge in graph.edges if name in (edge.a, edge.b))
-    return any(looks[-1].stamp_ns > state.asked_ns for looks in pairs if looks)
+    pairs = (state.histories[edge.name].observations for edge in graph.edges if name in (edge.a, edge.b))
+    return any(observations[-1].stamp_ns > state.attributed_ns for observations in pairs if observations)
 
 
-def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:
+def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, EdgeHistory], since_ns: int) -> bool:
     """Whether enough was seen of a sensor since a stamp to name it.
 
     If it has several pairs, two of them must have been looked at: a single one may have a fault of its own, such as the
@@ -267,38 +273,40 @@ def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], 
     """
     of_pairs = [histories[edge.name] for edge in graph.edges if name in (edge.a, edge.b)]
     if len(of_pairs) > 1:
-        return sum(bool(of.looks) and of.looks[-1].stamp_ns >= since_ns for of in of_pairs) >= 2
+        return sum(bool(of.observations) and of.observations[-1].stamp_ns >= since_ns for of in of_pairs) >= 2
     (history,) = of_pairs
-    clear = [look for look in history.looks if look.stamp_ns >= since_ns and not look.weak]
+    clear = [
+        observation for observation in history.observations if observation.stamp_ns >= since_ns and not observation.weak
+    ]
     return bool(clear) and (clear[-1].stepped_ns is not None or _stepped(history, since_ns, POOREST))
 
 
-def _stepped(history: History, since_ns: int, place_times: float = 1.0) -> bool:
+def _stepped(history: EdgeHistory, since_ns: int, place_times: float = 1.0) -> bool:
     """Whether an edge lies elsewhere since a stamp than before, by more than chance, if streets scatter its looks by
     `place_times` their usual standard deviation."""
     step = steps_at(history, [since_ns], place_times)
-    apart = float(dense.squared(dense.inverse(step.covariance[0]), step.xi[0]))
-    return bool(step.looks[0] >= SEEN and apart > STEPPED2)
+    distance2 = float(dense.squared(dense.inverse(step.covariance[0]), step.xi[0]))
+    return bool(step.observations[0] >= SEEN and distance2 > STEPPED2)
 
 
-def _times_ns(histories: Mapping[str, History], stepped_ns: int) -> list[int]:
+def _times_ns(histories: Mapping[str, EdgeHistory], stepped_ns: int) -> list[int]:
     """The stamps to try, newest first: the looks from each on may lie after a step. Times with no look between them are
     one. The likeliest time of the last answer, `stepped_ns`, and the times since which pairs suspect themselves are
     included because, unlike ages, they do not drift as looks grow old."""
-    told = [history.told for history in histories.values() if history.told]
-    last_ns = sorted({looks[-1].stamp_ns for looks in told}, reverse=True)
+    observed = [history.all_observations for history in histories.values() if history.all_observations]
+    last_ns = sorted({observations[-1].stamp_ns for observations in observed}, reverse=True)
     aged_ns = [last_ns[0] - round(age_s * NS_PER_S) for age_s in AGES_S]
     just_after = (stamp_ns + 1 for stamp_ns in last_ns[1:NEWEST])
-    latest = [history.looks[-1].stepped_ns for history in histories.values() if history.looks]
+    latest = [history.observations[-1].stepped_ns for history in histories.values() if history.observations]
     suspected = sorted({stamp_ns for stamp_ns in latest if stamp_ns is not None})[:MOST_SUSPECTED]
-    all_ns = sorted({look.stamp_ns for looks in told for look in looks})
+    all_ns = sorted({observation.stamp_ns for observations in observed for observation in observations})
     first_after = (bisect_left(all_ns, at_ns) for at_ns in (*just_after, *aged_ns, stepped_ns, *suspected))
     # The stamp of the very first look is the same as before all looks.
-    found = {all_ns[place] for place in first_after if 0 < place < len(all_ns)}
-    return sorted({last_ns[0], *found, BEFORE_ALL_NS}, reverse=True)
+    candidates_ns = {all_ns[place] for place in first_after if 0 < place < len(all_ns)}
+    return sorted({last_ns[0], *candidates_ns, BEFORE_ALL_NS}, reverse=True)
 
 
-def _posterior(histories: Mapping[str, History], times_ns: list[int], graph: RigGraph) -> Posterior:
+def _posterior(histories: Mapping[str, EdgeHistory], times_ns: list[int], graph: RigGraph) -> MovePosterior:
     # Levers and axes as they were before the step, because the rig may be far from how it was built.
     edges = [Edge(edge.name, edge.a, edge.b, histories[edge.name].pose) for edge in graph.edges]
     current = RigGraph.of(graph.sensors, edges, graph.links)
@@ -307,17 +315,17 @@ def _posterior(histories: Mapping[str, History], times_ns: list[int], graph: Rig
 
 def sensors(state: RigState, graph: RigGraph) -> tuple[SensorState, ...]:
     """What is believed of every sensor that can move, by name."""
-    return tuple(_state(state, graph, sensor) for sensor in graph.sensors if sensor.kind is not Kind.VEHICLE)
+    return tuple(_state(state, graph, sensor) for sensor in graph.sensors if sensor.kind is not SensorKind.VEHICLE)
 
 
 def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
     edges = [edge.name for edge in graph.edges if sensor.name in (edge.a, edge.b)]
-    looked = [name for name in edges if state.histories[name].looks]
+    observed = [name for name in edges if state.histories[name].observations]
     of = state.posterior
     if of is None and sensor.name in state.named:
         text = "It had moved when the service was stopped; none of its pairs has been looked at since."
         return SensorState(sensor.name, sensor.kind, _moved(sensor), 1.0, None, (Reason("last_known", text),))
-    if of is None or not looked:
+    if of is None or not observed:
         text = "None of its pairs has been looked at yet." if edges else "It is in no pair: nothing shows where it is."
         return SensorState(sensor.name, sensor.kind, SensorHealth.UNKNOWN, 0.0, None, (Reason("not_looked_at", text),))
     probability = of.sensors[sensor.name]
@@ -325,7 +333,7 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
     moved = of.steps.get(sensor.name) if probability > 1.0 - NAMED_AT else None
     if sensor.name in state.named:
         health = _moved(sensor)
-        reasons: tuple[Reason, ...] = (_named(sensor, probability, moved, looked, of),)
+        reasons: tuple[Reason, ...] = (_named(sensor, probability, moved, observed, of),)
     elif max(probability, disturbed) > 1.0 - NAMED_AT:
         health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
         if probability >= NAMED_AT:
@@ -338,26 +346,26 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
             reasons = (Reason("one_more_look", text), *reasons[1:])
     else:
         health = SensorHealth.CALIBRATED
-        text = f"The pairs that were looked at fit without a move of it: {', '.join(looked)}."
+        text = f"The pairs that were looked at fit without a move of it: {', '.join(observed)}."
         reasons = (Reason("fits", text),)
     return SensorState(sensor.name, sensor.kind, health, probability, moved, reasons)
 
 
 def _moved(sensor: Sensor) -> SensorHealth:
-    return SensorHealth.CAMERA_MOVED if sensor.kind is Kind.CAMERA else SensorHealth.LIDAR_MOVED
+    return SensorHealth.CAMERA_MOVED if sensor.kind is SensorKind.CAMERA else SensorHealth.LIDAR_MOVED
 
 
-def _named(sensor: Sensor, probability: float, moved: Moved | None, looked: list[str], of: Posterior) -> Reason:
-    since = [name for name in looked if name in of.looked_at]
+def _named(sensor: Sensor, probability: float, moved: Moved | None, observed: list[str], of: MovePosterior) -> Reason:
+    since = [name for name in observed if name in of.observed]
     far = "" if moved is None else f" by {_size(moved)}"
     others = [name for name in of.sets[0][0] if name != sensor.name]
-    beside = f", together with {', '.join(others)}" if others else ""
-    text = f"It moved{far}{beside}: seen by {', '.join(since)}; all else fits ({100.0 * probability:.1f} %)."
+    others_text = f", together with {', '.join(others)}" if others else ""
+    text = f"It moved{far}{others_text}: seen by {', '.join(since)}; all else fits ({100.0 * probability:.1f} %)."
     return Reason("moved", text)
 
 
 def _undecided(
-    sensor: Sensor, probability: float, disturbed: float, edges: list[str], of: Posterior
+    sensor: Sensor, probability: float, disturbed: float, edges: list[str], of: MovePosterior
 ) -> tuple[Reason, ...]:
     reasons = []
     if probability > 1.0 - NAMED_AT:

@@ -19,7 +19,7 @@ from math import radians
 import numpy as np
 
 from coec.calibration.rig.system import LASTING
-from coec.calibration.rig.types import Edge, Link, RigGraph, Sensor, was
+from coec.calibration.rig.types import Edge, RigGraph, RigidLink, Sensor, was
 from coec.calibration.tracker import NS_PER_H, Measurement, creep_sigma
 from coec.config import TrackerConfig
 
@@ -32,7 +32,7 @@ CREEP = creep_sigma(TrackerConfig())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Before:
+class PreMoveKnowledge:
     """What was known before a move.
 
     Attributes:
@@ -46,7 +46,7 @@ class Before:
     @classmethod
     def of(
         cls, sensors: tuple[str, ...], known: Mapping[str, Sequence[Measurement]], right_ns: int, stamp_ns: int
-    ) -> Before:
+    ) -> PreMoveKnowledge:
         """From what was known of each edge at several times, oldest first: the latest up to `right_ns`, when nothing
         had moved yet, with the uncertainty that it has at `stamp_ns`, when these sensors had moved."""
         right = {name: [one for one in of if one.stamp_ns <= right_ns] for name, of in known.items()}
@@ -68,7 +68,7 @@ class Before:
             if edge.name in self.edges
         ]
         links = [
-            Link(was(link.name), old[link.a], old[link.b], link.T_a_b, link.sigma)
+            RigidLink(was(link.name), old[link.a], old[link.b], link.T_a_b, link.sigma)
             for link in graph.links
             if {link.a, link.b} & set(self.sensors)
         ]

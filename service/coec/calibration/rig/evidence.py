@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.baseline import STREET, UNCOMMISSIONED_BIAS
-from coec.calibration.monitor.change_detector import Observation, told_by
+from coec.calibration.monitor.change_detector import Observation, measurement_on_axes
 from coec.calibration.monitor.likelihood import (
     BAD_AFTER_BAD,
     BAD_SHARE,
@@ -32,7 +32,7 @@ the sender; from the upper one on an axis counts as not determined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
+class EdgeObservation:
     """Where one look at an edge puts it.
 
     Attributes:
@@ -86,25 +86,25 @@ def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         raise ValueError(f"a covariance must have the shape (6, 6), got {covariance.shape}")
     variances = covariance.diagonal()
     with np.errstate(invalid="ignore"):
-        told = np.flatnonzero(np.isfinite(variances) & (variances < MOST_SIGMA**2))
-    if not len(told):
+        determined = np.flatnonzero(np.isfinite(variances) & (variances < MOST_SIGMA**2))
+    if not len(determined):
         raise ValueError("a covariance says nothing about any axis: every variance is missing or beyond all use")
-    block = covariance[np.ix_(told, told)]
-    if not np.isfinite(block).all() or (variances[told] < LEAST_SIGMA**2).any():
+    block = covariance[np.ix_(determined, determined)]
+    if not np.isfinite(block).all() or (variances[determined] < LEAST_SIGMA**2).any():
         raise ValueError("a covariance is not finite, or smaller than anything can be known to")
     if np.abs(block - block.T).max() > 1e-6 * np.abs(block).max():
         raise ValueError("a covariance is not symmetric")
     # Scaled to a unit diagonal: radians and metres differ by powers of ten.
-    scale = 1.0 / np.sqrt(variances[told])
+    scale = 1.0 / np.sqrt(variances[determined])
     inner = dense.inverse(0.5 * (block + block.T) * scale[:, None] * scale)
     information = np.zeros((6, 6))
-    information[np.ix_(told, told)] = inner * scale[:, None] * scale
+    information[np.ix_(determined, determined)] = inner * scale[:, None] * scale
     return information
 
 
-def of_check(
+def observation_of_check(
     edge: str, T_served: Matrix4, observation: Observation, share: float = 1.0, stepped_ns: int | None = None
-) -> Look | None:
+) -> EdgeObservation | None:
     """The look that a check of the pose `T_served` (4, 4) is; None if the check says nothing of the mount, because the
     data were at fault, it holds no new frame, or it determines no axis. For `stepped_ns` see `Look`.
 
@@ -119,13 +119,13 @@ def of_check(
     # Here looks at poor scenes count among the bad ones: their share was learned with the scatter of a street for all.
     observation = replace(observation, dispersion=1.0)
     for axes in (slice(0, 3), slice(3, 6)):
-        told = told_by(observation, axes, None)
-        if told is not None:
-            offset[axes], variance[axes] = told.offset, told.noise
-            place[axes], rig[axes] = np.sqrt(told.place), np.sqrt(told.rig)
+        measurement = measurement_on_axes(observation, axes, None)
+        if measurement is not None:
+            offset[axes], variance[axes] = measurement.offset, measurement.noise
+            place[axes], rig[axes] = np.sqrt(measurement.place), np.sqrt(measurement.rig)
     if not np.isfinite(variance).any():
         return None
-    return Look(
+    return EdgeObservation(
         edge=edge,
         stamp_ns=observation.stamp_ns,
         T_a_b=se3.perturb(T_served, offset),
@@ -138,7 +138,7 @@ def of_check(
     )
 
 
-def of_window(edge: str, window: Measurement) -> Look | None:
+def observation_of_window(edge: str, window: Measurement) -> EdgeObservation | None:
     """The look that an accepted window is; None if the window determines no axis.
 
     Its frames share a street, so the errors that they have in common count as noise here. So does the bias of the
@@ -148,15 +148,15 @@ def of_window(edge: str, window: Measurement) -> Look | None:
         ValueError: the pose is not rigid, or the covariance is invalid.
     """
     _rigid(edge, window.T_camera_lidar)
-    if not window.told_axes():
+    if not window.determined_axes():
         return None
     covariance = window.uncertainty.covariance
-    beside_checks = covariance + np.diag((BIAS_TIMES * UNCOMMISSIONED_BIAS) ** 2)
-    return Look(
+    relative_to_checks = covariance + np.diag((BIAS_TIMES * UNCOMMISSIONED_BIAS) ** 2)
+    return EdgeObservation(
         edge=edge,
         stamp_ns=window.stamp_ns,
         T_a_b=window.T_camera_lidar,
-        information=information_of(beside_checks),
+        information=information_of(relative_to_checks),
         place=STREET,
         rig=UNCOMMISSIONED_BIAS,
         window=covariance,

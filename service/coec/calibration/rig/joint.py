@@ -18,8 +18,8 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.rig.before import Before
-from coec.calibration.rig.system import Measured, Solution, System
+from coec.calibration.rig.before import PreMoveKnowledge
+from coec.calibration.rig.system import MeasuredEdge, Solution, System
 from coec.calibration.rig.types import RigGraph, whose
 from coec.calibration.tracker import Measurement, chi_square_tail
 from coec.calibration.types import Matrix4
@@ -96,7 +96,9 @@ class JointEstimate:
         return self.covariance[i : i + 6, j : j + 6]
 
 
-def estimate(graph: RigGraph, windows: Mapping[str, Measurement], before: Before | None = None) -> JointEstimate:
+def estimate_jointly(
+    graph: RigGraph, windows: Mapping[str, Measurement], before: PreMoveKnowledge | None = None
+) -> JointEstimate:
     """The rig from one window for each edge that has one, by its name, and from what was known `before` a move. Windows
     that determine no axis are ignored.
 
@@ -105,11 +107,15 @@ def estimate(graph: RigGraph, windows: Mapping[str, Measurement], before: Before
     """
     if strange := sorted(set(windows) - set(graph.edge)):
         raise ValueError(f"{', '.join(strange)}: no edge of this rig, it has {', '.join(graph.edge)}")
-    measured = tuple(name for name in graph.edge if name in windows and windows[name].told_axes())
+    measured = tuple(name for name in graph.edge if name in windows and windows[name].determined_axes())
     if not measured:
         raise ValueError("no window says anything about this rig")
-    told = {name: windows[name] for name in measured}
-    system = System.of(graph, told) if before is None else System.of(before.joined(graph), {**told, **before.measured})
+    measurements = {name: windows[name] for name in measured}
+    system = (
+        System.of(graph, measurements)
+        if before is None
+        else System.of(before.joined(graph), {**measurements, **before.measured})
+    )
     solution = system.solved(frozenset())
     chi2, freedom = solution.chi2, solution.freedom
     chance = chi_square_tail(chi2, freedom) if freedom else 1.0
@@ -164,36 +170,36 @@ def _alone_at_fault(system: System, solution: Solution) -> str | None:
 def _open_loops(system: System) -> tuple[Loop, ...]:
     """Those loops that do not close, out of the shortest loop through each edge and link."""
     measured = {one.known.name: one for one in system.measured}
-    ways = [system.graph.loop_through(name, list(measured)) for name in measured]
-    found: dict[frozenset[str], tuple[str, ...]] = {}
-    for way in ways:
+    paths = [system.graph.loop_through(name, list(measured)) for name in measured]
+    unique: dict[frozenset[str], tuple[str, ...]] = {}
+    for way in paths:
         if way is not None:
-            found.setdefault(frozenset(way), way)
-    loops = [_closed([measured[name] for name in way]) for way in found.values()]
+            unique.setdefault(frozenset(way), way)
+    loops = [_closed([measured[name] for name in way]) for way in unique.values()]
     at = INCONSISTENT_AT / max(len(loops), 1)  # one of many loops may fail to close by chance
     return tuple(sorted((loop for loop in loops if loop.chance < at), key=lambda loop: (loop.chance, loop.names)))
 
 
-def _closed(way: Sequence[Measured]) -> Loop:
+def _closed(way: Sequence[MeasuredEdge]) -> Loop:
     """The error left after a way along all of these, from the second end of the first one back to it."""
     here, at = np.eye(4), way[0].known.b
-    covariance, told = np.zeros((6, 6)), np.ones(6, np.bool_)
+    covariance, determined = np.zeros((6, 6)), np.ones(6, np.bool_)
     for one in way:
         forward = one.known.b == at
         step = one.T_a_b if forward else se3.inverse(one.T_a_b)
         # A perturbation on the left of T_a_b, about the axes of where the way began.
         before = se3.adjoint(se3.inverse(here)) if not forward else se3.adjoint(se3.inverse(step @ here))
         covariance = covariance + dense.product(dense.product(before, one.covariance), before.T)
-        told &= one.information.diagonal() > 0.0
+        determined &= one.information.diagonal() > 0.0
         here, at = np.asarray(step @ here), one.known.a if forward else one.known.b
     error = se3.difference(here, np.eye(4))
-    axes = np.flatnonzero(told) if told.any() else np.arange(3)
-    if not told[:3].all():
+    axes = np.flatnonzero(determined) if determined.any() else np.arange(3)
+    if not determined[:3].all():
         return Loop(tuple(one.known.name for one in way), float("nan"), float("nan"), 1.0)
     q = float(dense.squared(dense.inverse(covariance[np.ix_(axes, axes)]), error[axes]))
     return Loop(
         tuple(one.known.name for one in way),
         float(np.sqrt(np.sum(error[:3] ** 2))),
-        float(np.sqrt(np.sum(error[3:] ** 2))) if told[3:].all() else float("nan"),
+        float(np.sqrt(np.sum(error[3:] ** 2))) if determined[3:].all() else float("nan"),
         chi_square_tail(q, len(axes)),
     )

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from coec.calibration.commissioning.quantiles import normal_quantile
 from coec.calibration.monitor.change_detector import ROTATIONS, TRANSLATIONS
-from coec.calibration.rig.steps import REACH, Steps
-from coec.calibration.rig.types import Kind, Known, RigGraph
+from coec.calibration.rig.steps import REACH, EdgeSteps
+from coec.calibration.rig.types import KnownTransform, RigGraph, SensorKind
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.geometry import dense, se3
 
@@ -47,7 +47,7 @@ M_PER_RAD = TRANSLATIONS.moves[-1][0] / ROTATIONS.moves[-1][0]
 EVENT_HOURS = 1000.0
 """Hours of driving between two knocks of any kind. Chosen: a fleet's workshop sees a mount bent about once a year."""
 
-LOOK_BACK_HOURS = 120.0 / 3600.0
+SEARCH_SPAN_HOURS = 120.0 / 3600.0
 """How far back a step is looked for: as long as looks are kept apart."""
 
 TWO_SHARE, EDGE_SHARE = 0.1, 0.01
@@ -72,7 +72,7 @@ CONTENDER = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class Mover:
+class RigidGroup:
     """What moves as one: a sensor, or all sensors on one bar."""
 
     sensors: tuple[str, ...]
@@ -91,7 +91,7 @@ class Moved:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Posterior:
+class MovePosterior:
     """What is believed of who moved.
 
     Attributes:
@@ -110,12 +110,12 @@ class Posterior:
     disturbed: Mapping[str, float]
     steps: Mapping[str, Moved]
     when: int
-    looked_at: tuple[str, ...]
+    observed: tuple[str, ...]
 
 
-def movers(graph: RigGraph) -> tuple[Mover, ...]:
+def movers(graph: RigGraph) -> tuple[RigidGroup, ...]:
     """Every sensor that can move by itself, and every bar."""
-    alone = [Mover((sensor.name,)) for sensor in graph.sensors if sensor.kind is not Kind.VEHICLE]
+    alone = [RigidGroup((sensor.name,)) for sensor in graph.sensors if sensor.kind is not SensorKind.VEHICLE]
     groups: list[set[str]] = []
     for link in graph.links:
         joined = {link.a, link.b}
@@ -123,17 +123,17 @@ def movers(graph: RigGraph) -> tuple[Mover, ...]:
             groups.remove(group)
             joined |= group
         groups.append(joined)
-    return (*alone, *(Mover(group) for group in sorted(tuple(sorted(group)) for group in groups)))
+    return (*alone, *(RigidGroup(group) for group in sorted(tuple(sorted(group)) for group in groups)))
 
 
-def patterns(graph: RigGraph, of: Sequence[Mover]) -> Array:
+def patterns(graph: RigGraph, of: Sequence[RigidGroup]) -> Array:
     """(M, E, 6, 6) how each edge and link, in the order of the graph, steps as each mover moves about the axes of its
     first sensor, at the poses of the graph."""
     poses = dict(zip((sensor.name for sensor in graph.sensors), graph.poses, strict=True))
     return np.array([[_pattern(known, mover, poses) for known in graph.known] for mover in of])
 
 
-def who_moved(graph: RigGraph, steps: Mapping[str, Steps]) -> Posterior:
+def who_moved(graph: RigGraph, steps: Mapping[str, EdgeSteps]) -> MovePosterior:
     """The posterior over all sets, from what each edge says of a step at each of the same T times. All times are
     equally likely beforehand."""
     rows = _Rows.of(graph, steps)
@@ -165,7 +165,7 @@ def who_moved(graph: RigGraph, steps: Mapping[str, Steps]) -> Posterior:
     joint = np.concatenate([log_nobody[:, None], log_prior + log_sets], axis=1)
     weight = np.exp(joint - joint.max())
     weight /= weight.sum()
-    shared = _shared(sets, weight[:, 1:].sum(axis=0), design, rows.looked_at)
+    shared = _shared(sets, weight[:, 1:].sum(axis=0), design, rows.observed)
     sensors = {sensor.name: 0.0 for sensor in graph.sensors}
     for number, p in enumerate(shared.tolist()):
         for name in _names(moving, sets[number]):
@@ -173,7 +173,7 @@ def who_moved(graph: RigGraph, steps: Mapping[str, Steps]) -> Posterior:
     lasting = (weight[:, 0, None] * rows.by_itself).sum(axis=0) + (weight[:, 1:, None] * disturbed).sum(axis=(0, 1))
     when = int(np.argmax(weight[:, 1:].sum(axis=1)))
     order = sorted(range(len(sets)), key=lambda number: (-shared[number], number))
-    return Posterior(
+    return MovePosterior(
         nobody=float(weight[:, 0].sum()),
         sets=tuple(
             (_names(moving, sets[number]), float(shared[number])) for number in order if shared[number] >= CONTENDER
@@ -182,7 +182,7 @@ def who_moved(graph: RigGraph, steps: Mapping[str, Steps]) -> Posterior:
         disturbed={edge.name: float(p) for edge, p in zip(graph.edges, lasting.tolist(), strict=False)},
         steps=_steps(rows, when, design, sets[order[0]], moving, graph),
         when=when,
-        looked_at=tuple(edge.name for edge, seen in zip(graph.edges, rows.looked_at.tolist(), strict=False) if seen),
+        observed=tuple(edge.name for edge, seen in zip(graph.edges, rows.observed.tolist(), strict=False) if seen),
     )
 
 
@@ -195,7 +195,7 @@ class _Rows:
     ratio: Array  # (T, E) log density of the step were it disturbed, over that of noise
     log_disturbed: Array  # (T, E) log prior of a disturbance
     lasting: Array  # (T, E) share of that prior that is not a transient
-    looked_at: NDArray[np.bool_]  # (E,) since any of the times
+    observed: NDArray[np.bool_]  # (E,) since any of the times
     log_still: Array  # (T, E) log likelihood of all looks at one place, over that of a step by noise alone
     base: Array  # (T,) log likelihood of a step of all edges by noise alone, over that of all at one place
 
@@ -222,14 +222,14 @@ class _Rows:
         return np.asarray(np.exp(self.bent - self.either) * self.lasting * seen)
 
     @classmethod
-    def of(cls, graph: RigGraph, steps: Mapping[str, Steps]) -> _Rows:
-        times = len(next(iter(steps.values())).looks) if steps else 1
+    def of(cls, graph: RigGraph, steps: Mapping[str, EdgeSteps]) -> _Rows:
+        times = len(next(iter(steps.values())).observations) if steps else 1
         xi, covariance, seen, transient, stepped = [], [], [], [], []
         for edge in graph.edges:
             of = steps.get(edge.name)
             xi.append(np.zeros((times, 6)) if of is None else of.xi)
             covariance.append(np.tile(np.eye(6), (times, 1, 1)) if of is None else of.covariance)
-            seen.append(np.zeros(times) if of is None else of.looks)
+            seen.append(np.zeros(times) if of is None else of.observations)
             transient.append(np.zeros(times) if of is None else of.log_transient)
             stepped.append(np.zeros(times) if of is None else of.log_stepped - of.log_still)
         for link in graph.links:
@@ -240,34 +240,34 @@ class _Rows:
             # No look is at a link: noise alone and no step are the same.
             stepped.append(np.full(times, 3.0 * log(2.0 * pi) + 0.5 * float(np.sum(np.log(2.0 * link.sigma**2)))))
         step, cov = np.stack(xi, axis=1), np.stack(covariance, axis=1)
-        looked = np.stack(seen, axis=1) >= SEEN
+        observed = np.stack(seen, axis=1) >= SEEN
         # Linearising a move errs by half the square of its turn; for shifts, with lever arms of about a metre.
         angle2 = np.sum(step[..., :3] ** 2, axis=-1)
         cov = cov + (0.5 * angle2[..., None] * np.ones(6))[..., None] ** 2 * np.eye(6)
         factor = dense.cholesky(cov)
-        information = 0.5 * (inverse := dense.solved(factor, np.broadcast_to(np.eye(6), cov.shape)))
-        information = np.where(looked[..., None, None], information + 0.5 * np.swapaxes(inverse, -1, -2), 0.0)
+        information = 0.5 * (inverse := dense.cholesky_solve(factor, np.broadcast_to(np.eye(6), cov.shape)))
+        information = np.where(observed[..., None, None], information + 0.5 * np.swapaxes(inverse, -1, -2), 0.0)
         wide = dense.cholesky(cov + np.diag(REACH**2))
         q = dense.squared(information, step)
-        q_wide = np.sum(step * dense.solved(wide, step[..., None])[..., 0], axis=-1)
+        q_wide = np.sum(step * dense.cholesky_solve(wide, step[..., None])[..., 0], axis=-1)
         log_volume = dense.log_determinant(factor)
         spread = dense.log_determinant(wide) - log_volume
         base = np.stack(stepped, axis=1) - 0.5 * (q + log_volume + 6.0 * log(2.0 * pi))
-        base = np.where(looked, base, 0.0)
+        base = np.where(observed, base, 0.0)
         edges = len(graph.edges)
         lasting = np.full(step.shape[:2], log(LINK_BREAKS))
         lasting[:, :edges] = _log_event() + log(EDGE_SHARE / max(edges, 1))
         # Without a look since, no transient disturbance is assumed: such an edge speaks neither for nor against
         # anybody.
-        for_a_while = np.where(looked, np.stack(transient, axis=1), -np.inf)
+        for_a_while = np.where(observed, np.stack(transient, axis=1), -np.inf)
         prior = np.minimum(np.logaddexp(lasting, for_a_while), log(0.999))
         return cls(
             xi=step,
             information=information,
-            ratio=np.where(looked, 0.5 * (q - q_wide - spread), 0.0),
+            ratio=np.where(observed, 0.5 * (q - q_wide - spread), 0.0),
             log_disturbed=prior,
             lasting=np.exp(np.minimum(lasting - prior, 0.0)),
-            looked_at=np.asarray(looked.any(axis=0)),
+            observed=np.asarray(observed.any(axis=0)),
             log_still=-base,
             base=base.sum(axis=1),
         )
@@ -287,7 +287,7 @@ class _Pulls:
         return cls(
             precision=dense.product(turned[:, :, None], design[None, None]),
             moment=dense.applied(turned, rows.xi[:, None]),
-            touched=(np.abs(design).max(axis=(2, 3)) > 0.0) & rows.looked_at,
+            touched=(np.abs(design).max(axis=(2, 3)) > 0.0) & rows.observed,
         )
 
     def together(self, sets: Sequence[tuple[int, ...]]) -> tuple[Array, Array]:
@@ -314,19 +314,19 @@ def _evidence(sets: Sets, rows: _Rows, pulls: _Pulls) -> tuple[Array, Array]:
     touched = np.array([pulls.touched[list(one)].any(axis=0) for one in sets])
     cases: list[tuple[int, tuple[int, ...]]] = [(place, ()) for place in range(len(sets))]
     cases += [(place, (e,)) for place in range(len(sets)) for e in np.flatnonzero(touched[place]).tolist()]
-    found: list[list[_Case]] = [[] for _ in sets]
+    cases_of_sets: list[list[_Case]] = [[] for _ in sets]
     for (place, out), log_evidence in zip(cases, _marginal(cases, precision, moment, rows, touched).T, strict=True):
-        found[place].append(_Case(out, log_evidence))
+        cases_of_sets[place].append(_Case(out, log_evidence))
     cases = []
-    for place, of_set in enumerate(found):
+    for place, of_set in enumerate(cases_of_sets):
         if len(of_set) < 4:  # if both of two edges are disturbed, nothing speaks for the set
             continue
         worst = max(of_set[1:], key=lambda case: float(case.log_evidence.max())).out[0]
         cases += [(place, (worst, *case.out)) for case in of_set[1:] if case.out[0] != worst]
     for (place, out), log_evidence in zip(cases, _marginal(cases, precision, moment, rows, touched).T, strict=True):
-        found[place].append(_Case(out, log_evidence))
+        cases_of_sets[place].append(_Case(out, log_evidence))
     log_sets, disturbed = np.zeros((times, len(sets))), np.zeros((times, len(sets), edges))
-    for place, of_set in enumerate(found):
+    for place, of_set in enumerate(cases_of_sets):
         each = np.array([case.log_evidence for case in of_set])  # (C, T)
         total = np.logaddexp.reduce(each, axis=0)
         share = np.exp(each - total)
@@ -368,7 +368,7 @@ def _marginal(
     root = np.sqrt(np.array([np.tile(variance, size // 6) for variance in _variances()]))[:, None, None]
     factor = dense.cholesky(np.eye(size) + total * root[..., :, None] * root[..., None, :])
     scaled = pull * root
-    explained = np.sum(scaled * dense.solved(factor, scaled[..., None])[..., 0], axis=-1)
+    explained = np.sum(scaled * dense.cholesky_solve(factor, scaled[..., None])[..., 0], axis=-1)
     by_scale = 0.5 * (explained - dense.log_determinant(factor))
     return np.asarray(constant + np.logaddexp.reduce(by_scale, axis=0) - log(SCALES))
 
@@ -380,14 +380,14 @@ def _variances() -> list[Array]:
 
 
 def _log_event() -> float:
-    return log(LOOK_BACK_HOURS / EVENT_HOURS)
+    return log(SEARCH_SPAN_HOURS / EVENT_HOURS)
 
 
-def _names(moving: Sequence[Mover], one: tuple[int, ...]) -> tuple[str, ...]:
+def _names(moving: Sequence[RigidGroup], one: tuple[int, ...]) -> tuple[str, ...]:
     return tuple(sorted(name for m in one for name in moving[m].sensors))
 
 
-def _pattern(known: Known, mover: Mover, poses: Mapping[str, Array]) -> Array:
+def _pattern(known: KnownTransform, mover: RigidGroup, poses: Mapping[str, Array]) -> Array:
     origin = se3.inverse(poses[mover.sensors[0]])
     a_moves, b_moves = known.a in mover.sensors, known.b in mover.sensors
     if a_moves == b_moves:  # a bar that moves as a whole does not change what lies between its ends
@@ -397,19 +397,19 @@ def _pattern(known: Known, mover: Mover, poses: Mapping[str, Array]) -> Array:
     return -se3.adjoint(known.T_a_b @ poses[known.b] @ origin)
 
 
-def _shared(sets: Sequence[tuple[int, ...]], probability: Array, design: Array, looked_at: NDArray[np.bool_]) -> Array:
+def _shared(sets: Sequence[tuple[int, ...]], probability: Array, design: Array, observed: NDArray[np.bool_]) -> Array:
     """(S,) the probabilities; sets that leave the same pattern pool theirs, shared evenly by the smallest of them."""
     contenders = [number for number in range(len(sets)) if probability[number] >= CONTENDER]
     moves_row = np.abs(design).max(axis=(2, 3)) > 0.0
     # Sets that leave the same pattern touch the same edges, so few are left to compare.
-    touched = [tuple((moves_row[list(one)].any(axis=0) & looked_at).tolist()) for one in sets]
+    touched = [tuple((moves_row[list(one)].any(axis=0) & observed).tolist()) for one in sets]
     shared, done = probability.copy(), set[int]()
     for number in contenders:
         if number in done:
             continue
-        span = _span(sets[number], design, looked_at)
+        span = _span(sets[number], design, observed)
         others = [other for other in range(len(sets)) if touched[other] == touched[number]]
-        alike = [other for other in others if other == number or _same(span, _span(sets[other], design, looked_at))]
+        alike = [other for other in others if other == number or _same(span, _span(sets[other], design, observed))]
         done.update(alike)
         fewest = min(len(sets[other]) for other in alike)
         smallest = [other for other in alike if len(sets[other]) == fewest]
@@ -418,9 +418,9 @@ def _shared(sets: Sequence[tuple[int, ...]], probability: Array, design: Array, 
     return shared
 
 
-def _span(one: tuple[int, ...], design: Array, looked_at: NDArray[np.bool_]) -> Array:
+def _span(one: tuple[int, ...], design: Array, observed: NDArray[np.bool_]) -> Array:
     """(R, n) an orthonormal basis of the patterns that a set leaves on the edges looked at (Gram, Schmidt)."""
-    columns = np.concatenate([design[m][looked_at].reshape(-1, 6) for m in one], axis=1)
+    columns = np.concatenate([design[m][observed].reshape(-1, 6) for m in one], axis=1)
     basis: list[Array] = []
     for column in columns.T:
         length = float(np.sqrt(np.sum(column * column)))
@@ -443,7 +443,7 @@ def _same(one: Array, other: Array) -> bool:
 
 
 def _steps(
-    rows: _Rows, t: int, design: Array, one: tuple[int, ...], moving: Sequence[Mover], graph: RigGraph
+    rows: _Rows, t: int, design: Array, one: tuple[int, ...], moving: Sequence[RigidGroup], graph: RigGraph
 ) -> dict[str, Moved]:
     """By how much each sensor of a set moved, if the set did. Edges that do not fit count less, as in a mixture."""
     size, variance = 6 * len(one), np.tile(_variances()[0], len(one))

@@ -13,7 +13,7 @@ from coec.calibration.rig.attribution import SensorHealth
 from coec.calibration.rig.vehicle import VehicleRig, pairs_of, renewed
 
 
-class Objection(StrEnum):
+class RigAlarm(StrEnum):
     """`moved`: a sensor of the pair was named, and the pair still serves a pose of before the move. `suspected`: the
     windows of the rig do not fit each other, and a sensor of the pair may have moved. `inconsistent`: the windows do
     not fit each other, and no sensor moved."""
@@ -23,19 +23,19 @@ class Objection(StrEnum):
     INCONSISTENT = "inconsistent"
 
 
-def objections(rig: VehicleRig) -> Mapping[str, Objection]:
+def rig_alarms(rig: VehicleRig) -> Mapping[str, RigAlarm]:
     """The objection to each pair, by name; a pair that fits has none."""
-    found = dict.fromkeys(misfits(rig), Objection.INCONSISTENT)
+    alarms = dict.fromkeys(misfits(rig), RigAlarm.INCONSISTENT)
     undecided = {sensor.name for sensor in rig.sensors if sensor.health is SensorHealth.UNDECIDED}
-    for name in found:
+    for name in alarms:
         if {rig.graph.edge[name].a, rig.graph.edge[name].b} & undecided:
-            found[name] = Objection.SUSPECTED
+            alarms[name] = RigAlarm.SUSPECTED
     event = rig.event
     if event is not None:
         for name in pairs_of(rig.graph, event.sensors):
             if name not in rig.graph.of_lidars and not renewed(rig, name, event.stepped_ns):
-                found[name] = Objection.MOVED
-    return found
+                alarms[name] = RigAlarm.MOVED
+    return alarms
 
 
 def misfits(rig: VehicleRig) -> tuple[str, ...]:

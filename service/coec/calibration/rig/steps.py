@@ -20,17 +20,17 @@ from numpy.typing import NDArray
 
 from coec.calibration.monitor.change_detector import ROTATIONS, TRANSLATIONS
 from coec.calibration.monitor.likelihood import BAD_SHARE, FREEDOM
-from coec.calibration.rig.evidence import BIAS_TIMES, MOST_SIGMA, Look
+from coec.calibration.rig.evidence import BIAS_TIMES, MOST_SIGMA, EdgeObservation
 from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
 
 Array = NDArray[np.float64]
 
-MOST_LOOKS = 24
+MAX_OBSERVATIONS = 24
 """Looks of each edge that are kept one by one: two minutes at one every five seconds. Older ones are counted
 together."""
 
-MEMORY_LOOKS = 360.0
+MEMORY_OBSERVATIONS = 360.0
 """The older looks together count as this many at most: half an hour, so that the mean follows a mount that creeps."""
 
 REACH = np.array([*ROTATIONS.reach, *TRANSLATIONS.reach])
@@ -42,7 +42,7 @@ MOST_WINDOWS = 4
 STARTS, TURNS = 3, 5
 """Looks from which a mean is sought, and rounds of the search: the means of drawn looks stand still after four."""
 
-Beside = Callable[[Array, Array], Array]
+ExtraLikelihood = Callable[[Array, Array], Array]
 """Of offsets (T, S, 6) and their covariances (T, S, 6, 6), the log likelihood (T, S) of what else is known."""
 
 _NOTHING = np.eye(6) / MOST_SIGMA**2
@@ -50,7 +50,7 @@ _NOTHING = np.eye(6) / MOST_SIGMA**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class History:
+class EdgeHistory:
     """The looks at one edge since its last state that was consistent.
 
     Attributes:
@@ -64,12 +64,12 @@ class History:
     origin: Matrix4
     information: Array
     moment: Array
-    looks: tuple[Look, ...] = ()
+    observations: tuple[EdgeObservation, ...] = ()
     origin_sigma: Array = field(default_factory=lambda: np.full(6, np.nan))
-    windows: tuple[Look, ...] = ()
+    windows: tuple[EdgeObservation, ...] = ()
 
     @classmethod
-    def at(cls, T_a_b: Matrix4, sigma: Array) -> History:
+    def at(cls, T_a_b: Matrix4, sigma: Array) -> EdgeHistory:
         """A history without looks: the edge is at T_a_b (4, 4), known to `sigma` (6,); NaN or zero where that is not
         known."""
         with np.errstate(invalid="ignore"):
@@ -78,35 +78,35 @@ class History:
         return cls(T_a_b, np.diag(1.0 / variance), np.zeros(6))
 
     @classmethod
-    def served(cls, T_a_b: Matrix4, sigma: Array) -> History:
+    def served(cls, T_a_b: Matrix4, sigma: Array) -> EdgeHistory:
         """A history without looks of an edge that serves T_a_b (4, 4), known to `sigma` (6,) without the bias of the
         estimator; NaN or zero where that is not known."""
         return replace(cls.at(T_a_b, sigma), origin_sigma=np.where(sigma > 0.0, sigma, np.nan))
 
     @property
-    def told(self) -> tuple[Look, ...]:
+    def all_observations(self) -> tuple[EdgeObservation, ...]:
         """All that is kept one by one, looks and windows, in the order of their stamps."""
-        return tuple(sorted((*self.looks, *self.windows), key=lambda one: one.stamp_ns))
+        return tuple(sorted((*self.observations, *self.windows), key=lambda one: one.stamp_ns))
 
-    def after(self, look: Look, calm: bool) -> History:
+    def after(self, observation: EdgeObservation, calm: bool) -> EdgeHistory:
         """The history with one more look. The look that drops out is counted with the older ones if all is `calm`; else
         it is forgotten, because it may be from after the step in question."""
-        if look.window is not None and np.isfinite(self.step_covariance(look.window).diagonal()).any():
-            return replace(self, windows=(*self.windows, look)[-MOST_WINDOWS:])
-        if not self.looks:
-            return replace(self._biased(BIAS_TIMES * look.rig), looks=(look,))
-        looks = sorted((*self.looks, look), key=lambda one: one.stamp_ns)
-        if len(looks) <= MOST_LOOKS:
-            return replace(self, looks=tuple(looks))
-        oldest, kept = looks[0], replace(self, looks=tuple(looks[1:]))
+        if observation.window is not None and np.isfinite(self.step_covariance(observation.window).diagonal()).any():
+            return replace(self, windows=(*self.windows, observation)[-MOST_WINDOWS:])
+        if not self.observations:
+            return replace(self._biased(BIAS_TIMES * observation.rig), observations=(observation,))
+        observations = sorted((*self.observations, observation), key=lambda one: one.stamp_ns)
+        if len(observations) <= MAX_OBSERVATIONS:
+            return replace(self, observations=tuple(observations))
+        oldest, recent = observations[0], replace(self, observations=tuple(observations[1:]))
         if not calm:
-            return kept
+            return recent
         weight = _Stack.of(self.origin, [oldest]).weights(self.mean[None, None])[1][0, 0, 0]
-        keep = 1.0 - 1.0 / MEMORY_LOOKS
+        keep = 1.0 - 1.0 / MEMORY_OBSERVATIONS
         offset = se3.difference(oldest.T_a_b, self.origin)
         information = keep * self.information + weight * oldest.information
         moment = keep * self.moment + weight * dense.applied(oldest.information, offset)
-        return replace(kept, information=information, moment=moment)
+        return replace(recent, information=information, moment=moment)
 
     @property
     def sigma(self) -> Array:
@@ -117,7 +117,7 @@ class History:
     @property
     def mean(self) -> Array:
         """(6,) the offset, by what is known from before the kept looks."""
-        return np.asarray(dense.solved(dense.cholesky(self.information), self.moment[:, None])[:, 0])
+        return np.asarray(dense.cholesky_solve(dense.cholesky(self.information), self.moment[:, None])[:, 0])
 
     @property
     def pose(self) -> Matrix4:
@@ -129,25 +129,25 @@ class History:
         window; its diagonal is NaN on axes that either does not determine."""
         return np.asarray(window + np.diag(self.origin_sigma**2))
 
-    def _biased(self, sigma: Array) -> History:
+    def _biased(self, sigma: Array) -> EdgeHistory:
         """The origin as looks see it, which may all be biased by `sigma` (6,), however well it is known otherwise."""
-        known = History.at(self.origin, np.hypot(np.nan_to_num(self.sigma), sigma))
+        known = EdgeHistory.at(self.origin, np.hypot(np.nan_to_num(self.sigma), sigma))
         return replace(self, information=known.information, moment=known.moment)
 
-    def counted(self) -> History:
+    def counted(self) -> EdgeHistory:
         """The history with all kept looks counted together with the older ones, for a rig to which nothing happened."""
-        if not self.looks:
+        if not self.observations:
             return self
-        whole = _Stack.of(self.origin, self.looks).mean(
-            np.ones((1, len(self.looks)), np.bool_), self.information, self.moment
+        whole = _Stack.of(self.origin, self.observations).mean(
+            np.ones((1, len(self.observations)), np.bool_), self.information, self.moment
         )
-        return History.at(
+        return EdgeHistory.at(
             se3.perturb(self.origin, whole.offset[0]), np.sqrt(np.maximum(whole.covariance[0].diagonal(), 0.0))
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Steps:
+class EdgeSteps:
     """The step of one edge, for each of T times at which it may have stepped.
 
     Attributes:
@@ -161,50 +161,55 @@ class Steps:
 
     xi: Array
     covariance: Array
-    looks: Array
+    observations: Array
     log_transient: Array
     log_stepped: Array
     log_still: float
 
 
-def steps_at(history: History, times_ns: Sequence[int], place_times: float = 1.0) -> Steps:
+def steps_at(history: EdgeHistory, times_ns: Sequence[int], place_times: float = 1.0) -> EdgeSteps:
     """What the looks say of a step at each of some times: looks from that stamp on lie after the step. Places scatter
     the looks by `place_times` their usual standard deviation."""
-    stamps, times = np.array([look.stamp_ns for look in history.looks], np.int64), np.asarray(times_ns, np.int64)
+    stamps, times = (
+        np.array([observation.stamp_ns for observation in history.observations], np.int64),
+        np.asarray(times_ns, np.int64),
+    )
     after = stamps[None, :] >= times[:, None]
-    stack = _Stack.of(history.origin, history.looks)
+    stack = _Stack.of(history.origin, history.observations)
     windows = [_Window.of(window, history, times) for window in history.windows]
-    place = np.max(np.array([look.place for look in history.looks]).reshape(-1, 6), axis=0, initial=0.0)
+    place = np.max(
+        np.array([observation.place for observation in history.observations]).reshape(-1, 6), axis=0, initial=0.0
+    )
     places = np.diag(2.0 * (place_times * place) ** 2)  # one place before, one place since
     before = stack.mean(~after, history.information, history.moment)
 
-    def told_by_windows(offset: Array, covariance: Array) -> Array:
+    def log_likelihood_of_windows(offset: Array, covariance: Array) -> Array:
         """(T, S) log likelihood of all windows if the edge is at an offset (T, S, 6) since."""
         xi, around = offset - before.offset[:, None], covariance + (before.covariance + places)[:, None]
         return np.asarray(sum(window.log_best(xi, around) for window in windows))
 
-    since = stack.mean(after, _NOTHING, np.zeros(6), told_by_windows if windows else None)
-    still = stack.mean(np.ones((1, len(history.looks)), np.bool_), history.information, history.moment)
+    since = stack.mean(after, _NOTHING, np.zeros(6), log_likelihood_of_windows if windows else None)
+    still = stack.mean(np.ones((1, len(history.observations)), np.bool_), history.information, history.moment)
     xi = np.zeros_like(before.offset)
     for t, (was, is_now) in enumerate(zip(before.offset, since.offset, strict=True)):
         xi[t] = se3.difference(se3.perturb(history.origin, is_now), se3.perturb(history.origin, was))
     covariance = before.covariance + since.covariance + places
     good = since.good
-    looks = good.sum(axis=1)
-    again = np.array([look.log_bad_again for look in history.looks])
-    first = np.array([look.log_bad for look in history.looks]) - again
+    observations = good.sum(axis=1)
+    again = np.array([observation.log_bad_again for observation in history.observations])
+    first = np.array([observation.log_bad for observation in history.observations]) - again
     # The first bad look is rarer than a bad one after it.
     log_transient = (good * again).sum(axis=1) + np.max(good, axis=1, initial=0.0) * np.max(first, initial=0.0)
-    steps = Steps(
+    steps = EdgeSteps(
         xi,
         covariance,
-        looks,
+        observations,
         np.minimum(log_transient, 0.0),
         before.log_evidence + since.log_evidence,
         float(still.log_evidence[0]),
     )
     for window in windows:
-        steps = window.beside(steps)
+        steps = window.combined(steps)
     return steps
 
 
@@ -219,7 +224,7 @@ class _Window:
     covariance: Array  # (n, n) of it
 
     @classmethod
-    def of(cls, window: Look, history: History, times_ns: NDArray[np.int64]) -> _Window:
+    def of(cls, window: EdgeObservation, history: EdgeHistory, times_ns: NDArray[np.int64]) -> _Window:
         assert window.window is not None
         covariance = history.step_covariance(window.window)
         axes = np.flatnonzero(np.isfinite(covariance.diagonal()))
@@ -243,27 +248,27 @@ class _Window:
         return np.where(after, np.maximum(self._log_good(xi, covariance), self.log_bad), self.log_still)
 
     def _log_good(self, xi: Array, covariance: Array) -> Array:
-        told, reach = covariance[..., self.axes[:, None], self.axes], np.diag(REACH[self.axes] ** 2)
-        within = dense.product(reach, dense.inverse(told + reach))  # what looks tell, against the reach of a step
-        apart = self.xi - dense.applied(within, xi[..., self.axes])
-        return np.asarray(_LOG_GOOD + _log_normal(dense.product(within, told) + self.covariance, apart))
+        block, reach = covariance[..., self.axes[:, None], self.axes], np.diag(REACH[self.axes] ** 2)
+        within = dense.product(reach, dense.inverse(block + reach))  # what looks tell, against the reach of a step
+        difference = self.xi - dense.applied(within, xi[..., self.axes])
+        return np.asarray(_LOG_GOOD + _log_normal(dense.product(within, block) + self.covariance, difference))
 
-    def beside(self, steps: Steps) -> Steps:
+    def combined(self, steps: EdgeSteps) -> EdgeSteps:
         """The steps with what the window says of them."""
-        told, apart = steps.covariance[:, self.axes[:, None], self.axes], self.xi - steps.xi[:, self.axes]
+        block, difference = steps.covariance[:, self.axes[:, None], self.axes], self.xi - steps.xi[:, self.axes]
         fits = self.after & (self._log_good(steps.xi, steps.covariance) > self.log_bad)
         # Kalman's gain.
-        gain = dense.product(steps.covariance[:, :, self.axes], dense.inverse(told + self.covariance))
+        gain = dense.product(steps.covariance[:, :, self.axes], dense.inverse(block + self.covariance))
         less = dense.product(gain, np.swapaxes(steps.covariance[:, :, self.axes], -1, -2))
-        log_told = np.where(fits, _LOG_GOOD + _log_normal(told + self.covariance, apart), self.log_bad)
+        log_fit = np.where(fits, _LOG_GOOD + _log_normal(block + self.covariance, difference), self.log_bad)
         return replace(
             steps,
-            xi=steps.xi + np.where(fits[:, None], dense.applied(gain, apart), 0.0),
+            xi=steps.xi + np.where(fits[:, None], dense.applied(gain, difference), 0.0),
             covariance=steps.covariance - np.where(fits[:, None, None], 0.5 * (less + np.swapaxes(less, -1, -2)), 0.0),
-            looks=steps.looks + fits,
+            observations=steps.observations + fits,
             # Looks that are bad for a while have to have a bad window beside them.
             log_transient=steps.log_transient + np.where(fits, log(BAD_SHARE), 0.0),
-            log_stepped=steps.log_stepped + np.where(self.after, log_told, self.log_still),
+            log_stepped=steps.log_stepped + np.where(self.after, log_fit, self.log_still),
             log_still=steps.log_still + self.log_still,
         )
 
@@ -274,7 +279,7 @@ _LOG_GOOD = log(1.0 - BAD_SHARE)
 def _log_normal(covariance: Array, x: Array) -> Array:
     """(...) logarithm of the density of a normal distribution about 0 with the covariance (..., n, n) at x (..., n)."""
     factor = dense.cholesky(covariance)
-    q = np.sum(x * dense.solved(factor, x[..., None])[..., 0], axis=-1)
+    q = np.sum(x * dense.cholesky_solve(factor, x[..., None])[..., 0], axis=-1)
     return np.asarray(-0.5 * (q + dense.log_determinant(factor) + x.shape[-1] * log(2.0 * pi)))
 
 
@@ -301,18 +306,18 @@ class _Stack:
     share: Array  # (N,) how much each look counts
 
     @classmethod
-    def of(cls, origin: Matrix4, looks: Sequence[Look]) -> _Stack:
-        offset = np.array([se3.difference(look.T_a_b, origin) for look in looks]).reshape(-1, 6)
-        information = np.array([look.information for look in looks]).reshape(-1, 6, 6)
-        told = np.array([look.information.diagonal() > 0.0 for look in looks]).reshape(-1, 6)
-        axes = told.sum(axis=1).astype(np.float64)
-        whole = information + np.where(told, 0.0, 1.0)[:, :, None] * np.eye(6)
+    def of(cls, origin: Matrix4, observations: Sequence[EdgeObservation]) -> _Stack:
+        offset = np.array([se3.difference(observation.T_a_b, origin) for observation in observations]).reshape(-1, 6)
+        information = np.array([observation.information for observation in observations]).reshape(-1, 6, 6)
+        determined = np.array([observation.information.diagonal() > 0.0 for observation in observations]).reshape(-1, 6)
+        axes = determined.sum(axis=1).astype(np.float64)
+        whole = information + np.where(determined, 0.0, 1.0)[:, :, None] * np.eye(6)
         spread = dense.log_determinant(dense.cholesky(whole))
-        bad = np.exp([look.log_bad for look in looks])
+        bad = np.exp([observation.log_bad for observation in observations])
         constant = np.array([lgamma((FREEDOM + d) / 2.0) - lgamma(FREEDOM / 2.0) for d in axes.tolist()])
         log_good = np.log1p(-bad) + constant - 0.5 * axes * log(FREEDOM * pi) + 0.5 * spread
-        within = np.where(told, -0.5 * (offset / REACH) ** 2 - np.log(REACH) - 0.5 * log(2.0 * pi), 0.0)
-        share = np.array([look.share for look in looks])
+        within = np.where(determined, -0.5 * (offset / REACH) ** 2 - np.log(REACH) - 0.5 * log(2.0 * pi), 0.0)
+        share = np.array([observation.share for observation in observations])
         return cls(offset, information, axes, log_good, np.log(bad) + within.sum(axis=1), share)
 
     def weights(self, mean: Array) -> tuple[Array, Array, Array]:
@@ -325,10 +330,12 @@ class _Stack:
         good = self.share * np.exp(log_good - density)
         return self.share * density, good * np.minimum((FREEDOM + self.axes) / (FREEDOM + q), 1.0), good
 
-    def mean(self, mask: NDArray[np.bool_], information: Array, moment: Array, beside: Beside | None = None) -> _Means:
+    def mean(
+        self, mask: NDArray[np.bool_], information: Array, moment: Array, extra: ExtraLikelihood | None = None
+    ) -> _Means:
         """The means of the looks in each row of a mask (T, N), combined with what else is known. Of several, the one is
         taken that is likeliest by the looks and by what is known `beside` them."""
-        known = dense.solved(dense.cholesky(information), moment[:, None])[:, 0]
+        known = dense.cholesky_solve(dense.cholesky(information), moment[:, None])[:, 0]
         if not len(self.offset):
             covariance = np.broadcast_to(dense.inverse(information), (len(mask), 6, 6))
             return _Means(
@@ -338,15 +345,15 @@ class _Stack:
         for _ in range(TURNS):
             weight = self.weights(mean)[1] * mask[:, None, :]
             precision, moments = self._sums(weight, information, moment)
-            mean = dense.solved(dense.cholesky(precision), moments[..., None])[..., 0]
+            mean = dense.cholesky_solve(dense.cholesky(precision), moments[..., None])[..., 0]
         density, weight, good = self.weights(mean)
-        apart = mean - known
-        likely = (density * mask[:, None, :]).sum(axis=-1) - 0.5 * dense.squared(information, apart)
-        chosen = likely
-        if beside is not None:
+        difference = mean - known
+        likely = (density * mask[:, None, :]).sum(axis=-1) - 0.5 * dense.squared(information, difference)
+        ranking = likely
+        if extra is not None:
             precision, _ = self._sums(weight * mask[:, None, :], information, moment)
-            chosen = likely + beside(mean, dense.inverse(precision))
-        rows, best = np.arange(len(mask)), np.argmax(chosen, axis=1)
+            ranking = likely + extra(mean, dense.inverse(precision))
+        rows, best = np.arange(len(mask)), np.argmax(ranking, axis=1)
         precision, _ = self._sums(weight[rows, best] * mask, information, moment)
         covariance = dense.inverse(precision)
         log_evidence = likely[rows, best] + _volume(covariance)

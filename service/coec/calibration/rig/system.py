@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.rig.evidence import information_of
-from coec.calibration.rig.types import Known, RigGraph, whose
+from coec.calibration.rig.types import KnownTransform, RigGraph, whose
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
 
-Array = NDArray[np.float64]
+ArrayOfSystem = NDArray[np.float64]
 
 BUILT = np.array([radians(5.0)] * 3 + [0.3] * 3)
 """How far each sensor may be from where the vehicle was built (rad, m): wide beside all that is measured, because it
@@ -64,16 +64,16 @@ columns, lie aside depends on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredEdge:
     """An edge or a link that was measured."""
 
-    known: Known
+    known: KnownTransform
     T_a_b: Matrix4
-    information: Array  # (6, 6) of the noise
-    shared: Mapping[str, Array]  # (6,) shift by one standard deviation, by owner and name of the error
+    information: ArrayOfSystem  # (6, 6) of the noise
+    shared: Mapping[str, ArrayOfSystem]  # (6,) shift by one standard deviation, by owner and name of the error
 
     @property
-    def covariance(self) -> Array:
+    def covariance(self) -> ArrayOfSystem:
         """(6, 6) of all errors; at least as wide as `BUILT` on axes that were not determined."""
         noise = dense.inverse(self.information + np.diag(1.0 / BUILT**2) * 1e-2)
         for name in sorted(self.shared):
@@ -88,7 +88,7 @@ class Solution:
     poses: tuple[Matrix4, ...]
     chi2: float
     freedom: int
-    of_edges: Array
+    of_edges: ArrayOfSystem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,7 @@ class System:
     """All measurements, and the names of the shared errors, each of which is one unknown."""
 
     graph: RigGraph
-    measured: tuple[Measured, ...]
+    measured: tuple[MeasuredEdge, ...]
     errors: tuple[str, ...]
 
     @classmethod
@@ -111,7 +111,9 @@ class System:
             if known.name in windows:
                 measured.append(_of_window(known, windows[known.name]))
         measured += [
-            Measured(Known(link.name, link.a, link.b, link.T_a_b), link.T_a_b, np.diag(1.0 / link.sigma**2), {})
+            MeasuredEdge(
+                KnownTransform(link.name, link.a, link.b, link.T_a_b), link.T_a_b, np.diag(1.0 / link.sigma**2), {}
+            )
             for link in graph.links
         ]
         errors = sorted({name for one in measured for name in one.shared})
@@ -139,7 +141,7 @@ class System:
                 turned = dense.product(design.T, one.information)
                 normal += dense.product(turned, design)
                 pull += dense.applied(turned, away)
-            step = dense.solved(dense.cholesky(normal), pull[:, None])[:, 0]
+            step = dense.cholesky_solve(dense.cholesky(normal), pull[:, None])[:, 0]
             poses = tuple(se3.perturb(pose, step[6 * k : 6 * k + 6]) for k, pose in enumerate(poses))
             shared = shared + step[n:]
             if np.abs(step).max() < STILL:
@@ -148,18 +150,20 @@ class System:
         for one in there:
             squares.append(float(dense.squared(one.information, self._linear(one, poses, shared)[1])))
         covariance = dense.inverse(normal)[:n, :n]
-        told = sum(int(np.count_nonzero(one.information.diagonal())) for one in there)
+        measured_axes = sum(int(np.count_nonzero(one.information.diagonal())) for one in there)
         settled = n - fsum((covariance.diagonal() * prior[:n]).tolist())
         design = np.concatenate([self._design(poses, known.a, known.b) for known in self.graph.known])
         design = design[: 6 * len(self.graph.edges)]
         return Solution(
             poses=poses,
             chi2=fsum(squares),
-            freedom=max(round(told - settled), 0),
+            freedom=max(round(measured_axes - settled), 0),
             of_edges=dense.product(dense.product(design, covariance), design.T),
         )
 
-    def _linear(self, one: Measured, poses: Sequence[Matrix4], shared: Array) -> tuple[Array, Array]:
+    def _linear(
+        self, one: MeasuredEdge, poses: Sequence[Matrix4], shared: ArrayOfSystem
+    ) -> tuple[ArrayOfSystem, ArrayOfSystem]:
         """The derivative (6, unknowns) of a measurement, and its residual (6,) at some poses."""
         known = one.known
         away = se3.difference(one.T_a_b, self.predicted(poses, known.a, known.b))
@@ -171,7 +175,7 @@ class System:
             common, shared
         )
 
-    def _design(self, poses: Sequence[Matrix4], a: str, b: str) -> Array:
+    def _design(self, poses: Sequence[Matrix4], a: str, b: str) -> ArrayOfSystem:
         """(6, 6·S) how T_a_b moves with the sensors."""
         design = np.zeros((6, 6 * len(poses)))
         i, j = 6 * self.graph.place[a], 6 * self.graph.place[b]
@@ -180,21 +184,21 @@ class System:
         return design
 
 
-def _of_window(known: Known, window: Measurement) -> Measured:
+def _of_window(known: KnownTransform, window: Measurement) -> MeasuredEdge:
     if not se3.is_rigid(window.T_camera_lidar):
         raise ValueError(f"{known.name}: a pose must be a rigid transform (4, 4) of finite numbers")
     try:
         information = information_of(window.uncertainty.noise)
     except ValueError as error:
         raise ValueError(f"{known.name}: {error}") from error
-    told = information.diagonal() > 0.0
-    shared: dict[str, Array] = {}
+    determined = information.diagonal() > 0.0
+    shared: dict[str, ArrayOfSystem] = {}
     for name, shift in window.uncertainty.systematic.items():
-        if shift.shape != (6,) or not np.isfinite(shift[told]).all() or np.abs(shift[told]).max() > 10.0:
+        if shift.shape != (6,) or not np.isfinite(shift[determined]).all() or np.abs(shift[determined]).max() > 10.0:
             raise ValueError(f"{known.name}: the error {name} must be a shift of six finite numbers")
         owner = OWNERS.get(name, OWN)
         parts = ((f"{whose(known.a)} {name}", owner.of_a), (f"{whose(known.b)} {name}", owner.of_b))
         if owner is OWN:
             parts = ((f"{known.name} {name}", 1.0), ("", 0.0))
-        shared |= {of: part * np.where(told, shift, 0.0) for of, part in parts if part > 0.0}
-    return Measured(known, window.T_camera_lidar, information, shared)
+        shared |= {of: part * np.where(determined, shift, 0.0) for of, part in parts if part > 0.0}
+    return MeasuredEdge(known, window.T_camera_lidar, information, shared)

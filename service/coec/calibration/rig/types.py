@@ -41,7 +41,7 @@ def whose(name: str) -> str:
     return name.removesuffix(_WAS)
 
 
-class Kind(StrEnum):
+class SensorKind(StrEnum):
     """What a node is. The vehicle's own frame, if something measures it, is a node that cannot move."""
 
     CAMERA = "camera"
@@ -54,7 +54,7 @@ class Sensor:
     """A node."""
 
     name: str
-    kind: Kind
+    kind: SensorKind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +68,7 @@ class Edge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Link:
+class RigidLink:
     """Two sensors on one bar: T_a_b (4, 4) is known, and stays so to `sigma` (6,) about the axes of a (rad, m)."""
 
     name: str
@@ -78,7 +78,7 @@ class Link:
     sigma: NDArray[np.float64]
 
 
-class Known(NamedTuple):
+class KnownTransform(NamedTuple):
     """An edge or a link: the fields that both have."""
 
     name: str
@@ -93,10 +93,10 @@ class RigGraph:
 
     sensors: tuple[Sensor, ...]
     edges: tuple[Edge, ...]
-    links: tuple[Link, ...]
+    links: tuple[RigidLink, ...]
 
     @classmethod
-    def of(cls, sensors: Sequence[Sensor], edges: Sequence[Edge], links: Sequence[Link] = ()) -> RigGraph:
+    def of(cls, sensors: Sequence[Sensor], edges: Sequence[Edge], links: Sequence[RigidLink] = ()) -> RigGraph:
         """The graph.
 
         Raises:
@@ -136,7 +136,7 @@ class RigGraph:
         return {edge.name: edge for edge in self.edges}
 
     @cached_property
-    def known(self) -> tuple[Known, ...]:
+    def known(self) -> tuple[KnownTransform, ...]:
         """Edges, then links."""
         return _known(self.edges, self.links)
 
@@ -144,32 +144,32 @@ class RigGraph:
     def poses(self) -> tuple[Matrix4, ...]:
         """T_sensor_rig (4, 4) of each sensor as the vehicle was built. The first sensor is the origin, and so is the
         first sensor of every part that no edge or link joins to it."""
-        found: dict[str, Matrix4] = {}
+        placed: dict[str, Matrix4] = {}
         for sensor in self.sensors:
-            if sensor.name not in found:
-                found |= self.joined_to(sensor.name)
-        return tuple(found[sensor.name] for sensor in self.sensors)
+            if sensor.name not in placed:
+                placed |= self.joined_to(sensor.name)
+        return tuple(placed[sensor.name] for sensor in self.sensors)
 
     @cached_property
     def of_lidars(self) -> frozenset[str]:
         """Names of the edges between two LiDARs, which no pair serves."""
         kinds = {sensor.name: sensor.kind for sensor in self.sensors}
-        return frozenset(edge.name for edge in self.edges if kinds[edge.a] is kinds[edge.b] is Kind.LIDAR)
+        return frozenset(edge.name for edge in self.edges if kinds[edge.a] is kinds[edge.b] is SensorKind.LIDAR)
 
     def joined_to(self, origin: str) -> Mapping[str, Matrix4]:
         """T_sensor_origin (4, 4) as the vehicle was built, of each sensor that edges or links join to `origin`, by
         name."""
-        found: dict[str, Matrix4] = {origin: np.eye(4)}
+        placed: dict[str, Matrix4] = {origin: np.eye(4)}
         reached = [origin]
         for name in reached:  # grows as it goes: breadth first
             for known in self.known:
-                if known.b == name and known.a not in found:
-                    found[known.a] = np.asarray(known.T_a_b @ found[name])
+                if known.b == name and known.a not in placed:
+                    placed[known.a] = np.asarray(known.T_a_b @ placed[name])
                     reached.append(known.a)
-                elif known.a == name and known.b not in found:
-                    found[known.b] = np.asarray(se3.inverse(known.T_a_b) @ found[name])
+                elif known.a == name and known.b not in placed:
+                    placed[known.b] = np.asarray(se3.inverse(known.T_a_b) @ placed[name])
                     reached.append(known.b)
-        return found
+        return placed
 
     def loop_through(self, closing: str, among: Sequence[str]) -> tuple[str, ...] | None:
         """The shortest loop through the edge or link `closing` that runs along those named in `among`: their names,
@@ -177,27 +177,27 @@ class RigGraph:
         by_name = {known.name: known for known in self.known}
         first = by_name[closing]
         others = [by_name[name] for name in sorted(among) if name != closing]
-        came: dict[str, tuple[str, str]] = {first.b: ("", "")}
+        predecessor: dict[str, tuple[str, str]] = {first.b: ("", "")}
         reached = [first.b]
         for name in reached:
             for known in others:
                 for here, there in ((known.a, known.b), (known.b, known.a)):
-                    if here == name and there not in came:
-                        came[there] = (name, known.name)
+                    if here == name and there not in predecessor:
+                        predecessor[there] = (name, known.name)
                         reached.append(there)
-        if first.a not in came:
+        if first.a not in predecessor:
             return None
         path, name = [], first.a
         while name != first.b:
-            name, by = came[name]
+            name, by = predecessor[name]
             path.append(by)
         return (closing, *path)
 
 
-def _known(edges: Sequence[Edge], links: Sequence[Link]) -> tuple[Known, ...]:
+def _known(edges: Sequence[Edge], links: Sequence[RigidLink]) -> tuple[KnownTransform, ...]:
     return (
-        *(Known(edge.name, edge.a, edge.b, edge.T_a_b) for edge in edges),
-        *(Known(link.name, link.a, link.b, link.T_a_b) for link in links),
+        *(KnownTransform(edge.name, edge.a, edge.b, edge.T_a_b) for edge in edges),
+        *(KnownTransform(link.name, link.a, link.b, link.T_a_b) for link in links),
     )
 
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from coec.calibration.rig import attribution
 from coec.calibration.rig.attribution import NS_PER_S, STEPPED2, RigState, SensorHealth, SensorState
-from coec.calibration.rig.before import Before
-from coec.calibration.rig.evidence import Look, of_window
-from coec.calibration.rig.joint import JointEstimate, estimate
+from coec.calibration.rig.before import PreMoveKnowledge
+from coec.calibration.rig.evidence import EdgeObservation, observation_of_window
+from coec.calibration.rig.joint import JointEstimate, estimate_jointly
 from coec.calibration.rig.moves import Moved, movers
-from coec.calibration.rig.steps import MOST_LOOKS
+from coec.calibration.rig.steps import MAX_OBSERVATIONS
 from coec.calibration.rig.types import RigGraph
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
@@ -34,7 +34,7 @@ OVER_NS = 900 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Windowed:
+class EdgeWindow:
     """An accepted window of a pair: its measurement and the stamp of its first pair of frames."""
 
     measurement: Measurement
@@ -42,7 +42,7 @@ class Windowed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Served:
+class ServedEdge:
     """The pose (4, 4) that a pair serves, known to `sigma` (6,), from frames since `start_ns`. `start_ns` is None if
     the pose comes from no frames but from how the vehicle was built or from a person. `known` is what all windows of
     the pair together say of the mount, if there are any."""
@@ -54,7 +54,7 @@ class Served:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class JointPose:
     """What the joint estimate says of a pair: a pose (4, 4) and the covariance (6, 6) of its perturbation.
 
     Axes that the pair's own window does not determine are as in that window, and NaN in the covariance. A pair without
@@ -66,16 +66,16 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Correction:
+class RigCorrection:
     """One correction for all pairs of the sensors that moved, decided at a stamp."""
 
     stamp_ns: int
     sensors: tuple[str, ...]
-    pairs: Mapping[str, Told]
+    pairs: Mapping[str, JointPose]
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class MoveEvent:
     """Sensors that have been named since the stamp `since_ns`; their move lies before the stamp `stepped_ns`.
     `corrected`: whether the correction of their pairs has been decided."""
 
@@ -86,11 +86,11 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Move:
+class MoveRecord:
     """An event, kept for later queries: by how much each of its sensors moved, by name, as far as that was known when
     they were named; and the stamp at which the event was over, None while it goes on."""
 
-    event: Event
+    event: MoveEvent
     moved: Mapping[str, Moved]
     over_ns: int | None = None
 
@@ -118,37 +118,37 @@ class VehicleRig:
 
     graph: RigGraph
     believed: RigState
-    serves: Mapping[str, Served]
-    windows: Mapping[str, Windowed] = field(default_factory=dict)
+    serves: Mapping[str, ServedEdge]
+    windows: Mapping[str, EdgeWindow] = field(default_factory=dict)
     known: Mapping[str, tuple[Measurement, ...]] = field(default_factory=dict)
-    before: Before | None = None
-    event: Event | None = None
-    move: Move | None = None
+    before: PreMoveKnowledge | None = None
+    event: MoveEvent | None = None
+    move: MoveRecord | None = None
     joint: JointEstimate | None = None
     sensors: tuple[SensorState, ...] = ()
     since_ns: Mapping[str, int] = field(default_factory=dict)
-    correction: Correction | None = None
-    looks: Mapping[str, int] = field(default_factory=dict)
-    registered: Mapping[str, Windowed] = field(default_factory=dict)
+    correction: RigCorrection | None = None
+    observations: Mapping[str, int] = field(default_factory=dict)
+    registered: Mapping[str, EdgeWindow] = field(default_factory=dict)
 
 
-def begun(graph: RigGraph, serves: Mapping[str, Served], windows: Mapping[str, Windowed]) -> VehicleRig:
+def initial_rig(graph: RigGraph, serves: Mapping[str, ServedEdge], windows: Mapping[str, EdgeWindow]) -> VehicleRig:
     """The rig before any look: every edge is where its pair serves it, with that uncertainty. `windows` are the windows
     that the served poses rest on."""
-    believed = attribution.begun(graph)
+    believed = attribution.initial(graph)
     for name in graph.edge:
         believed = attribution.served(believed, name, serves[name].T_a_b, serves[name].sigma)
-    told = attribution.sensors(believed, graph)
+    sensors = attribution.sensors(believed, graph)
     known = {name: (of.known,) for name, of in serves.items() if of.known is not None}
-    return _combined(VehicleRig(graph, believed, dict(serves), dict(windows), known, sensors=told))
+    return _combined(VehicleRig(graph, believed, dict(serves), dict(windows), known, sensors=sensors))
 
 
-def going_on(rig: VehicleRig, event: Event, before: Before) -> VehicleRig:
+def resumed(rig: VehicleRig, event: MoveEvent, before: PreMoveKnowledge) -> VehicleRig:
     """The rig with an event that began before a restart, and what was known before that event. Windows of its edges
     from before the move are dropped."""
-    told = attribution.sensors(rig.believed, rig.graph)
-    since_ns = {sensor.name: event.since_ns for sensor in told if sensor.name in rig.believed.named}
-    rig = replace(rig, event=event, before=before, move=Move(event, {}), sensors=told, since_ns=since_ns)
+    sensors = attribution.sensors(rig.believed, rig.graph)
+    since_ns = {sensor.name: event.since_ns for sensor in sensors if sensor.name in rig.believed.named}
+    rig = replace(rig, event=event, before=before, move=MoveRecord(event, {}), sensors=sensors, since_ns=since_ns)
     return _without_stale(rig)
 
 
@@ -169,29 +169,29 @@ def grown(rig: VehicleRig, fresh: VehicleRig) -> VehicleRig:
     return _combined(rig)
 
 
-def _before_of_both(before: Before | None, fresh: Before | None) -> Before | None:
+def _before_of_both(before: PreMoveKnowledge | None, fresh: PreMoveKnowledge | None) -> PreMoveKnowledge | None:
     """What was known before one event, for the pairs of a rig together with those that join it."""
     if before is None or fresh is None or before.sensors != fresh.sensors:
         return before
     return replace(before, edges={**fresh.edges, **before.edges})
 
 
-def after_look(rig: VehicleRig, look: Look) -> VehicleRig:
+def after_edge_observation(rig: VehicleRig, observation: EdgeObservation) -> VehicleRig:
     """The rig after a check, or any other look, says where an edge is.
 
     Raises:
         ValueError: the look is of no edge of the rig.
     """
-    believed = attribution.after_look(rig.believed, rig.graph, look)
-    asked = believed.asked_ns != rig.believed.asked_ns
-    looks = {**rig.looks, look.edge: rig.looks.get(look.edge, 0) + 1}
-    rig = replace(rig, believed=believed, looks=looks)
-    if not asked:
+    believed = attribution.after_edge_observation(rig.believed, rig.graph, observation)
+    attributed = believed.attributed_ns != rig.believed.attributed_ns
+    observations = {**rig.observations, observation.edge: rig.observations.get(observation.edge, 0) + 1}
+    rig = replace(rig, believed=believed, observations=observations)
+    if not attributed:
         return rig
-    return _followed(_noted(rig, look.stamp_ns), look.stamp_ns)
+    return _followed(_noted(rig, observation.stamp_ns), observation.stamp_ns)
 
 
-def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) -> VehicleRig:
+def after_window(rig: VehicleRig, edge: str, window: EdgeWindow, stamp_ns: int) -> VehicleRig:
     """The rig after a window of an edge was accepted, which was known at `stamp_ns`. The window says where the edge is
     and who moved. A window that began before a move of its sensors is ignored, because it shows neither mount.
 
@@ -201,15 +201,15 @@ def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) ->
     if _from_before_a_move(rig, edge, window):
         return rig
     rig = _combined(replace(rig, windows={**rig.windows, edge: window}))
-    look = of_window(edge, window.measurement)
-    if look is not None:
+    observation = observation_of_window(edge, window.measurement)
+    if observation is not None:
         # All of its frames lie after a step only if the first one does.
-        look = replace(look, stamp_ns=window.start_ns)
-        rig = _noted(replace(rig, believed=attribution.after_window(rig.believed, rig.graph, look)), stamp_ns)
+        observation = replace(observation, stamp_ns=window.start_ns)
+        rig = _noted(replace(rig, believed=attribution.after_window(rig.believed, rig.graph, observation)), stamp_ns)
     return _followed(rig, stamp_ns)
 
 
-def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
+def after_lidars(rig: VehicleRig, observation: EdgeObservation, window: EdgeWindow) -> VehicleRig:
     """The rig after two LiDARs were registered to each other, which is one look.
 
     Attribution uses the look at once. The joint estimate uses it once the next look agrees with it: a single look may
@@ -220,29 +220,29 @@ def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
         ValueError: the look is of no edge of the rig.
     """
     measured = window.measurement
-    found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns)
-    rig = after_look(replace(rig, serves={**rig.serves, look.edge: found}), look)
-    before = rig.registered.get(look.edge)
-    rig = replace(rig, registered={**rig.registered, look.edge: window})
-    if before is None or not _say_the_same(before.measurement, measured) or _from_before_a_move(rig, look.edge, window):
+    pose_served = ServedEdge(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns)
+    rig = after_edge_observation(replace(rig, serves={**rig.serves, observation.edge: pose_served}), observation)
+    before = rig.registered.get(observation.edge)
+    rig = replace(rig, registered={**rig.registered, observation.edge: window})
+    if before is None or not _agree(before.measurement, measured) or _from_before_a_move(rig, observation.edge, window):
         return rig
-    return _followed(_combined(replace(rig, windows={**rig.windows, look.edge: window})), look.stamp_ns)
+    return _followed(_combined(replace(rig, windows={**rig.windows, observation.edge: window})), observation.stamp_ns)
 
 
-def _say_the_same(one: Measurement, other: Measurement) -> bool:
+def _agree(one: Measurement, other: Measurement) -> bool:
     """Whether two looks at an edge differ by no more than chance."""
-    apart = se3.difference(one.T_camera_lidar, other.T_camera_lidar)
+    difference = se3.difference(one.T_camera_lidar, other.T_camera_lidar)
     covariance = one.uncertainty.covariance + other.uncertainty.covariance
-    return float(dense.squared(dense.inverse(covariance), apart)) < STEPPED2
+    return float(dense.squared(dense.inverse(covariance), difference)) < STEPPED2
 
 
-def _from_before_a_move(rig: VehicleRig, edge: str, window: Windowed) -> bool:
+def _from_before_a_move(rig: VehicleRig, edge: str, window: EdgeWindow) -> bool:
     """Whether a window began before a sensor of its edge moved."""
     event = rig.event
     return event is not None and window.start_ns < event.stepped_ns and edge in pairs_of(rig.graph, event.sensors)
 
 
-def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> VehicleRig:
+def after_served(rig: VehicleRig, edge: str, serves: ServedEdge, stamp_ns: int) -> VehicleRig:
     """The rig after a pair serves another pose. The first pose that rests on frames says where the edge is, if all is
     calm; later ones do not, because they correct what looks show as well."""
     before = rig.serves[edge]
@@ -255,7 +255,7 @@ def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> V
 def forgotten(rig: VehicleRig) -> VehicleRig:
     """The rig after sensor time stepped back: looks of the old time are dropped, as are windows and the event. What was
     known before those looks stays."""
-    histories = {name: replace(history, looks=()) for name, history in rig.believed.histories.items()}
+    histories = {name: replace(history, observations=()) for name, history in rig.believed.histories.items()}
     believed = RigState(histories)
     rig = replace(rig, believed=believed, windows={}, known={}, before=None, joint=None, event=None, move=None)
     rig = replace(rig, since_ns={}, registered={})
@@ -280,7 +280,7 @@ def renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
     return start_ns is not None and start_ns >= since_ns
 
 
-def _serving(rig: VehicleRig, edge: str, serves: Served) -> VehicleRig:
+def _serving(rig: VehicleRig, edge: str, serves: ServedEdge) -> VehicleRig:
     """The rig with a new served pose for an edge, and with what that says is known of the edge."""
     rig = replace(rig, serves={**rig.serves, edge: serves})
     if serves.known is None:
@@ -290,21 +290,21 @@ def _serving(rig: VehicleRig, edge: str, serves: Served) -> VehicleRig:
 
 def _noted(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     """The rig with what is now believed of the sensors, and since when."""
-    told = attribution.sensors(rig.believed, rig.graph)
+    sensors = attribution.sensors(rig.believed, rig.graph)
     before = {sensor.name: sensor.health for sensor in rig.sensors}
     since_ns = {
         sensor.name: rig.since_ns[sensor.name]
         if sensor.name in rig.since_ns and before.get(sensor.name) is sensor.health
         else stamp_ns
-        for sensor in told
+        for sensor in sensors
         if sensor.health is not SensorHealth.UNKNOWN
     }
-    return replace(rig, sensors=told, since_ns=since_ns)
+    return replace(rig, sensors=sensors, since_ns=since_ns)
 
 
 def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     """The rig with its event carried on: it may begin, be put right, or be over."""
-    rig = _begun_or_grown(rig, stamp_ns)
+    rig = _started_or_extended(rig, stamp_ns)
     event = rig.event
     if event is None:
         return _settled_unnamed(rig, stamp_ns)
@@ -333,8 +333,10 @@ def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     if served:
         is_over = all(renewed(rig, name, since_ns) for name in served)
     else:
-        kept = [rig.believed.histories[name].looks for name in pairs]
-        is_over = all(len(looks) >= MOST_LOOKS and looks[0].stamp_ns >= since_ns for looks in kept)
+        of_pairs = [rig.believed.histories[name].observations for name in pairs]
+        is_over = all(
+            len(observations) >= MAX_OBSERVATIONS and observations[0].stamp_ns >= since_ns for observations in of_pairs
+        )
     return _over(rig, pairs, stamp_ns) if pairs and is_over else rig
 
 
@@ -343,7 +345,7 @@ def _served(rig: VehicleRig, edges: Sequence[str]) -> list[str]:
     return [name for name in edges if name not in rig.graph.of_lidars]
 
 
-def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -> VehicleRig:
+def _corrected(rig: VehicleRig, event: MoveEvent, fresh: list[str], stamp_ns: int) -> VehicleRig:
     """The rig once all live pairs of an event have a window from after it. There is no correction if only one pair was
     measured, because that pair already knows, or if the pairs do not fit each other."""
     rig = replace(rig, event=replace(event, corrected=True))
@@ -351,15 +353,19 @@ def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -
     if joint is None or not (joint.consistent or joint.left_out is not None):
         return rig
     measured = [name for name in fresh if name in joint.measured]
-    told = {name: _told(joint, name, rig.windows[name].measurement) for name in _served(rig, measured)}
-    if len(measured) < 2 or not told:
+    joint_poses = {name: _joint_pose(joint, name, rig.windows[name].measurement) for name in _served(rig, measured)}
+    if len(measured) < 2 or not joint_poses:
         return rig
     if rig.before is not None:
-        told |= {name: _told_by_others(joint, name) for name in _served(rig, [*rig.before.edges]) if name not in fresh}
-    return replace(rig, correction=Correction(stamp_ns, event.sensors, told))
+        joint_poses |= {
+            name: _joint_pose_from_others(joint, name)
+            for name in _served(rig, [*rig.before.edges])
+            if name not in fresh
+        }
+    return replace(rig, correction=RigCorrection(stamp_ns, event.sensors, joint_poses))
 
 
-def _begun_or_grown(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
+def _started_or_extended(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     """The rig with a new or larger event if a sensor is newly named. Windows of its edges from before the move are
     dropped."""
     named, event = rig.believed.named, rig.event
@@ -368,52 +374,52 @@ def _begun_or_grown(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     sensors = tuple(sorted(named if event is None else named | set(event.sensors)))
     pairs = pairs_of(rig.graph, sensors)
     after = [
-        look.stamp_ns
+        observation.stamp_ns
         for name in pairs
-        for look in rig.believed.histories[name].looks
-        if look.stamp_ns >= rig.believed.stepped_ns
+        for observation in rig.believed.histories[name].observations
+        if observation.stamp_ns >= rig.believed.stepped_ns
     ]
     stepped_ns = min(after, default=stamp_ns) if event is None else event.stepped_ns
     since_ns = stamp_ns if event is None else event.since_ns
-    event = Event(sensors, since_ns, stepped_ns)
+    event = MoveEvent(sensors, since_ns, stepped_ns)
     moved = {sensor.name: sensor.moved for sensor in rig.sensors if sensor.name in sensors and sensor.moved is not None}
-    return _without_stale(replace(rig, before=_before(rig, event), event=event, move=Move(event, moved)))
+    return _without_stale(replace(rig, before=_before(rig, event), event=event, move=MoveRecord(event, moved)))
 
 
-def _before(rig: VehicleRig, event: Event) -> Before:
+def _before(rig: VehicleRig, event: MoveEvent) -> PreMoveKnowledge:
     """What was known before an event: for each edge the latest knowledge up to the last look that saw no move."""
     touched = pairs_of(rig.graph, event.sensors)
     right_ns = max(
-        (look.stamp_ns for name in touched for look in rig.believed.histories[name].looks
-         if look.stamp_ns < min(rig.believed.stepped_ns, event.stepped_ns)),
+        (observation.stamp_ns for name in touched for observation in rig.believed.histories[name].observations
+         if observation.stamp_ns < min(rig.believed.stepped_ns, event.stepped_ns)),
         default=event.stepped_ns,
     )  # fmt: skip
     known = {name: rig.known[name] for name in touched if name in rig.known}
-    return Before.of(event.sensors, known, right_ns, event.since_ns)
+    return PreMoveKnowledge.of(event.sensors, known, right_ns, event.since_ns)
 
 
-def _told(joint: JointEstimate, edge: str, own: Measurement) -> Told:
-    axes = np.isin(np.arange(6), own.told_axes())
-    apart = np.where(axes, se3.difference(joint.T_a_b[edge], own.T_camera_lidar), 0.0)
+def _joint_pose(joint: JointEstimate, edge: str, own: Measurement) -> JointPose:
+    axes = np.isin(np.arange(6), own.determined_axes())
+    difference = np.where(axes, se3.difference(joint.T_a_b[edge], own.T_camera_lidar), 0.0)
     covariance = np.where(axes[:, None] & axes, joint.between(edge, edge), np.nan)
-    return Told(se3.perturb(own.T_camera_lidar, apart), covariance)
+    return JointPose(se3.perturb(own.T_camera_lidar, difference), covariance)
 
 
-def _told_by_others(joint: JointEstimate, edge: str) -> Told:
+def _joint_pose_from_others(joint: JointEstimate, edge: str) -> JointPose:
     """The pose of a pair without a window from after the move. The windows of other pairs place the sensor that moved,
     and what was known before places its other sensor."""
-    return Told(joint.T_a_b[edge], joint.between(edge, edge))
+    return JointPose(joint.T_a_b[edge], joint.between(edge, edge))
 
 
 def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:
     """The rig after an event: from now on the edges of its pairs are where the correction put them, or else where they
     are served."""
     believed, event, last = rig.believed, rig.event, rig.correction
-    told = last.pairs if last is not None and event is not None and last.stamp_ns >= event.since_ns else {}
+    corrections = last.pairs if last is not None and event is not None and last.stamp_ns >= event.since_ns else {}
     for name in pairs:
         T_a_b, sigma = rig.serves[name].T_a_b, rig.serves[name].sigma
-        if name in told:
-            T_a_b, sigma = told[name].T_a_b, np.sqrt(told[name].covariance.diagonal())
+        if name in corrections:
+            T_a_b, sigma = corrections[name].T_a_b, np.sqrt(corrections[name].covariance.diagonal())
         believed = attribution.served(believed, name, T_a_b, sigma)
     since_ns = rig.believed.stepped_ns if event is None else event.stepped_ns
     known = {
@@ -431,16 +437,18 @@ def _without_stale(rig: VehicleRig) -> VehicleRig:
     if event is None:
         return rig
     pairs = pairs_of(rig.graph, event.sensors)
-    kept = {name: one for name, one in rig.windows.items() if name not in pairs or one.start_ns >= event.stepped_ns}
-    return _combined(replace(rig, windows=kept))
+    current = {name: one for name, one in rig.windows.items() if name not in pairs or one.start_ns >= event.stepped_ns}
+    return _combined(replace(rig, windows=current))
 
 
 def _combined(rig: VehicleRig) -> VehicleRig:
     """The rig with the joint estimate from its present windows and from what was known before the current event."""
-    told = {name: window.measurement for name, window in rig.windows.items() if window.measurement.told_axes()}
-    return replace(rig, joint=estimate(rig.graph, told, rig.before) if told else None)
+    measurements = {
+        name: window.measurement for name, window in rig.windows.items() if window.measurement.determined_axes()
+    }
+    return replace(rig, joint=estimate_jointly(rig.graph, measurements, rig.before) if measurements else None)
 
 
 def _last_ns(rig: VehicleRig, edge: str) -> int:
-    looks = rig.believed.histories[edge].looks
-    return looks[-1].stamp_ns if looks else attribution.BEFORE_ALL_NS
+    observations = rig.believed.histories[edge].observations
+    return observations[-1].stamp_ns if observations else attribution.BEFORE_ALL_NS

@@ -44,8 +44,8 @@ def maximum_in(
     known = dict(zip((point.tobytes() for point in first), scores(first), strict=True))
 
     def score(point: NDArray[np.float64], _gradient: NDArray[np.float64]) -> float:
-        found = known.pop(point.tobytes(), None)
-        return scores(point[None])[0] if found is None else found
+        cached = known.pop(point.tobytes(), None)
+        return scores(point[None])[0] if cached is None else cached
 
     optimiser = nlopt.opt(nlopt.LN_BOBYQA, len(start))
     optimiser.set_lower_bounds(box.lower)
@@ -54,8 +54,8 @@ def maximum_in(
     optimiser.set_xtol_abs(box.tolerance)
     optimiser.set_maxeval(max_evaluations)
     optimiser.set_max_objective(score)
-    found = np.asarray(optimiser.optimize(start))
-    return found, optimiser.last_optimize_result() == nlopt.MAXEVAL_REACHED
+    best = np.asarray(optimiser.optimize(start))
+    return best, optimiser.last_optimize_result() == nlopt.MAXEVAL_REACHED
 
 
 def _first_points(start: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:

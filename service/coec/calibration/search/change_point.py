@@ -25,14 +25,14 @@ from math import inf, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.edges import Edges, EdgeWitness, in_reach
+from coec.calibration.objective.edges import EdgeCue, Edges, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, alignments, significances
 from coec.geometry.edges.charts import EdgeCharts, charted_significances
-from coec.geometry.edges.climbs import Climb, Summit, climbed
+from coec.geometry.edges.climbs import AscentStart, Summit, ascend
 from coec.geometry.thinning import thinned
 
 REACH_RAD = radians(4.0)
@@ -69,7 +69,7 @@ FAR_POSES, AROUND_POSES = 6, 8
 """Number of poses that the chart proposes, by their gain over the solved one, and number of poses around each that are
 tried on the fine band, because those of the chart are half a degree apart."""
 
-CLIMB_BLURS, HALVINGS = 0.3, 2
+ASCENT_BLURS, HALVINGS = 0.3, 2
 """First step of a climb, in blurs of its level, and its halvings: down to a tenth of a blur, where a score is within a
 percent of its maximum."""
 
@@ -132,14 +132,14 @@ class ChangePoint:
         return self.support >= MIN_SUPPORT and self.likeness >= MIN_LIKENESS
 
 
-def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
+def change_point(edges: EdgeCue, pose: Matrix4) -> ChangePoint | None:
     """The likeliest change within a window that was solved to `pose` (4, 4), however unlikely it is; None with fewer
     than `MIN_FRAMES` pairs. The camera turns about its centre."""
     if len(edges.whole.first_point) - 1 < MIN_FRAMES:
         return None
-    band = _asked(edges.bands[0], edges.half_view_rad, pose)
-    sharp = _asked(edges.sharp, edges.half_view_rad, pose)
-    chart = _asked(edges.charts[-1], edges.half_view_rad, pose)
+    band = _edges_in_reach(edges.bands[0], edges.half_view_rad, pose)
+    sharp = _edges_in_reach(edges.sharp, edges.half_view_rad, pose)
+    chart = _edges_in_reach(edges.charts[-1], edges.half_view_rad, pose)
     blur_rad, frames = edges.band_blur_rad[0], len(band.first_point) - 1
     near = sample_reach(pose, SearchBox(NEAR_BLURS * blur_rad, 0.0), NEAR_POSES)
     far = _put_forward(chart, pose, frames)
@@ -148,19 +148,19 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     total = early[-1]
     late = total - early
     gains = early[:-1].max(axis=1) + late[:-1].max(axis=1) - total.max()
-    begun = [Climb(poses[int(np.argmax(total))], 0, frames)]
+    starts = [AscentStart(poses[int(np.argmax(total))], 0, frames)]
     sides: list[range] = []
     promising = _promising(gains)
     for last_early in promising:
         for first, last, of_side in ((0, last_early + 1, early), (last_early + 1, frames, late)):
             number = STARTS if last - first <= FEW else 1
             best = np.argsort(-of_side[last_early], kind="stable")[:number].tolist()
-            sides.append(range(len(begun), len(begun) + number))
-            begun += [Climb(poses[k], first, last) for k in best]
-    on_band = [end.pose for end in _climbed(band, begun, blur_rad)]
-    again = [replace(climb, pose=pose) for climb, pose in zip(begun, on_band, strict=True)]
+            sides.append(range(len(starts), len(starts) + number))
+            starts += [AscentStart(poses[k], first, last) for k in best]
+    on_band = [end.pose for end in _ascents(band, starts, blur_rad)]
+    again = [replace(start, pose=pose) for start, pose in zip(starts, on_band, strict=True)]
     # The pose for all frames is climbed on the sharpest edges later, beside the poses of the settled sides.
-    on_sharp = _climbed(sharp, again[1:], edges.blur_rad)
+    on_sharp = _ascents(sharp, again[1:], edges.blur_rad)
     of_sides = [max((on_sharp[k - 1] for k in side), key=lambda end: end.score).pose for side in sides]
     splits = [
         _Split(last_early + 1, T_before, T_after)
@@ -186,13 +186,13 @@ def _promising(gains: NDArray[np.float64]) -> list[int]:
     return [best] if len(inner) == 0 else list(dict.fromkeys((best, FEW - 1 + int(np.argmax(inner)))))
 
 
-def _settled(sharp: EdgeFrames, begun: Sequence[_Split], T_whole: Matrix4, blur_rad: float) -> list[ChangePoint]:
+def _settled(sharp: EdgeFrames, splits: Sequence[_Split], T_whole: Matrix4, blur_rad: float) -> list[ChangePoint]:
     """The likeliest change next to each split, from the poses that fit its two sides and one (4, 4) that fits all
     frames. All splits take their turns together, so that several climbs run at once."""
-    frames, turning = len(sharp.first_point) - 1, dict(enumerate(begun))
+    frames, turning = len(sharp.first_point) - 1, dict(enumerate(splits))
     best, most = dict(turning), dict.fromkeys(turning, -inf)
     for _ in range(TURNS):
-        ends = _climbed(sharp, [climb for split in turning.values() for climb in _sides(split, frames)], blur_rad)
+        ends = _ascents(sharp, [start for split in turning.values() for start in _sides(split, frames)], blur_rad)
         at_ends = _scores(sharp, [end.pose for end in ends])
         again = {}
         for (number, split), place in zip(turning.items(), range(0, len(ends), 2), strict=True):
@@ -207,19 +207,19 @@ def _settled(sharp: EdgeFrames, begun: Sequence[_Split], T_whole: Matrix4, blur_
             break
         turning = again
     # The one pose for all frames is also sought from the poses of the sides, so that it is no worse than theirs.
-    chosen = list(best.values())
-    whole = [T_whole, *(T for split in chosen for T in (split.T_before, split.T_after))]
-    of_whole, *of_sides = _climbed(sharp, [Climb(T, 0, frames) for T in whole], blur_rad)
+    final = list(best.values())
+    whole = [T_whole, *(T for split in final for T in (split.T_before, split.T_after))]
+    of_whole, *of_sides = _ascents(sharp, [AscentStart(T, 0, frames) for T in whole], blur_rad)
     at_sides = _scores(sharp, whole[1:])
     changes = []
-    for place, split in zip(range(0, len(of_sides), 2), chosen, strict=True):
+    for place, split in zip(range(0, len(of_sides), 2), final, strict=True):
         together = max(end.score for end in (of_whole, *of_sides[place : place + 2]))
         changes.append(_change(split, at_sides[place], at_sides[place + 1], together))
     return changes
 
 
-def _sides(split: _Split, frames: int) -> tuple[Climb, Climb]:
-    return Climb(split.T_before, 0, split.first_late), Climb(split.T_after, split.first_late, frames)
+def _sides(split: _Split, frames: int) -> tuple[AscentStart, AscentStart]:
+    return AscentStart(split.T_before, 0, split.first_late), AscentStart(split.T_after, split.first_late, frames)
 
 
 def _change(
@@ -260,14 +260,14 @@ def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[
     for side, k in zip(sides, best.tolist(), strict=True):
         if k != 0:
             gained[k] = max(gained[k], float(side[k] - side[0]))
-    chosen = sorted(gained, key=lambda k: (-gained[k], k))[:FAR_POSES]
-    return [cover[chosen], *(_about(cover[k]) for k in chosen)] if chosen else []
+    selected = sorted(gained, key=lambda k: (-gained[k], k))[:FAR_POSES]
+    return [cover[selected], *(_about(cover[k]) for k in selected)] if selected else []
 
 
 def _put_forward_by_ends(chart: EdgeCharts, band: EdgeFrames, pose: Matrix4) -> list[NDArray[np.float64]]:
     """Proposes poses (n, 4, 4) that the first and the last frames fit best, by the chart and then by the band. They are
     searched farther off if these frames do not fit the solved pose."""
-    at_pose, chosen = scores(band, pose), []
+    at_pose, selected = scores(band, pose), []
     for begin in (0, len(at_pose) - END):
         end = begin + END
         fits = float(at_pose[begin:end].mean()) >= MISFIT * float(np.median(at_pose))
@@ -277,14 +277,14 @@ def _put_forward_by_ends(chart: EdgeCharts, band: EdgeFrames, pose: Matrix4) -> 
         best = np.argsort(-charted_significances(part, cover), kind="stable")[:END_CHARTED]
         about = np.concatenate([cover[best], *(_about(cover[k]) for k in best.tolist())])
         fine = significances(_part(band, begin, end), about)
-        chosen.append(about[np.argsort(-fine, kind="stable")[:END_POSES]])
-    return chosen
+        selected.append(about[np.argsort(-fine, kind="stable")[:END_POSES]])
+    return selected
 
 
 def _about(pose: Matrix4) -> NDArray[np.float64]:
     """Poses (n, 4, 4) between a pose of the cover and its neighbours."""
-    apart_rad = REACH_RAD * (4.0 / 3.0 * pi / CHART_POSES) ** (1.0 / 3.0)
-    return sample_reach(pose, SearchBox(apart_rad, 0.0), AROUND_POSES)
+    spacing_rad = REACH_RAD * (4.0 / 3.0 * pi / CHART_POSES) ** (1.0 / 3.0)
+    return sample_reach(pose, SearchBox(spacing_rad, 0.0), AROUND_POSES)
 
 
 def scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
@@ -299,27 +299,27 @@ def _scores(band: EdgeFrames, poses: Sequence[Matrix4]) -> NDArray[np.float64]:
 
 def _support(of_frames: NDArray[np.float64]) -> float:
     """Mean of scores (F,), each weighted by itself; 0 if none is above 0."""
-    told = np.maximum(of_frames, 0.0)
-    return float(np.square(told).sum() / max(told.sum(), LEAST_SQUARE))
+    positive = np.maximum(of_frames, 0.0)
+    return float(np.square(positive).sum() / max(positive.sum(), LEAST_SQUARE))
 
 
 def _loss(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """The share of the scores `own` (F,) that is lost if they become `other` (F,), each weighted by itself; 0 if none
     is above 0."""
-    told = np.maximum(own, 0.0)
-    return float((told * (own - other)).sum() / max(np.square(told).sum(), LEAST_SQUARE))
+    positive = np.maximum(own, 0.0)
+    return float((positive * (own - other)).sum() / max(np.square(positive).sum(), LEAST_SQUARE))
 
 
-def _climbed(band: EdgeFrames, begun: Sequence[Climb], blur_rad: float) -> list[Summit]:
+def _ascents(band: EdgeFrames, starts: Sequence[AscentStart], blur_rad: float) -> list[Summit]:
     """The ends of climbs: the poses next to their beginnings at which their frames score most, one axis after the
     other."""
     nowhere, turns = np.eye(4), (*np.eye(6)[:3], *-np.eye(6)[:3])
-    steps_rad = [CLIMB_BLURS * blur_rad * 0.5**halved for halved in range(HALVINGS + 1)]
+    steps_rad = [ASCENT_BLURS * blur_rad * 0.5**halved for halved in range(HALVINGS + 1)]
     moves = np.array([[se3.perturb(nowhere, step_rad * turn) for turn in turns] for step_rad in steps_rad])
-    return climbed(band, list(begun), moves)
+    return ascend(band, list(starts), moves)
 
 
-def _asked(edges: Edges, half_view_rad: float, pose: Matrix4) -> Edges:
+def _edges_in_reach(edges: Edges, half_view_rad: float, pose: Matrix4) -> Edges:
     """The edges with at most `POINTS` range edges, and of those only the ones that some pose brings into view."""
     return in_reach(edges.of_points(thinned(len(edges.weight), POINTS)), half_view_rad, pose, SEEN)
 

@@ -14,13 +14,13 @@ from math import cos, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.edges import EdgeWitness, in_reach
+from coec.calibration.objective.edges import EdgeCue, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.geometry.cover import moved_by, unit_ball
-from coec.geometry.edges.charts import EdgeCharts, charted_significances, climb, keep_apart
+from coec.geometry.edges.charts import EdgeCharts, charted_significances, pattern_search, select_separated
 from coec.geometry.thinning import thinned
 
 COVER_RAD = radians(0.9)
@@ -53,7 +53,7 @@ class _Round:
     """
 
     poses: int
-    apart_rad: float
+    separation_rad: float
     chart: int
     thinned: bool
     points: int
@@ -98,14 +98,14 @@ AT_RIM = 0.98
 
 def at_rim(pose: Matrix4, start: Matrix4, reach: SearchBox) -> bool:
     """Whether a pose (4, 4) lies on or outside the rim of the ball of poses about `start` that was searched."""
-    apart = se3.difference(pose, start)
-    turn_rad, shift_m = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
+    difference = se3.difference(pose, start)
+    turn_rad, shift_m = float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
     return turn_rad > AT_RIM * reach.rotation_rad or (
         reach.translation_m > 0.0 and shift_m > AT_RIM * reach.translation_m
     )
 
 
-def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Basin]:
+def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]:
     """The most significant basins whose poses lie within `reach` of `start` (4, 4), best first.
 
     The reach is a ball: a rotation (rad) about any axis, and a shift (m) in any direction (0: rotation only).
@@ -115,23 +115,23 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
     poses = _promising(thinned_to[ROUNDS[0].chart], start, reach)
     for number in ROUNDS:
         charts = thinned_to[number.chart] if number.thinned else finest
-        poses = poses[_apart(poses, charted_significances(charts, poses), number.poses, number.apart_rad)]
-        poses, z = _climbed(charts, poses, number, start, reach)
+        poses = poses[_separated(poses, charted_significances(charts, poses), number.poses, number.separation_rad)]
+        poses, z = _pattern_searched(charts, poses, number, start, reach)
     if reach.translation_m > 0.0:
         more = _shifted(poses[np.argsort(-z, kind="stable")[:SHIFTED_POSES]])
-        more, _ = _climbed(finest, more, SHIFTED, start, reach)
+        more, _ = _pattern_searched(finest, more, SHIFTED, start, reach)
         poses = np.concatenate([poses, more])
     z = charted_significances(finest, poses)
-    return [Basin(poses[k], float(z[k])) for k in _apart(poses, z, len(poses), ROUNDS[-1].apart_rad)]
+    return [Basin(poses[k], float(z[k])) for k in _separated(poses, z, len(poses), ROUNDS[-1].separation_rad)]
 
 
-def basin_next_to(edges: EdgeWitness, pose: Matrix4, reach: SearchBox) -> Matrix4:
+def basin_next_to(edges: EdgeCue, pose: Matrix4, reach: SearchBox) -> Matrix4:
     """The pose (4, 4) to which the rounds lead from `pose` (4, 4), within `reach` of it, even if other poses rank
     higher."""
     end = pose[None]
     for number in ROUNDS:
         charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
-        end, _ = _climbed(in_reach(charts, edges.half_view_rad, pose, reach), end, number, pose, reach)
+        end, _ = _pattern_searched(in_reach(charts, edges.half_view_rad, pose, reach), end, number, pose, reach)
     return np.asarray(end[0])
 
 
@@ -169,7 +169,7 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     for begin in range(0, len(best), BLOCK):
         poses[1 + begin : 1 + begin + BLOCK] = cover.poses(best[begin : begin + BLOCK])
     z = charted_significances(charts, poses)
-    return poses[_apart(poses, z, ROUNDS[0].poses, ROUNDS[0].apart_rad)]
+    return poses[_separated(poses, z, ROUNDS[0].poses, ROUNDS[0].separation_rad)]
 
 
 def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -180,20 +180,24 @@ def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return shifted
 
 
-def _climbed(
+def _pattern_searched(
     charts: EdgeCharts, poses: NDArray[np.float64], number: _Round, start: Matrix4, reach: SearchBox
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     steps = of_both(number.step_rad)
     if reach.translation_m == 0.0:
         steps[3:] = 0.0
     few = _at_most(charts, number.points)
-    return climb(few, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m]))
+    return pattern_search(
+        few, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m])
+    )
 
 
 def _at_most(charts: EdgeCharts, points: int) -> EdgeCharts:
     return charts.of_points(thinned(len(charts.weight), points))
 
 
-def _apart(poses: NDArray[np.float64], z: NDArray[np.float64], count: int, apart_rad: float) -> NDArray[np.int64]:
+def _separated(
+    poses: NDArray[np.float64], z: NDArray[np.float64], count: int, separation_rad: float
+) -> NDArray[np.int64]:
     """Indices of the best poses, best first, no two closer in rotation than `apart_rad`."""
-    return np.asarray(keep_apart(poses, np.argsort(-z, kind="stable"), count, 1.0 + 2.0 * cos(apart_rad)))
+    return np.asarray(select_separated(poses, np.argsort(-z, kind="stable"), count, 1.0 + 2.0 * cos(separation_rad)))

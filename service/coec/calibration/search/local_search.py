@@ -71,15 +71,15 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     centre, most = np.zeros(config.dof), config.max_evaluations
     half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
     step = _per_axis(config.dof, radians(config.step_deg), config.step_m)
-    found, exhausted = maximum_in(_box(centre, half_width, half_width, step, config), scores, centre, most)
+    best, exhausted = maximum_in(_box(centre, half_width, half_width, step, config), scores, centre, most)
     reach, step = (of_both(turn_rad)[: config.dof] for turn_rad in (REFINE_BOX_RAD, REFINE_STEP_RAD))
-    found, exhausted_again = maximum_in(_box(found, reach, half_width, step, config), scores, found, most)
+    best, exhausted_again = maximum_in(_box(best, reach, half_width, step, config), scores, best, most)
     stop_reason = StopReason.TOLERANCE
     if exhausted or exhausted_again:
         stop_reason = StopReason.EVALUATIONS
-    elif (np.abs(found) >= AT_BOUND * half_width).any():
+    elif (np.abs(best) >= AT_BOUND * half_width).any():
         stop_reason = StopReason.AT_BOUND
-    return SearchResult(_pose(start, found), evaluations, stop_reason)
+    return SearchResult(_pose(start, best), evaluations, stop_reason)
 
 
 class Constraint(Protocol):
@@ -101,17 +101,17 @@ def polish(
     config: SearchConfig,
     progress: Progress,
     evaluations: int = 0,
-    kept: Constraint | None = None,
+    constraint: Constraint | None = None,
 ) -> SearchResult:
     """The maximum next to `basin` (4, 4), within a few difference steps of the objective. `evaluations` were made
     before and are included in the result. Every pose that is tried obeys `kept`."""
-    moved = [axis for axis in range(config.dof) if kept is None or axis not in kept.axes]
+    moved = [axis for axis in range(config.dof) if constraint is None or axis not in constraint.axes]
 
     def pose(coordinates: NDArray[np.float64]) -> Matrix4:
         perturbation = np.zeros(6)
         perturbation[moved] = coordinates
         perturbed = se3.perturb(basin, perturbation)
-        return perturbed if kept is None else kept(perturbed)
+        return perturbed if constraint is None else constraint(perturbed)
 
     def scores(points: NDArray[np.float64]) -> list[float]:
         nonlocal evaluations
@@ -121,9 +121,9 @@ def polish(
 
     step = of_both(objective.step_rad, POLISH_METRES_PER_RADIAN)[moved]
     centre, reach = np.zeros(len(moved)), POLISH_STEPS * step
-    found, exhausted = maximum_in(_box(centre, reach, reach, step, config), scores, centre, config.max_evaluations)
+    best, exhausted = maximum_in(_box(centre, reach, reach, step, config), scores, centre, config.max_evaluations)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
-    return SearchResult(pose(found), evaluations, stop_reason)
+    return SearchResult(pose(best), evaluations, stop_reason)
 
 
 def near(config: SearchConfig, objective: Objective) -> SearchConfig:
@@ -140,8 +140,8 @@ def polish_in_turn(
     *leading, last = objectives
     evaluations = 0
     for objective in leading:
-        found = polish(objective, basin, near(config, objective), progress, evaluations)
-        basin, evaluations = found.T_camera_lidar, found.evaluations
+        result = polish(objective, basin, near(config, objective), progress, evaluations)
+        basin, evaluations = result.T_camera_lidar, result.evaluations
     return polish(last, basin, config, progress, evaluations)
 
 

@@ -33,7 +33,7 @@ TRANSLATIONS = range(3, 6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CentreKept:
+class FixedCentre:
     """Keeps the camera's centre where it was along some axes of the camera.
 
     Attributes:
@@ -75,6 +75,6 @@ def without(
     progress: Progress,
 ) -> SearchResult:
     """The search finished again with the camera's centre put back to that of `prior` (4, 4) along the axes `blind`."""
-    kept = CentreKept(blind, prior)
-    again = polish(objective, kept(search.T_camera_lidar), config, progress, search.evaluations, kept)
+    constraint = FixedCentre(blind, prior)
+    again = polish(objective, constraint(search.T_camera_lidar), config, progress, search.evaluations, constraint)
     return replace(again, stop_reason=search.stop_reason)

@@ -18,7 +18,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.edges import EdgeWitness
+from coec.calibration.objective.edges import EdgeCue
 from coec.calibration.search.change_point import ChangePoint, change_point, scores
 from coec.calibration.types import FramePair, Matrix4
 
@@ -35,7 +35,7 @@ class DatedEdges:
     """The edge witness of some pairs, and their stamps, ascending."""
 
     stamps_ns: tuple[int, ...]
-    edges: EdgeWitness
+    edges: EdgeCue
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,18 +71,18 @@ def step_time(
     first, last = max(0, change.first_late - 2), min(len(stamps_ns) - 1, change.first_late + 1)
     about, waiting = StepTime(stamps_ns[first], stamps_ns[last], change.T_before, change.T_after), list(between)
     while True:
-        asked = [pair for pair in waiting if about.holds(pair.stamp_ns)]
-        for some in _bunches(asked):
-            found = edges_of(some)
-            if found is not None:
-                near = change_point(found.edges, _better_known(change, len(stamps_ns)))
-                seen.append(found)
+        requested = [pair for pair in waiting if about.holds(pair.stamp_ns)]
+        for some in _bunches(requested):
+            dated = edges_of(some)
+            if dated is not None:
+                near = change_point(dated.edges, _better_known(change, len(stamps_ns)))
+                seen.append(dated)
                 changes += [] if near is None else [near]
-        told = _told(seen, changes)
-        if not asked:
-            return told
+        best = _best_step_time(seen, changes)
+        if not requested:
+            return best
         waiting = [pair for pair in waiting if not about.holds(pair.stamp_ns)]
-        about = told
+        about = best
 
 
 def _bunches(pairs: Sequence[FramePair]) -> Iterator[Sequence[FramePair]]:
@@ -96,7 +96,7 @@ def _better_known(change: ChangePoint, frames: int) -> Matrix4:
     return change.T_before if 2 * change.first_late > frames else change.T_after
 
 
-def _told(seen: Sequence[DatedEdges], changes: Sequence[ChangePoint]) -> StepTime:
+def _best_step_time(seen: Sequence[DatedEdges], changes: Sequence[ChangePoint]) -> StepTime:
     """The time of the change by all pairs, at the two poses that explain them best. At least one pair lies on either
     side."""
     stamps_ns = np.concatenate([np.array(some.stamps_ns, np.int64) for some in seen])
@@ -108,14 +108,14 @@ def _told(seen: Sequence[DatedEdges], changes: Sequence[ChangePoint]) -> StepTim
 
     before = [(one.T_before, at(one.T_before)) for one in changes]
     after = [(one.T_after, at(one.T_after)) for one in changes]
-    told, most = None, -np.inf
+    best, most = None, -np.inf
     for (T_before, early), (T_after, late) in product(before, after):
         # For each split: the pairs before it score at one pose and the rest at the other.
         summed = late.sum() + np.cumsum(early - late)[:-1]
         highest = float(summed.max())
-        if told is None or highest > most:
+        if best is None or highest > most:
             may_be = np.flatnonzero(summed >= highest - MAY_BE)
             most = highest
-            told = StepTime(int(stamps_ns[may_be[0]]), int(stamps_ns[may_be[-1] + 1]), T_before, T_after)
-    assert told is not None, "there is a change"
-    return told
+            best = StepTime(int(stamps_ns[may_be[0]]), int(stamps_ns[may_be[-1] + 1]), T_before, T_after)
+    assert best is not None, "there is a change"
+    return best

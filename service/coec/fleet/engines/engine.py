@@ -8,7 +8,7 @@ from typing import Protocol
 
 from coec.errors import CoecError, ModelError
 from coec.fleet.places import Job, StoreError
-from coec.fleet.terms import Terms
+from coec.fleet.terms import ReplaySettings
 from coec.schemas.fleet import WindowRow
 
 PROCESS_DIED, DEADLINE, TOO_LARGE = "process_died", "deadline", "memory_exceeded"
@@ -37,7 +37,7 @@ class FleetError(CoecError):
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
+class WorkerLimits:
     """Limits for the work on one window, and for failures.
 
     Attributes:
@@ -52,7 +52,7 @@ class Bounds:
     alike: int | None = 3
 
     @property
-    def late(self) -> str:
+    def deadline_message(self) -> str:
         """The error text for a window that took longer."""
         return f"it was not judged within {self.seconds:g} s (--deadline)"
 
@@ -64,7 +64,7 @@ class Engine(Protocol):
     def cores(self) -> int:
         """How many windows are solved at a time."""
 
-    def rows(self, jobs: Sequence[Job], terms: Terms) -> Iterator[WindowRow]:
+    def rows(self, jobs: Sequence[Job], settings: ReplaySettings) -> Iterator[WindowRow]:
         """A row for every window, as they are finished. A window that ends its process gets a row, too.
 
         Raises:

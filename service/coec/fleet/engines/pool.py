@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from coec.fleet.engines.engine import COMMON_CAUSES, DEADLINE, Bounds, FleetError
-from coec.fleet.engines.queue import AHEAD, Queue
+from coec.fleet.engines.engine import COMMON_CAUSES, DEADLINE, FleetError, WorkerLimits
+from coec.fleet.engines.queue import WINDOWS_PER_WORKER, WindowQueue
 from coec.fleet.places import Job
 from coec.schemas.fleet import WindowRow
 
@@ -39,7 +39,7 @@ START_TRIES = 3
 """How many processes may fail at their start, while none runs."""
 
 
-class Worker(Protocol):
+class PoolWorker(Protocol):
     """A process that judges windows."""
 
     def submit(self, job: Job) -> None:
@@ -50,22 +50,22 @@ class Worker(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Started:
+class WorkerStarted:
     """A process runs and can judge windows."""
 
-    worker: Worker
+    worker: PoolWorker
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class WindowEvaluated:
     """A process has judged a window."""
 
-    worker: Worker
+    worker: PoolWorker
     row: WindowRow
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class WorkerStopped:
     """A process has ended, could not start, or must be ended.
 
     Attributes:
@@ -75,22 +75,22 @@ class Ended:
         blame: whether a window may have caused it. False: the machine was lost.
     """
 
-    worker: Worker
+    worker: PoolWorker
     code: str
     text: str
     blame: bool = True
 
 
-Event = Started | Judged | Ended
+WorkerEvent = WorkerStarted | WindowEvaluated | WorkerStopped
 
 
-class Workers(Protocol):
+class WorkerFactory(Protocol):
     """Starts processes, and reports what happens to them."""
 
-    def start(self) -> Worker:
+    def start(self) -> PoolWorker:
         """Begins to start a process; returns at once."""
 
-    def events(self, workers: Sequence[Worker], timeout_s: float) -> Iterable[Event]:
+    def events(self, workers: Sequence[PoolWorker], timeout_s: float) -> Iterable[WorkerEvent]:
         """What has happened to these processes; waits for the first event, at most for so long."""
 
 
@@ -111,14 +111,16 @@ class _Slot:
     alike: int = 0
 
 
-class Pool:
+class WorkerPool:
     """The processes that judge one batch."""
 
-    def __init__(self, workers: Workers, bounds: Bounds, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, workers: WorkerFactory, bounds: WorkerLimits, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._workers = workers
         self._bounds = bounds
         self._clock = clock
-        self._slots: dict[Worker, _Slot] = {}
+        self._slots: dict[PoolWorker, _Slot] = {}
         self._failed_starts = 0
         self._common: WindowRow | None = None
         self._available_s = clock()
@@ -133,7 +135,7 @@ class Pool:
         Raises:
             FleetError: no process can be started, or windows could not be judged for a common cause. Those have no row.
         """
-        queue = Queue(jobs)
+        queue = WindowQueue(jobs)
         self._available_s = self._clock()
         try:
             for _ in range(min(cores, len(jobs))):
@@ -142,7 +144,7 @@ class Pool:
                 self._assign(queue)
                 for event in self._workers.events(list(self._slots), POLL_S):
                     yield from self._handle(event, queue)
-                yield from self._end_late(queue)
+                yield from self._stop_late(queue)
                 self._check_available()
             if queue.unjudged:
                 raise self._error(f"{queue.unjudged} of {len(jobs)} windows could not be judged")
@@ -153,9 +155,9 @@ class Pool:
     def _start(self) -> None:
         self._slots[self._workers.start()] = _Slot(self._clock())
 
-    def _assign(self, queue: Queue) -> None:
+    def _assign(self, queue: WindowQueue) -> None:
         # One window each before anybody gets a second one, so that the last windows run side by side.
-        for has in range(AHEAD):
+        for has in range(WINDOWS_PER_WORKER):
             for worker, slot in self._slots.items():
                 if slot.started and len(slot.jobs) == has and (job := queue.next_for(slot.jobs.values())) is not None:
                     if not slot.jobs:
@@ -163,15 +165,15 @@ class Pool:
                     slot.jobs[job.url] = job
                     worker.submit(job)
 
-    def _handle(self, event: Event, queue: Queue) -> Iterator[WindowRow]:
+    def _handle(self, event: WorkerEvent, queue: WindowQueue) -> Iterator[WindowRow]:
         slot = self._slots.get(event.worker)
         if slot is None:  # it has been given up, and its windows are with others
             return
-        if isinstance(event, Started):
+        if isinstance(event, WorkerStarted):
             slot.started = True
             self._failed_starts = 0
-        elif isinstance(event, Ended):
-            yield from self._end(event, queue)
+        elif isinstance(event, WorkerStopped):
+            yield from self._replace(event, queue)
         else:
             slot.progress_s = self._clock()
             job = slot.jobs.pop(event.row.url, None)
@@ -187,7 +189,7 @@ class Pool:
             if slot.alike >= self._bounds.alike:
                 self._retire(event.worker, event.row, queue)
 
-    def _end(self, event: Ended, queue: Queue) -> Iterator[WindowRow]:
+    def _replace(self, event: WorkerStopped, queue: WindowQueue) -> Iterator[WindowRow]:
         """Replaces a process, and passes its windows on."""
         slot = self._slots.pop(event.worker)
         event.worker.close()
@@ -202,27 +204,27 @@ class Pool:
             _log.warning("a process for judging windows could not start", extra={"fields": {"reason": event.text}})
         jobs = slot.jobs.values()
         if event.blame:
-            yield from queue.give_back(jobs, event.code, event.text)
+            yield from queue.retry_alone(jobs, event.code, event.text)
         else:
             fields = {"reason": event.text, "windows": [job.url for job in jobs]}
             _log.warning("windows of a lost process are judged by others", extra={"fields": fields})
-            yield from queue.return_unblamed(jobs, event.text)
+            yield from queue.requeue_lost(jobs, event.text)
 
-    def _retire(self, worker: Worker, row: WindowRow, queue: Queue) -> None:
+    def _retire(self, worker: PoolWorker, row: WindowRow, queue: WindowQueue) -> None:
         """Gives a process up that fails every window for the same cause; its windows go to others."""
         slot = self._slots.pop(worker)
         worker.close()
-        queue.put_back(slot.jobs.values())
+        queue.requeue(slot.jobs.values())
         _log.warning(
             "a process for judging windows fails every window and gets no more",
             extra={"fields": {"code": row.error_code, "reason": row.error}},
         )
 
-    def _end_late(self, queue: Queue) -> Iterator[WindowRow]:
+    def _stop_late(self, queue: WindowQueue) -> Iterator[WindowRow]:
         now_s = self._clock()
         for worker, slot in list(self._slots.items()):
             if slot.jobs and now_s - slot.progress_s > self._bounds.seconds:
-                yield from self._end(Ended(worker, DEADLINE, self._bounds.late), queue)
+                yield from self._replace(WorkerStopped(worker, DEADLINE, self._bounds.deadline_message), queue)
 
     def _any_started(self) -> bool:
         return any(slot.started for slot in self._slots.values())

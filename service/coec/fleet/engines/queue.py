@@ -8,10 +8,10 @@ from collections.abc import Collection, Iterable, Iterator
 
 from coec.fleet.engines.engine import NODE_LOST
 from coec.fleet.places import Job
-from coec.fleet.trouble import lost
+from coec.fleet.trouble import lost_row
 from coec.schemas.fleet import WindowRow
 
-AHEAD = 2
+WINDOWS_PER_WORKER = 2
 """How many windows a process has at a time: one that it solves, and one that it fetches meanwhile."""
 
 MAX_LOSSES = 3
@@ -21,7 +21,7 @@ MAX_TRIES = 2
 """How often a window is tried that fails for a common cause: a store may have been away for a moment."""
 
 
-class Queue:
+class WindowQueue:
     """The waiting windows. A window whose process ended is tried once more, alone in a process. The first end may have
     been caused by another window, or by memory that others had taken; the second one is caused by this window."""
 
@@ -41,36 +41,36 @@ class Queue:
         """How many windows failed for a common cause as often as they are tried."""
         return self._unjudged
 
-    def next_for(self, has: Collection[Job]) -> Job | None:
+    def next_for(self, assigned: Collection[Job]) -> Job | None:
         """The next window for a process that has these; None: it gets no more now."""
-        if not self._waiting or len(has) >= AHEAD:
+        if not self._waiting or len(assigned) >= WINDOWS_PER_WORKER:
             return None
-        if has and (self._waiting[0] in self._suspected or not self._suspected.isdisjoint(has)):
+        if assigned and (self._waiting[0] in self._suspected or not self._suspected.isdisjoint(assigned)):
             return None
         return self._waiting.popleft()
 
-    def give_back(self, has: Collection[Job], code: str, text: str) -> Iterator[WindowRow]:
+    def retry_alone(self, assigned: Collection[Job], code: str, text: str) -> Iterator[WindowRow]:
         """A process with these windows has ended, for a reason. Queues the windows again, and returns the rows of those
         that are not tried again."""
-        for job in reversed(list(has)):
+        for job in reversed(list(assigned)):
             if job in self._suspected:
-                yield lost(job, code, text)
+                yield lost_row(job, code, text)
             else:
                 self._suspected.add(job)
                 self._waiting.appendleft(job)
 
-    def put_back(self, has: Collection[Job]) -> None:
+    def requeue(self, assigned: Collection[Job]) -> None:
         """Queues windows again, before all others, that a process had but has not finished through no fault of theirs.
         Nothing is remembered about them."""
-        self._waiting.extendleft(reversed(list(has)))
+        self._waiting.extendleft(reversed(list(assigned)))
 
-    def return_unblamed(self, has: Collection[Job], text: str) -> Iterator[WindowRow]:
+    def requeue_lost(self, assigned: Collection[Job], text: str) -> Iterator[WindowRow]:
         """The machine with these windows was lost, which is hardly their fault. Queues them again before all others,
         and returns the rows of those that have been lost too often."""
-        for job in reversed(list(has)):
+        for job in reversed(list(assigned)):
             self._losses[job] += 1
             if self._losses[job] >= MAX_LOSSES:
-                yield lost(job, NODE_LOST, f"{text}, as were {MAX_LOSSES - 1} machines that had it before")
+                yield lost_row(job, NODE_LOST, f"{text}, as were {MAX_LOSSES - 1} machines that had it before")
             else:
                 self._waiting.appendleft(job)
 

@@ -20,12 +20,12 @@ from coec import __version__
 from coec.adapters.system.cores import ONE_THREAD
 from coec.errors import SourceError
 from coec.fleet.credentials import StoreCredentials
-from coec.fleet.engines.engine import NODE_LOST, NOT_ON_NODE, PROCESS_DIED, Bounds, FleetError
-from coec.fleet.engines.pool import Ended, Event, Judged, Pool, Started, Worker
-from coec.fleet.engines.queue import AHEAD
+from coec.fleet.engines.engine import NODE_LOST, NOT_ON_NODE, PROCESS_DIED, FleetError, WorkerLimits
+from coec.fleet.engines.pool import PoolWorker, WindowEvaluated, WorkerEvent, WorkerPool, WorkerStarted, WorkerStopped
+from coec.fleet.engines.queue import WINDOWS_PER_WORKER
 from coec.fleet.places import Job, is_path, stores_of
-from coec.fleet.terms import Terms
-from coec.fleet.trouble import failed
+from coec.fleet.terms import ReplaySettings
+from coec.fleet.trouble import failed_row
 from coec.schemas.fleet import WindowRow
 
 ADDRESS = "RAY_ADDRESS"
@@ -56,11 +56,11 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 class _Judge:
     """Runs on a node of the cluster, which has coec installed."""
 
-    def __init__(self, terms: str, credentials: StoreCredentials) -> None:
+    def __init__(self, settings: str, credentials: StoreCredentials) -> None:
         credentials.install()  # before the clients of stores are imported, which may read them then
-        from coec.fleet.desk import Desk  # only the nodes need what calibrates
+        from coec.fleet.desk import WindowEvaluator  # only the nodes need what calibrates
 
-        self._desk = Desk(Terms.model_validate_json(terms))
+        self._evaluator = WindowEvaluator(ReplaySettings.model_validate_json(settings))
 
     def versions(self) -> tuple[str, str]:
         """Host name of the node, and the version of coec on it."""
@@ -71,7 +71,7 @@ class _Judge:
 
     def row(self, job: Job) -> str:
         """The row of a window, as JSON. For several threads."""
-        return self._desk.row(job).model_dump_json()
+        return self._evaluator.row(job).model_dump_json()
 
 
 class _Actor:
@@ -86,7 +86,7 @@ class _Actor:
         self._ray = ray
 
     @property
-    def owed(self) -> list[Any]:
+    def pending(self) -> list[Any]:
         """References of all answers that have not come."""
         return [*self.rows, *(one for one in (self.versions, self.ping) if one is not None)]
 
@@ -102,33 +102,33 @@ class _Actor:
 class _Actors:
     """Starts actors on the cluster, and reports what happens to them."""
 
-    def __init__(self, ray: Any, terms: str, credentials: StoreCredentials, bounds: Bounds) -> None:
+    def __init__(self, ray: Any, settings: str, credentials: StoreCredentials, bounds: WorkerLimits) -> None:
         self._ray = ray
-        self._arguments = (terms, credentials)
+        self._arguments = (settings, credentials)
         self._options = {
             "num_cpus": 1,
             "memory": bounds.bytes,
-            "max_concurrency": AHEAD + 1,  # one more for pings
+            "max_concurrency": WINDOWS_PER_WORKER + 1,  # one more for pings
             "runtime_env": {"env_vars": dict(ONE_THREAD)},
         }
 
-    def start(self) -> Worker:
+    def start(self) -> PoolWorker:
         """See `Workers`."""
         return _Actor(self._ray.remote(_Judge).options(**self._options).remote(*self._arguments), self._ray)
 
-    def events(self, workers: Sequence[Worker], timeout_s: float) -> Iterator[Event]:
+    def events(self, workers: Sequence[PoolWorker], timeout_s: float) -> Iterator[WorkerEvent]:
         """See `Workers`."""
         actors = cast("Sequence[_Actor]", workers)
-        owed = [one for actor in actors for one in actor.owed]
+        pending = [one for actor in actors for one in actor.pending]
         done: list[Any] = []
-        if not owed:
+        if not pending:
             time.sleep(timeout_s)
-        elif self._ray.wait(owed, num_returns=1, timeout=timeout_s)[0]:
-            done, _ = self._ray.wait(owed, num_returns=len(owed), timeout=0)
+        elif self._ray.wait(pending, num_returns=1, timeout=timeout_s)[0]:
+            done, _ = self._ray.wait(pending, num_returns=len(pending), timeout=0)
         for actor in actors:
             yield from self._received(actor, set(done))
 
-    def _received(self, actor: _Actor, done: set[Any]) -> Iterator[Event]:
+    def _received(self, actor: _Actor, done: set[Any]) -> Iterator[WorkerEvent]:
         """What an actor has answered, and whether it still does."""
         now_s = time.monotonic()
         try:
@@ -137,56 +137,58 @@ class _Actors:
                 actor.alive_s = now_s
                 event = self._started(actor, *answer)
                 yield event
-                if isinstance(event, Ended):
+                if isinstance(event, WorkerStopped):
                     return
             for row in [row for row in actor.rows if row in done]:
                 document = self._ray.get(row, timeout=GET_S)
                 actor.rows.remove(row)
                 actor.alive_s = now_s
-                yield Judged(actor, _explained(WindowRow.model_validate_json(document)))
+                yield WindowEvaluated(actor, _with_missing_file(WindowRow.model_validate_json(document)))
             if actor.ping in done:
                 self._ray.get(actor.ping, timeout=GET_S)
                 actor.ping, actor.alive_s = None, now_s
         except self._ray.exceptions.RayError as error:
-            yield self._ended(actor, error)
+            yield self._stopped(actor, error)
             return
         if actor.versions is not None:
             return
         if now_s - actor.alive_s > SILENCE_S:
-            yield Ended(actor, NODE_LOST, f"the node that had it has not answered for {SILENCE_S:g} s", blame=False)
+            yield WorkerStopped(
+                actor, NODE_LOST, f"the node that had it has not answered for {SILENCE_S:g} s", blame=False
+            )
         elif actor.ping is None and now_s - actor.pinged_s > PING_S:
             actor.ping, actor.pinged_s = actor.actor.ping.remote(), now_s
 
-    def _started(self, actor: _Actor, host: str, version: str) -> Event:
+    def _started(self, actor: _Actor, host: str, version: str) -> WorkerEvent:
         if version == __version__:
-            return Started(actor)
+            return WorkerStarted(actor)
         text = f"the node {host} has coec {version}, but this machine {__version__}"
-        return Ended(actor, PROCESS_DIED, _unusable(text))
+        return WorkerStopped(actor, PROCESS_DIED, _unusable_cluster(text))
 
-    def _ended(self, actor: _Actor, error: Exception) -> Event:
+    def _stopped(self, actor: _Actor, error: Exception) -> WorkerEvent:
         """Why an actor does not answer any more: its process ended, or its node was lost."""
         text = _COLOUR.sub("", str(error)).strip()
         if isinstance(error, (self._ray.exceptions.ActorUnavailableError, self._ray.exceptions.GetTimeoutError)) or (
             NODE_DIED in text
         ):
-            return Ended(actor, NODE_LOST, "the node that had it was lost", blame=False)
+            return WorkerStopped(actor, NODE_LOST, "the node that had it was lost", blame=False)
         if actor.versions is not None:
-            return Ended(actor, PROCESS_DIED, _unusable(text.rpartition("\n")[2].strip()))
-        return Ended(actor, PROCESS_DIED, f"the process that judged it ended: {type(error).__name__}")
+            return WorkerStopped(actor, PROCESS_DIED, _unusable_cluster(text.rpartition("\n")[2].strip()))
+        return WorkerStopped(actor, PROCESS_DIED, f"the process that judged it ended: {type(error).__name__}")
 
 
-def _unusable(text: str) -> str:
+def _unusable_cluster(text: str) -> str:
     return (
         f"no process can judge windows on the Ray cluster: {text}; every node needs coec {__version__} with the same "
         "extras as this machine, in the Python that runs `ray start`"
     )
 
 
-def _explained(row: WindowRow) -> WindowRow:
+def _with_missing_file(row: WindowRow) -> WindowRow:
     """The row of a window; if the node lacks a file that this machine has, the row says so."""
     if row.error is None or row.sha256 is not None or not is_path(row.url) or not Path(row.url).is_file():
         return row
-    return failed(row, NOT_ON_NODE, f"a node of the cluster cannot read {row.url}, which exists on this machine")
+    return failed_row(row, NOT_ON_NODE, f"a node of the cluster cannot read {row.url}, which exists on this machine")
 
 
 def _probe(address: str) -> None:
@@ -207,7 +209,7 @@ class RayEngine:
     """Judges windows on a Ray cluster."""
 
     def __init__(
-        self, cores: int | None, bounds: Bounds, address: str | None = None, *, send_credentials: bool = True
+        self, cores: int | None, bounds: WorkerLimits, address: str | None = None, *, send_credentials: bool = True
     ) -> None:
         """Connects to a cluster.
 
@@ -231,10 +233,12 @@ class RayEngine:
         self._bounds = bounds
         self._send_credentials = send_credentials
         address = address or os.environ.get(ADDRESS) or AUTO
-        ours = {"include_dashboard": False} if address == "local" else {}
+        local_options = {"include_dashboard": False} if address == "local" else {}
         try:
             _probe(address)
-            ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR, **ours)
+            ray.init(
+                address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR, **local_options
+            )
             nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         except Exception as error:  # of Ray, of the system, or of a library in between
             raise FleetError(
@@ -242,15 +246,15 @@ class RayEngine:
                 f"{ADDRESS}=HOST:6379 or --ray-address names one that runs (`ray start --head` starts it); "
                 "--ray-address local starts one on this machine for this batch; --engine local needs none",
             ) from error
-        there = sum(int(min(node.get("CPU", 0.0), node.get("memory", 0.0) // bounds.bytes)) for node in nodes)
-        if there == 0:
+        available = sum(int(min(node.get("CPU", 0.0), node.get("memory", 0.0) // bounds.bytes)) for node in nodes)
+        if available == 0:
             raise FleetError(
                 f"no node of the Ray cluster at {address} has a core and {bounds.bytes >> 20} MiB for a process "
                 "(--memory)"
             )
-        self.cores = min(cores or there, there)
+        self.cores = min(cores or available, available)
 
-    def rows(self, jobs: Sequence[Job], terms: Terms) -> Iterator[WindowRow]:
+    def rows(self, jobs: Sequence[Job], settings: ReplaySettings) -> Iterator[WindowRow]:
         """See `Engine`. Credentials are sent for those stores only in which windows are.
 
         Raises:
@@ -258,8 +262,8 @@ class RayEngine:
         """
         stores = stores_of(jobs) if self._send_credentials else ()
         credentials = StoreCredentials.from_environment(stores, os.environ)
-        actors = _Actors(self._ray, terms.model_dump_json(), credentials, self._bounds)
-        yield from Pool(actors, self._bounds).rows(jobs, self.cores)
+        actors = _Actors(self._ray, settings.model_dump_json(), credentials, self._bounds)
+        yield from WorkerPool(actors, self._bounds).rows(jobs, self.cores)
 
     def close(self) -> None:
         """Leaves the cluster, or ends it if it was started here."""

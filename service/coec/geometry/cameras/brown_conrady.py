@@ -12,7 +12,7 @@ from coec.geometry.cameras.formulas import like
 from coec.geometry.cameras.polynomial import odd_polynomial, solve_odd_polynomial
 
 # Newton's method converges quadratically from the radial solution; real lenses need three to five steps.
-_MAX_STEPS = 30
+_MAX_NEWTON_STEPS = 30
 # Largest distance between a pixel and the re-distorted solution for the pixel to have a ray. Normalised coordinates:
 # 1e-9 of a focal length, a millionth of a pixel.
 _TOLERANCE = 1e-9
@@ -38,14 +38,14 @@ def undistort(
     """
     limit = math.sqrt(max_radius2)
     distorted_radius = math.sqrt(xd * xd + yd * yd)
-    radius, found = solve_odd_polynomial(k1, k2, k3, 0.0, distorted_radius, limit)
-    if not found:  # beyond the radial limit, where the tangential part may still reach back inside
+    radius, converged = solve_odd_polynomial(k1, k2, k3, 0.0, distorted_radius, limit)
+    if not converged:  # beyond the radial limit, where the tangential part may still reach back inside
         radius = limit if limit < math.inf else distorted_radius
-        found = odd_polynomial(k1, k2, k3, 0.0, radius) > 0.0
+        converged = odd_polynomial(k1, k2, k3, 0.0, radius) > 0.0
     scale = radius / distorted_radius if distorted_radius > 0.0 else 1.0
     x = xd * scale
     y = yd * scale
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_NEWTON_STEPS):
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         radial_slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # d radial / d(r^2), doubled
@@ -67,4 +67,4 @@ def undistort(
     close = (abs(xr - xd) < _TOLERANCE * (1.0 + distorted_radius)) & (
         abs(yr - yd) < _TOLERANCE * (1.0 + distorted_radius)
     )
-    return x, y, found & close & (x * x + y * y < max_radius2)
+    return x, y, converged & close & (x * x + y * y < max_radius2)

@@ -19,7 +19,7 @@ import math
 from typing import NamedTuple
 
 from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import sensor, within
+from coec.geometry.cameras.intrinsics import common_intrinsics, within
 
 # At xi = -1 the second sphere's centre lies on the first sphere and the optical axis itself has no image.
 MIN_XI, MAX_XI = -0.999, 1.0
@@ -62,7 +62,7 @@ def build(
     """A checked camera (-0.999 <= xi <= 1, 0 <= alpha <= 1). Raises ValueError that names the field."""
     xi = within("xi", xi, MIN_XI, MAX_XI)
     alpha = within("alpha", alpha, 0.0, 1.0)
-    return DoubleSphere(*sensor(width, height, fx, fy, cx, cy), xi, alpha, _min_cosine(xi, alpha))
+    return DoubleSphere(*common_intrinsics(width, height, fx, fy, cx, cy), xi, alpha, _min_cosine(xi, alpha))
 
 
 def image_point(camera: DoubleSphere, x: float, y: float, z: float) -> tuple[float, float, bool]:

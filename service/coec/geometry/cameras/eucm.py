@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import positive, sensor, within
+from coec.geometry.cameras.intrinsics import common_intrinsics, positive, within
 
 
 class Eucm(NamedTuple):
@@ -42,7 +42,7 @@ def build(
     """A checked camera (0 <= alpha <= 1, beta > 0). Raises ValueError that names the field."""
     alpha = within("alpha", alpha, 0.0, 1.0)
     return Eucm(
-        *sensor(width, height, fx, fy, cx, cy),
+        *common_intrinsics(width, height, fx, fy, cx, cy),
         alpha,
         positive("beta", beta),
         -alpha / (1.0 - alpha) if alpha <= 0.5 else -(1.0 - alpha) / alpha,

@@ -33,7 +33,7 @@ def like(constant: float, value: float) -> float:  # noqa: ARG001  (only its typ
     return constant
 
 
-class _Sensor(Protocol):
+class _ImageSize(Protocol):
     """The fields that every camera model has and that the guards read."""
 
     @property
@@ -43,7 +43,7 @@ class _Sensor(Protocol):
 
 
 def guarded_pixel(
-    camera: _Sensor, x: float, y: float, z: float, u: float, v: float, in_domain: bool
+    camera: _ImageSize, x: float, y: float, z: float, u: float, v: float, in_domain: bool
 ) -> tuple[float, float, bool]:
     """(u, v, True) for a point (x, y, z) in the domain with a sane pixel, else the principal point and False."""
     range2 = x * x + y * y + z * z

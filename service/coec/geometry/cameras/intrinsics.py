@@ -5,7 +5,7 @@ from numbers import Integral, Real
 from typing import NamedTuple
 
 
-class Sensor(NamedTuple):
+class CommonIntrinsics(NamedTuple):
     """The checked fields that all models share, in the order in which all models start."""
 
     width: int
@@ -44,9 +44,9 @@ def pixel_count(name: str, value: int) -> int:
     return int(value)
 
 
-def sensor(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Sensor:
+def common_intrinsics(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> CommonIntrinsics:
     """The checked size (px), focal lengths (px, above zero) and principal point (px, any finite value)."""
-    return Sensor(
+    return CommonIntrinsics(
         pixel_count("width", width),
         pixel_count("height", height),
         positive("fx", fx),

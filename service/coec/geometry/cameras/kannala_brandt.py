@@ -14,7 +14,7 @@ import math
 from typing import NamedTuple
 
 from coec.geometry.cameras.formulas import guarded_ray, like, polar_angle
-from coec.geometry.cameras.intrinsics import finite, sensor
+from coec.geometry.cameras.intrinsics import common_intrinsics, finite
 from coec.geometry.cameras.polynomial import (
     monotonic_limit_squared,
     odd_polynomial,
@@ -57,7 +57,7 @@ def build(
 ) -> KannalaBrandt:
     """A checked camera. Raises ValueError that names the field."""
     return KannalaBrandt(
-        *sensor(width, height, fx, fy, cx, cy),
+        *common_intrinsics(width, height, fx, fy, cx, cy),
         finite("k1", k1),
         finite("k2", k2),
         finite("k3", k3),
@@ -82,6 +82,6 @@ def unproject_point(camera: KannalaBrandt, u: float, v: float) -> tuple[float, f
     mx = (u - camera.cx) / camera.fx
     my = (v - camera.cy) / camera.fy
     distorted = math.sqrt(mx * mx + my * my)
-    theta, found = solve_odd_polynomial(camera.k1, camera.k2, camera.k3, camera.k4, distorted, camera.max_theta_rad)
+    theta, converged = solve_odd_polynomial(camera.k1, camera.k2, camera.k3, camera.k4, distorted, camera.max_theta_rad)
     scale = math.sin(theta) / distorted if distorted > _MIN_RADIUS_M else 1.0
-    return guarded_ray(mx * scale, my * scale, math.cos(theta), found)
+    return guarded_ray(mx * scale, my * scale, math.cos(theta), converged)

@@ -57,8 +57,8 @@ def fit_kannala_brandt(camera: Camera) -> KannalaBrandtFit:
     design = np.concatenate([radial, centre], axis=2).reshape(-1, _PARAMETERS)
     # Columns differ by powers of theta: scale them to unit length, so that the small ones are not rounded off.
     scale = np.linalg.norm(design, axis=0)
-    found = np.linalg.lstsq(design / scale, uv_px.reshape(-1), rcond=None)[0] / scale
-    first, *higher = (float(value) for value in found[: len(_POWERS)])
+    solution = np.linalg.lstsq(design / scale, uv_px.reshape(-1), rcond=None)[0] / scale
+    first, *higher = (float(value) for value in solution[: len(_POWERS)])
     if not first > 0.0:
         raise ValueError("no Kannala-Brandt camera comes near this one")
     k1, k2, k3, k4 = (value / first for value in higher)
@@ -67,8 +67,8 @@ def fit_kannala_brandt(camera: Camera) -> KannalaBrandtFit:
         height=camera.height,
         fx=camera.fx * first,
         fy=camera.fy * first,
-        cx=float(found[-2]),
-        cy=float(found[-1]),
+        cx=float(solution[-2]),
+        cy=float(solution[-1]),
         k1=k1,
         k2=k2,
         k3=k3,
@@ -83,8 +83,8 @@ def _seen(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     columns, rows = (np.linspace(0.0, size - 1.0, _GRID) for size in (camera.width, camera.height))
     # NumPy's numbers divide by zero as compiled code does, to an infinity: outside a domain a formula may.
     with np.errstate(all="ignore"):
-        found = [((u, v), unproject_point(camera, u, v)) for v in rows for u in columns]
-    seen = [(uv, (x, y, z)) for uv, (x, y, z, valid) in found if valid]
+        rays = [((u, v), unproject_point(camera, u, v)) for v in rows for u in columns]
+    seen = [(uv, (x, y, z)) for uv, (x, y, z, valid) in rays if valid]
     return np.array([uv for uv, _ in seen]).reshape(-1, 2), np.array([ray for _, ray in seen]).reshape(-1, 3)
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from coec.geometry.cameras.brown_conrady import distort, undistort
 from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import finite, sensor, within
+from coec.geometry.cameras.intrinsics import common_intrinsics, finite, within
 from coec.geometry.cameras.polynomial import monotonic_limit_squared
 
 # Calibrations of real lenses have xi of 0 to 4; far above, the image no longer depends on it.
@@ -59,7 +59,7 @@ def build(
     """A checked camera (0 <= xi <= 1000). Raises ValueError that names the field."""
     xi = within("xi", xi, 0.0, _MAX_XI)
     return Mei(
-        *sensor(width, height, fx, fy, cx, cy),
+        *common_intrinsics(width, height, fx, fy, cx, cy),
         xi,
         finite("k1", k1),
         finite("k2", k2),
@@ -86,7 +86,7 @@ def image_point(camera: Mei, x: float, y: float, z: float) -> tuple[float, float
 
 def unproject_point(camera: Mei, u: float, v: float) -> tuple[float, float, float, bool]:
     """Unit ray in the camera frame of a pixel, and whether the pixel is the image of a point in the domain."""
-    mx, my, found = undistort(
+    mx, my, converged = undistort(
         camera.k1,
         camera.k2,
         camera.p1,
@@ -99,4 +99,4 @@ def unproject_point(camera: Mei, u: float, v: float) -> tuple[float, float, floa
     radius2 = mx * mx + my * my
     discriminant = 1.0 + (1.0 - camera.xi * camera.xi) * radius2  # negative: outside the sphere's silhouette
     factor = (camera.xi + math.sqrt(max(discriminant, 0.0))) / (1.0 + radius2)
-    return guarded_ray(factor * mx, factor * my, factor - camera.xi, found & (discriminant > 0.0))
+    return guarded_ray(factor * mx, factor * my, factor - camera.xi, converged & (discriminant > 0.0))

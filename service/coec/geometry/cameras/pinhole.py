@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import sensor
+from coec.geometry.cameras.intrinsics import common_intrinsics
 
 
 class Pinhole(NamedTuple):
@@ -19,7 +19,7 @@ class Pinhole(NamedTuple):
 
 def build(*, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Pinhole:
     """A checked camera. Raises ValueError that names the field."""
-    return Pinhole(*sensor(width, height, fx, fy, cx, cy))
+    return Pinhole(*common_intrinsics(width, height, fx, fy, cx, cy))
 
 
 def image_point(camera: Pinhole, x: float, y: float, z: float) -> tuple[float, float, bool]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from coec.geometry.cameras.brown_conrady import distort, undistort
 from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import finite, sensor
+from coec.geometry.cameras.intrinsics import common_intrinsics, finite
 from coec.geometry.cameras.polynomial import monotonic_limit_squared
 
 
@@ -45,7 +45,7 @@ def build(
 ) -> RadTan:
     """A checked camera. Raises ValueError that names the field."""
     return RadTan(
-        *sensor(width, height, fx, fy, cx, cy),
+        *common_intrinsics(width, height, fx, fy, cx, cy),
         finite("k1", k1),
         finite("k2", k2),
         finite("p1", p1),
@@ -69,7 +69,7 @@ def image_point(camera: RadTan, x: float, y: float, z: float) -> tuple[float, fl
 
 def unproject_point(camera: RadTan, u: float, v: float) -> tuple[float, float, float, bool]:
     """Unit ray in the camera frame of a pixel, and whether the pixel is the image of a point in the domain."""
-    mx, my, found = undistort(
+    mx, my, converged = undistort(
         camera.k1,
         camera.k2,
         camera.p1,
@@ -79,4 +79,4 @@ def unproject_point(camera: RadTan, u: float, v: float) -> tuple[float, float, f
         (u - camera.cx) / camera.fx,
         (v - camera.cy) / camera.fy,
     )
-    return guarded_ray(mx, my, 1.0, found)
+    return guarded_ray(mx, my, 1.0, converged)

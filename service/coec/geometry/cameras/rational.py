@@ -18,7 +18,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import finite, sensor
+from coec.geometry.cameras.intrinsics import common_intrinsics, finite
 from coec.geometry.cameras.polynomial import first_positive_root
 
 # Most doublings that find the bracket, and most halvings of it, as in `polynomial`.
@@ -70,7 +70,7 @@ def build(
     above = np.array([1.0, finite("k1", k1), finite("k2", k2), finite("k3", k3)])
     below = np.array([1.0, finite("k4", k4), finite("k5", k5), finite("k6", k6)])
     return Rational(
-        *sensor(width, height, fx, fy, cx, cy),
+        *common_intrinsics(width, height, fx, fy, cx, cy),
         float(k1),
         float(k2),
         finite("p1", p1),

@@ -49,5 +49,5 @@ def pixel_rad(camera: Camera) -> float:
     """The angle that a pixel on the optical axis covers, radians; the larger one if rows and columns differ. It is
     measured by projection, because the focal length of a fisheye is not in pixels per radian."""
     u, v, _ = project_point(camera, 0.0, 0.0, 1.0)
-    beside = project_point(camera, _STEP, 0.0, 1.0), project_point(camera, 0.0, _STEP, 1.0)
-    return _STEP / min(math.hypot(right - u, down - v) for right, down, _ in beside)
+    neighbours = project_point(camera, _STEP, 0.0, 1.0), project_point(camera, 0.0, _STEP, 1.0)
+    return _STEP / min(math.hypot(right - u, down - v) for right, down, _ in neighbours)

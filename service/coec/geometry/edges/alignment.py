@@ -46,13 +46,13 @@ class EdgeFrames:
     first_point: NDArray[np.int64]
     maps: NDArray[np.int8]
 
-    def of_points(self, kept: NDArray[np.int64]) -> EdgeFrames:
+    def of_points(self, indices: NDArray[np.int64]) -> EdgeFrames:
         """The range edges with the given indices, ascending, on the same maps."""
         return replace(
             self,
-            xyz_m=np.ascontiguousarray(self.xyz_m[:, kept]),
-            weight=self.weight[kept],
-            first_point=np.searchsorted(kept, self.first_point).astype(np.int64),
+            xyz_m=np.ascontiguousarray(self.xyz_m[:, indices]),
+            weight=self.weight[indices],
+            first_point=np.searchsorted(indices, self.first_point).astype(np.int64),
         )
 
 
@@ -195,8 +195,8 @@ def _smooth_sums(
     for task in prange(poses.shape[0] * frames):
         k, f = task // frames, task % frames
         pose = poses[k, min(np.int64(f), poses.shape[1] - 1)]
-        told, square = smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[f])
-        sums[k, f, 0], sums[k, f, 1] = told, square
+        strength, square = smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[f])
+        sums[k, f, 0], sums[k, f, 1] = strength, square
     return sums
 
 
@@ -233,14 +233,14 @@ def _late_sums(
     sums = np.empty((poses.shape[0], frames, 2))
     for task in prange(poses.shape[0] * frames):
         k, f = task // frames, task % frames
-        told, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
+        strength, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
         edges, block, moved_m = maps[f].ravel(), _block(), np.empty((3, BLOCK), np.float32)
         for begin in range(first_point[f], first_point[f + 1], BLOCK):
             end = min(begin + BLOCK, first_point[f + 1])
             _pass_by(xyz[:, begin:end], passing[:, begin:end], share[:, begin:end], late_s[k], moved_m)
             x, y, z = moved_m[0, : end - begin], moved_m[1, : end - begin], moved_m[2, : end - begin]
-            _add(told, square, *_between(camera, poses[k], x, y, z, weight[begin:end], edges, block))
-        sums[k, f, 0], sums[k, f, 1] = _total(told) / STRENGTH_STEPS, _total(square)
+            _add(strength, square, *_between(camera, poses[k], x, y, z, weight[begin:end], edges, block))
+        sums[k, f, 0], sums[k, f, 1] = _total(strength) / STRENGTH_STEPS, _total(square)
     return sums
 
 
@@ -271,13 +271,13 @@ def smooth_sums_of_frame(
 ) -> tuple[float, float]:
     """Σ w·e and Σ w² over the range edges of one frame, from `first` to before `last`."""
     # One sum for each place in a block, so that they are added in vector registers.
-    told, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
+    strength, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
     edges, block = edge_map.ravel(), _block()
     for begin in range(first, last, BLOCK):
         end = min(begin + BLOCK, last)
         x, y, z = xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end]
-        _add(told, square, *_between(camera, T, x, y, z, weight[begin:end], edges, block))
-    return _total(told) / STRENGTH_STEPS, _total(square)
+        _add(strength, square, *_between(camera, T, x, y, z, weight[begin:end], edges, block))
+    return _total(strength) / STRENGTH_STEPS, _total(square)
 
 
 @njit(cache=True, parallel=PRANGE, error_model="numpy")
@@ -299,10 +299,10 @@ def _smooth_sums_of_parts(
         for begin in range(first_point[f], first_point[f + 1], BLOCK):
             end = min(begin + BLOCK, first_point[f + 1])
             x, y, z = xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end]
-            told, square = _between(camera, poses[n], x, y, z, weight[begin:end], edges, block)
+            strength, square = _between(camera, poses[n], x, y, z, weight[begin:end], edges, block)
             for i in range(end - begin):
                 k = part[begin + i]
-                of_frame[k, 0] += told[i]
+                of_frame[k, 0] += strength[i]
                 of_frame[k, 1] += square[i]
         for k in range(parts):
             of_frame[k, 0] /= STRENGTH_STEPS
@@ -342,9 +342,9 @@ def _between(
         here = np.uint64(max(place[i], 0))
         below = here + width
         p[i], q[i], r[i], s[i] = edges[here], edges[here + np.uint64(1)], edges[below], edges[below + np.uint64(1)]
-    told, square = numbers[2, :n], numbers[3, :n]
-    _mix(u, v, place, p, q, r, s, weight, told, square)
-    return told, square
+    strength, square = numbers[2, :n], numbers[3, :n]
+    _mix(u, v, place, p, q, r, s, weight, strength, square)
+    return strength, square
 
 
 @njit(cache=True)
@@ -371,27 +371,27 @@ def _mix(
     r: NDArray[np.int8],
     s: NDArray[np.int8],
     weight: NDArray[np.float32],
-    told: NDArray[np.float32],
+    strength: NDArray[np.float32],
     square: NDArray[np.float32],
 ) -> None:
     """Interpolates the strengths of points (n,) and weighs them into `told`, with the squared weights in `square`. A
     point lies `right` and `down` of a pixel of strength p; q is to the right of p, r below p, and s below q. Zero if
     there is no place or if one of the four is void."""
-    for i in range(told.shape[0]):
+    for i in range(strength.shape[0]):
         seen = (place[i] >= 0) & (p[i] != VOID) & (q[i] != VOID) & (r[i] != VOID) & (s[i] != VOID)
         upper = np.float32(p[i]) + right[i] * (np.float32(q[i]) - np.float32(p[i]))
         lower = np.float32(r[i]) + right[i] * (np.float32(s[i]) - np.float32(r[i]))
         w = weight[i] if seen else np.float32(0.0)
-        told[i] = w * (upper + down[i] * (lower - upper))
+        strength[i] = w * (upper + down[i] * (lower - upper))
         square[i] = w * w
 
 
 @njit(cache=True)
 def _add(
-    told: NDArray[np.float32], square: NDArray[np.float32], more: NDArray[np.float32], squares: NDArray[np.float32]
+    strength: NDArray[np.float32], square: NDArray[np.float32], more: NDArray[np.float32], squares: NDArray[np.float32]
 ) -> None:
     for i in range(more.shape[0]):
-        told[i] += more[i]
+        strength[i] += more[i]
         square[i] += squares[i]
 
 
@@ -427,15 +427,15 @@ def _nearest_pixel_z_at(
     maps: NDArray[np.int8],
     T: NDArray[np.float32],
 ) -> float:
-    told, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
+    strength, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
     block = _block()
     for f in range(first_point.shape[0] - 1):
         edges = maps[f].ravel()
         for begin in range(first_point[f], first_point[f + 1], BLOCK):
             end = min(begin + BLOCK, first_point[f + 1])
             x, y, z = xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end]
-            _add(told, square, *_nearest(camera, T, x, y, z, weight[begin:end], edges, block))
-    return _total(told) / (STRENGTH_STEPS * math.sqrt(max(_total(square), LEAST_SQUARE)))
+            _add(strength, square, *_nearest(camera, T, x, y, z, weight[begin:end], edges, block))
+    return _total(strength) / (STRENGTH_STEPS * math.sqrt(max(_total(square), LEAST_SQUARE)))
 
 
 @njit(cache=True, error_model="numpy")
@@ -459,13 +459,13 @@ def _nearest(
         inside = (u[i] >= -half) & (v[i] >= -half) & (u[i] < right) & (v[i] < bottom)
         across, down = (u[i] if inside else half), (v[i] if inside else half)
         place[i] = np.int32(down + half) * stride + np.int32(across + half) if inside else np.int32(-1)
-    e, told, square = strengths[0, :n], numbers[2, :n], numbers[3, :n]
+    e, strength, square = strengths[0, :n], numbers[2, :n], numbers[3, :n]
     for i in range(n):
         e[i] = edges[np.uint64(max(place[i], 0))]
     for i in range(n):
         w = weight[i] if (place[i] >= 0) & (e[i] != VOID) else np.float32(0.0)
-        told[i], square[i] = w * np.float32(e[i]), w * w
-    return told, square
+        strength[i], square[i] = w * np.float32(e[i]), w * w
+    return strength, square
 
 
 @njit(cache=True, error_model="numpy")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from coec.geometry.cameras import Camera
 from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
-from coec.geometry.pixel_lookup import OUTSIDE, exact_pixel
+from coec.geometry.pixel_lookup import NOT_IN_IMAGE, exact_pixel
 from coec.geometry.projection import unproject
 
 CELLS_PER_BLUR = 2.5
@@ -131,7 +131,7 @@ def _cells(maps: NDArray[np.int8], pixel: NDArray[np.int32]) -> NDArray[np.int8]
     for f in prange(maps.shape[0]):
         first = 1 + f * per_chart
         for i in range(per_chart):
-            if pixel[i] != OUTSIDE:
+            if pixel[i] != NOT_IN_IMAGE:
                 cells[first + i] = maps[f, pixel[i]]
     return cells
 
@@ -151,7 +151,7 @@ def charted_significances(charts: EdgeCharts, poses: NDArray[np.float64]) -> NDA
     return _charted_z(*_arguments(charts), poses)
 
 
-def climb(
+def pattern_search(
     charts: EdgeCharts,
     starts: NDArray[np.float64],
     steps: NDArray[np.float64],
@@ -173,7 +173,7 @@ def climb(
     Returns:
         Poses (K, 4, 4) and their z (K,).
     """
-    ends, z = _climb(
+    ends, z = _pattern_search(
         *_arguments(charts), np.ascontiguousarray(starts), steps, halvings, np.ascontiguousarray(centre), reach
     )
     return ends, z
@@ -195,7 +195,7 @@ def _arguments(charts: EdgeCharts) -> _Arguments:
 
 @njit(cache=True, error_model="numpy")
 def _charted_z_at(
-    words: NDArray[np.int32],
+    packed: NDArray[np.int32],
     height: int,
     width: int,
     unit: np.float32,
@@ -229,7 +229,7 @@ def _charted_z_at(
     for i in range(xyz.shape[1]):
         # Take the cell's byte out of its word (the first byte is the lowest): shift it to the top, then down with sign.
         place = np.uint32(cell[i])
-        word = words[np.uint64(place >> np.uint32(2))]
+        word = packed[np.uint64(place >> np.uint32(2))]
         e = np.int32(word << (np.int32(24) - np.int32((place & np.uint32(3)) << np.uint32(3)))) >> np.int32(24)
         w = weight[i] if e != VOID else np.int32(0)
         strength += w * e
@@ -240,7 +240,7 @@ def _charted_z_at(
 
 @njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _charted_z(
-    words: NDArray[np.int32],
+    packed: NDArray[np.int32],
     height: int,
     width: int,
     unit: np.float32,
@@ -254,13 +254,13 @@ def _charted_z(
     for k in prange(poses.shape[0]):
         narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
         _narrow(poses[k], narrow)
-        z[k] = _charted_z_at(words, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
+        z[k] = _charted_z_at(packed, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
     return z
 
 
 @njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _climb(
-    words: NDArray[np.int32],
+def _pattern_search(
+    packed: NDArray[np.int32],
     height: int,
     width: int,
     unit: np.float32,
@@ -280,7 +280,7 @@ def _climb(
         pose = starts[k].copy()
         narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
         _narrow(pose, narrow)
-        best = _charted_z_at(words, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
+        best = _charted_z_at(packed, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
         step = steps.copy()
         halved, axis, last, way = 0, 0, -1, 0.0
         # Axes in a row that did not help. After six of them there is nothing left to try with these steps. After five,
@@ -295,7 +295,7 @@ def _climb(
                 if not _within(trial, centre, reach):
                     continue
                 _narrow(trial, narrow)
-                score = _charted_z_at(words, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
+                score = _charted_z_at(packed, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
                 if score > best:
                     best, pose, last, way, idle = score, trial, axis, sign, 0
                     break
@@ -359,24 +359,26 @@ def _moved(pose: NDArray[np.float64], axis: int, amount: float) -> NDArray[np.fl
 
 
 @njit(cache=True)
-def keep_apart(poses: NDArray[np.float64], order: NDArray[np.int64], count: int, limit: float) -> NDArray[np.int64]:
+def select_separated(
+    poses: NDArray[np.float64], order: NDArray[np.int64], count: int, limit: float
+) -> NDArray[np.int64]:
     """The first `count` indices of `order` whose poses (K, 4, 4) lie apart in rotation: for any two of them the trace
     of R_a·R_bᵀ is at most `limit`. The trace is 1 + 2 cos(angle), and the sum of the products of the entries."""
-    kept = np.empty(min(count, order.shape[0]), np.int64)
-    found = 0
+    selected = np.empty(min(count, order.shape[0]), np.int64)
+    number = 0
     for index in order:
         free = True
-        for k in range(found):
+        for k in range(number):
             trace = 0.0
             for i in range(3):
                 for j in range(3):
-                    trace += poses[index, i, j] * poses[kept[k], i, j]
+                    trace += poses[index, i, j] * poses[selected[k], i, j]
             if trace > limit:
                 free = False
                 break
         if free:
-            kept[found] = index
-            found += 1
-            if found == kept.shape[0]:
+            selected[number] = index
+            number += 1
+            if number == selected.shape[0]:
                 break
-    return kept[:found]
+    return selected[:number]

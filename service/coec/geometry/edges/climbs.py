@@ -21,7 +21,7 @@ MAX_SWEEPS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Climb:
+class AscentStart:
     """The start of a climb: a pose (4, 4), and its frames, from `first` to before `last`."""
 
     pose: NDArray[np.float64]
@@ -37,7 +37,7 @@ class Summit:
     score: float
 
 
-def climbed(frames: EdgeFrames, climbs: list[Climb], moves: NDArray[np.float64]) -> list[Summit]:
+def ascend(frames: EdgeFrames, starts: list[AscentStart], moves: NDArray[np.float64]) -> list[Summit]:
     """The end of each climb. A climb tries every move in turn, on the left of the pose, and keeps those that help. When
     none helps it goes on with the finer moves, and after the finest it ends.
 
@@ -46,9 +46,9 @@ def climbed(frames: EdgeFrames, climbs: list[Climb], moves: NDArray[np.float64])
         climbs: where they begin.
         moves: (L, M, 4, 4) M moves for each of L levels, from coarse to fine.
     """
-    spans = np.array([(climb.first, climb.last) for climb in climbs], np.int64)
-    poses = np.array([climb.pose for climb in climbs])
-    scores = _climb(
+    spans = np.array([(start.first, start.last) for start in starts], np.int64)
+    poses = np.array([start.pose for start in starts])
+    scores = _ascend(
         in_single_precision(frames.camera), frames.xyz_m, frames.weight, frames.first_point, frames.maps, spans, moves,
         poses,
     )  # fmt: skip
@@ -56,7 +56,7 @@ def climbed(frames: EdgeFrames, climbs: list[Climb], moves: NDArray[np.float64])
 
 
 @njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _climb(
+def _ascend(
     camera: Camera,
     xyz: NDArray[np.float32],
     weight: NDArray[np.float32],

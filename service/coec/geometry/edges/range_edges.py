@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.bearings import Bearings, bearings
 from coec.geometry.compiler import PRANGE, njit, prange
-from coec.geometry.edges.scan_lines import BAND_RAD, telling
+from coec.geometry.edges.scan_lines import BAND_RAD, distinct_rings
 
 BANDS = math.ceil(0.5 * math.pi / BAND_RAD)
 """Bands of elevation in a quarter of a turn, from the horizon up or down."""
@@ -35,7 +35,7 @@ NEIGHBOUR_RAD = math.radians(1.0)
 """Largest difference of azimuth between neighbours: five columns of a slow sensor. A larger gap is a hole, not a
 surface."""
 
-LOOK_AHEAD = 6
+MAX_NEIGHBOURS_TRIED = 6
 """Points of a band that are tried as the neighbour, because several rings may share a band."""
 
 MIN_JUMP_M, MIN_JUMP_SHARE = 0.5, 0.05
@@ -85,7 +85,7 @@ def range_edges(
         seen: the bearings of the points, if the caller has them.
     """
     seen = bearings(xyz_m) if seen is None else seen
-    ring = telling(ring)
+    ring = distinct_rings(ring)
     if ring is None:
         # A point without an elevation (NaN) lands in the highest band, where it is near to no other.
         band = np.fmin(np.floor(seen.elevation / BAND_RAD), BANDS - 1)
@@ -96,13 +96,13 @@ def range_edges(
     row = np.ascontiguousarray(row).view()
     row.setflags(write=False)
     # If all points of a row are on one scan line, only their order counts, not their elevation.
-    beside = same_line >= math.pi
+    one_line_per_row = same_line >= math.pi
     order, first, azimuth, elevation, range_m = _along_the_rows(
-        row, rows, seen.azimuth, seen.elevation, seen.range_m, beside
+        row, rows, seen.azimuth, seen.elevation, seen.range_m, one_line_per_row
     )
-    index, turn_rad, weight = _jumps(first, azimuth, elevation, range_m, same_line, beside)
-    found = order[index].astype(np.int64)
-    return RangeEdges(found, _about_the_axis(xyz_m[found], turn_rad), weight)
+    index, turn_rad, weight = _jumps(first, azimuth, elevation, range_m, same_line, one_line_per_row)
+    near_side = order[index].astype(np.int64)
+    return RangeEdges(near_side, _about_the_axis(xyz_m[near_side], turn_rad), weight)
 
 
 _Rows = tuple[
@@ -121,7 +121,7 @@ def _along_the_rows(
     azimuth: NDArray[np.float32],
     elevation: NDArray[np.float32],
     range_m: NDArray[np.float32],
-    beside: bool,
+    one_line_per_row: bool,
 ) -> _Rows:
     """Sorts the points, without those on the vehicle itself, by row and then by azimuth; ties keep their order. Returns
     their indices; where each row begins, (rows + 1,); and their azimuth, elevation (empty if all points of a row count
@@ -130,14 +130,14 @@ def _along_the_rows(
     A first pass examines the rows. In most sweeps they are ascending, descending, or begin in the middle of a turn, so
     that the second pass puts every point into its final place at once.
     """
-    count, begun, latest = np.zeros(rows, np.int64), np.empty(rows, np.float32), np.empty(rows, np.float32)
+    count, first_azimuth, latest = np.zeros(rows, np.int64), np.empty(rows, np.float32), np.empty(rows, np.float32)
     falls, rises = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
     fall, rise = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
     for i in range(row.shape[0]):
         if range_m[i] >= MIN_RANGE_M:
             r, angle = row[i], azimuth[i]
             if count[r] == 0:
-                begun[r] = angle
+                first_azimuth[r] = angle
             elif angle < latest[r]:
                 falls[r], fall[r] = falls[r] + 1, count[r]
             elif angle > latest[r]:
@@ -149,13 +149,13 @@ def _along_the_rows(
         first[r + 1] = first[r] + count[r]
         if falls[r] == 0:
             kind[r] = _RISING
-        elif falls[r] == 1 and latest[r] < begun[r]:
+        elif falls[r] == 1 and latest[r] < first_azimuth[r]:
             kind[r] = _TURNED
-        elif rises[r] == 0 or (rises[r] == 1 and latest[r] > begun[r]):  # the sensor turns clockwise
+        elif rises[r] == 0 or (rises[r] == 1 and latest[r] > first_azimuth[r]):  # the sensor turns clockwise
             kind[r] = _FALLING
     order = np.empty(first[rows], np.int32)
     turned, far_m = np.empty(first[rows], np.float32), np.empty(first[rows], np.float32)
-    raised = np.empty(0 if beside else first[rows], np.float32)
+    raised = np.empty(0 if one_line_per_row else first[rows], np.float32)
     following = np.zeros(rows, np.int64)
     for i in range(row.shape[0]):
         if range_m[i] >= MIN_RANGE_M:
@@ -168,7 +168,7 @@ def _along_the_rows(
                 at = rise[r] - 1 - k if k < rise[r] else rise[r] + count[r] - 1 - k
             at += first[r]
             order[at], turned[at], far_m[at] = i, azimuth[i], range_m[i]
-            if not beside:
+            if not one_line_per_row:
                 raised[at] = elevation[i]
     for r in range(rows):
         if kind[r] == _MIXED:
@@ -177,7 +177,7 @@ def _along_the_rows(
             _take(order[of_row], sequence)
             _take(turned[of_row], sequence)
             _take(far_m[of_row], sequence)
-            if not beside:
+            if not one_line_per_row:
                 _take(raised[of_row], sequence)
     return order, first, turned, raised, far_m
 
@@ -197,18 +197,18 @@ def _jumps(
     elevation: NDArray[np.float32],
     range_m: NDArray[np.float32],
     same_line: float,
-    beside: bool,
+    one_line_per_row: bool,
 ) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
     """Positions of the near sides, azimuths from there to the edge, and weights, for points (N,) in the order of
     `_along_the_rows`."""
     rows, count = first.shape[0] - 1, azimuth.shape[0]
     index, turn_rad = np.empty(count, np.int32), np.empty(count, np.float32)
-    weight, found = np.empty(count, np.float32), np.zeros(rows, np.int64)
+    weight, jumps_in_row = np.empty(count, np.float32), np.zeros(rows, np.int64)
     for r in prange(rows):
         begin, end = first[r], first[r + 1]
         at = begin
         for k in range(begin, end):
-            if beside:  # quick test: skip a point without a farther neighbour
+            if one_line_per_row:  # quick test: skip a point without a farther neighbour
                 before = range_m[k - 1] if k > begin else np.float32(0.0)
                 behind = range_m[k + 1] if k + 1 < end else np.float32(0.0)
                 if (before if before > behind else behind) - range_m[k] <= MIN_JUMP_M:
@@ -216,11 +216,11 @@ def _jumps(
             least = max(MIN_JUMP_M, MIN_JUMP_SHARE * range_m[k])
             highest, sides, turn = 0.0, 0, 0.0
             for step in (-1, 1):
-                for ahead in range(1, LOOK_AHEAD + 1):
+                for ahead in range(1, MAX_NEIGHBOURS_TRIED + 1):
                     j = k + step * ahead
                     if j < begin or j >= end or abs(azimuth[j] - azimuth[k]) > NEIGHBOUR_RAD:
                         break
-                    if beside or abs(elevation[j] - elevation[k]) < same_line:
+                    if one_line_per_row or abs(elevation[j] - elevation[k]) < same_line:
                         jump = range_m[j] - range_m[k]
                         if jump > least:
                             highest = max(highest, jump)
@@ -233,15 +233,15 @@ def _jumps(
                 turn_rad[at] = turn if sides == 1 else 0.0
                 weight[at] = math.sqrt(min(highest, MAX_WEIGHT_M))
                 at += 1
-        found[r] = at - begin
-    total, kept = found.sum(), 0
-    index_kept, turn_kept = np.empty(total, np.int32), np.empty(total, np.float32)
-    weight_kept = np.empty(total, np.float32)
+        jumps_in_row[r] = at - begin
+    total, position = jumps_in_row.sum(), 0
+    packed_index, packed_turn = np.empty(total, np.int32), np.empty(total, np.float32)
+    packed_weight = np.empty(total, np.float32)
     for r in range(rows):
-        for at in range(first[r], first[r] + found[r]):
-            index_kept[kept], turn_kept[kept], weight_kept[kept] = index[at], turn_rad[at], weight[at]
-            kept += 1
-    return index_kept, turn_kept, weight_kept
+        for at in range(first[r], first[r] + jumps_in_row[r]):
+            packed_index[position], packed_turn[position], packed_weight[position] = index[at], turn_rad[at], weight[at]
+            position += 1
+    return packed_index, packed_turn, packed_weight
 
 
 def _about_the_axis(xyz_m: NDArray[np.float32], turn_rad: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ BAND_RAD = math.radians(0.42)
 narrower ones cut scan lines of a tilted sensor into pieces."""
 
 
-def telling(ring: NDArray[np.uint16] | None) -> NDArray[np.uint16] | None:
+def distinct_rings(ring: NDArray[np.uint16] | None) -> NDArray[np.uint16] | None:
     """The rings (N,) if they distinguish beams; None if there are none, or if the driver fills the field with one
     number for all beams."""
     if ring is None or not len(ring) or ring.min() == ring.max():

@@ -27,7 +27,7 @@ from coec.reports.page.blocks import (
     Text,
     Tone,
     Trend,
-    Verdict,
+    VerdictBanner,
 )
 from coec.reports.page.charts import Chart, Ground, Limit, Mark, Series
 from coec.reports.page.discs import Disc, Dot, DotKind, Ring
@@ -63,7 +63,7 @@ __all__ = [
     "Text",
     "Tone",
     "Trend",
-    "Verdict",
+    "VerdictBanner",
     "render",
     "write",
 ]

@@ -25,7 +25,7 @@ class Text:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class VerdictBanner:
     """The outcome in a sentence.
 
     Attributes:
@@ -230,7 +230,7 @@ class Facts:
     codes: frozenset[str] = frozenset()
 
 
-Block = Text | Verdict | AxesTable | Copies | Pictures | Compare | Charts | Discs | Figures | Table | Facts
+Block = Text | VerdictBanner | AxesTable | Copies | Pictures | Compare | Charts | Discs | Figures | Table | Facts
 """The `template` of a block names its file in `templates/blocks`."""
 
 

@@ -72,7 +72,7 @@ class Chart:
     x_label: str
     y_label: str
     series: tuple[Series, ...]
-    told: str
+    description: str
     grounds: tuple[Ground, ...] = ()
     marks: tuple[Mark, ...] = ()
     limits: tuple[Limit, ...] = ()
@@ -173,7 +173,7 @@ def legend(charts: Sequence[Chart]) -> list[tuple[str, str]]:
     return list(named)
 
 
-def drawn(chart: Chart, size: Size) -> Drawing:
+def layout(chart: Chart, size: Size) -> Drawing:
     """The chart at a size."""
     xs = [x for each in chart.series for x, y in each.points if isfinite(x) and isfinite(y)]
     xs += [x for each in chart.grounds for x in (each.begin, each.end)]
@@ -193,7 +193,9 @@ def drawn(chart: Chart, size: Size) -> Drawing:
     def y_of(y: float) -> float:
         return bottom - (bottom - top) * _share(y, y_low, y_high, chart.log_y)
 
-    chosen = chart.x_ticks or tuple((x, ticks.label(x)) for x in _round(x_low, x_high, chart.log_x, size.x_ticks))
+    tick_values = chart.x_ticks or tuple(
+        (x, ticks.tick_label(x)) for x in _round(x_low, x_high, chart.log_x, size.x_ticks)
+    )
     bands = (
         Path(_band([(x_of(x), y_of(low), y_of(high)) for x, low, high in each.band]), "band", number)
         for number, each in enumerate(chart.series)
@@ -211,8 +213,8 @@ def drawn(chart: Chart, size: Size) -> Drawing:
     y_marks = _round(y_low, y_high, chart.log_y, size.y_ticks)
     return Drawing(
         size=size, left=left, right=right, top=top, bottom=bottom,
-        x_ticks=_apart([Tick(round(x_of(x), 1), text) for x, text in chosen]),
-        y_ticks=tuple(Tick(round(y_of(y), 1), ticks.label(y)) for y in y_marks),
+        x_ticks=_without_overlap([Tick(round(x_of(x), 1), text) for x, text in tick_values]),
+        y_ticks=tuple(Tick(round(y_of(y), 1), ticks.tick_label(y)) for y in y_marks),
         grounds=grounds, bands=tuple(bands), paths=tuple(paths),
         marks=marks, limits=tuple(round(y_of(each.at), 1) for each in chart.limits if _shown(each.at, chart)),
     )  # fmt: skip
@@ -245,17 +247,17 @@ def _share(value: float, low: float, high: float, log: bool) -> float:
 
 
 def _round(low: float, high: float, log: bool, most: int) -> list[float]:
-    return ticks.logarithmic(low, high) if log else ticks.linear(low, high, most)
+    return ticks.logarithmic_ticks(low, high) if log else ticks.linear_ticks(low, high, most)
 
 
-def _apart(every: list[Tick]) -> tuple[Tick, ...]:
+def _without_overlap(every: list[Tick]) -> tuple[Tick, ...]:
     """The ticks whose labels do not run into each other."""
-    kept: list[Tick] = []
+    spaced: list[Tick] = []
     for tick in every:
-        room = LETTER_PX * (len(tick.label) + len(kept[-1].label)) / 2 + 6 if kept else 0.0
-        if not kept or tick.at - kept[-1].at >= room:
-            kept.append(tick)
-    return tuple(kept)
+        room = LETTER_PX * (len(tick.label) + len(spaced[-1].label)) / 2 + 6 if spaced else 0.0
+        if not spaced or tick.at - spaced[-1].at >= room:
+            spaced.append(tick)
+    return tuple(spaced)
 
 
 def _marks(every: Sequence[tuple[float, str]], right: float) -> tuple[Line, ...]:

@@ -6,10 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-SIDE = 344
+DISC_SIDE_PX = 344
 """Width and height of a drawing, px: a phone shows it without shrinking it."""
 
-RADIUS = 132.0
+DISC_RADIUS_PX = 132.0
 """Radius of the disc, px; labels stand around it."""
 
 
@@ -36,7 +36,7 @@ class Dot:
     right: float
     up: float
     kind: DotKind
-    told: str
+    description: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +60,12 @@ class Disc:
     """
 
     title: str
-    told: str
+    description: str
     compass: tuple[str, str, str, str]
     rings: tuple[Ring, ...]
     dots: tuple[Dot, ...]
 
 
-def place(dot: Dot) -> tuple[float, float]:
+def dot_position(dot: Dot) -> tuple[float, float]:
     """Place of a dot in the drawing, px from its upper left corner."""
-    return round(SIDE / 2 + RADIUS * dot.right, 1), round(SIDE / 2 - RADIUS * dot.up, 1)
+    return round(DISC_SIDE_PX / 2 + DISC_RADIUS_PX * dot.right, 1), round(DISC_SIDE_PX / 2 - DISC_RADIUS_PX * dot.up, 1)

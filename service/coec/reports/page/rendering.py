@@ -47,7 +47,7 @@ def write(path: Path, page: Page) -> Path:
         OutputError: the file cannot be written.
         DecodeError: one of its pictures cannot be decoded.
     """
-    return output.write(path, render(page).encode())
+    return output.write_output(path, render(page).encode())
 
 
 def render(page: Page) -> str:
@@ -109,8 +109,8 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     made.globals.update(
-        drawn=charts.drawn, legend=charts.legend, WIDE=charts.WIDE, NARROW=charts.NARROW, SMALL=charts.SMALL,
-        disc_place=discs.place, DISC_SIDE=discs.SIDE, DISC_RADIUS=discs.RADIUS,
+        drawn=charts.layout, legend=charts.legend, WIDE=charts.WIDE, NARROW=charts.NARROW, SMALL=charts.SMALL,
+        disc_place=discs.dot_position, DISC_SIDE=discs.DISC_SIDE_PX, DISC_RADIUS=discs.DISC_RADIUS_PX,
         trend_paths=_trend_paths, TREND_WIDTH=TREND_WIDTH, TREND_HEIGHT=TREND_HEIGHT,
     )  # fmt: skip
     made.filters["prose"] = _prose

@@ -14,7 +14,7 @@ LOG_ENOUGH = 3
 """Fewest ticks of a logarithmic axis, if its decades allow."""
 
 
-def linear(low: float, high: float, most: int) -> list[float]:
+def linear_ticks(low: float, high: float, most: int) -> list[float]:
     """Round numbers between the two ends: as many as possible, but at most `most` (2 or more)."""
     if not (isfinite(low) and isfinite(high)) or high <= low:
         return [low]
@@ -27,21 +27,21 @@ def linear(low: float, high: float, most: int) -> list[float]:
     return [low, high]
 
 
-def logarithmic(low: float, high: float) -> list[float]:
+def logarithmic_ticks(low: float, high: float) -> list[float]:
     """Round numbers between the two ends, which must be above zero."""
-    found: list[float] = []
+    values: list[float] = []
     for steps in LOG_STEPS:
-        found = [
+        values = [
             step * 10.0**decade
             for decade in range(floor(log10(low)), ceil(log10(high)) + 1)
             for step in steps
             if low * (1 - 1e-9) <= step * 10.0**decade <= high * (1 + 1e-9)
         ]
-        if len(found) >= LOG_ENOUGH:
-            return found
-    return found
+        if len(values) >= LOG_ENOUGH:
+            return values
+    return values
 
 
-def label(value: float) -> str:
+def tick_label(value: float) -> str:
     """A number in its shortest form, with a true minus."""
     return f"{value:g}".replace("-", "−")

@@ -18,12 +18,12 @@ class NotAllowedError(CoecError):
 class Authority:
     """Decides who may command a vehicle."""
 
-    def __init__(self, config: AuthorityConfig, reached_from_outside: Callable[[], str | None]) -> None:
+    def __init__(self, config: AuthorityConfig, external_access: Callable[[], str | None]) -> None:
         """`reached_from_outside()` says in a clause why programs on other computers can reach the service; None: they
         cannot."""
         self._config = config
         self._allowed = {sender.name: frozenset(sender.commands) for sender in config.senders}
-        self._reached_from_outside = reached_from_outside
+        self._external_access = external_access
 
     @property
     def senders(self) -> tuple[str, ...]:
@@ -49,10 +49,10 @@ class Authority:
             return
         why = "`authority.anonymous` is `never`"
         if self._config.anonymous == "loopback":
-            outside = self._reached_from_outside()
-            if outside is None:
+            external_access = self._external_access()
+            if external_access is None:
                 return
-            why = f"other computers may reach the service: {outside}"
+            why = f"other computers may reach the service: {external_access}"
         raise NotAllowedError(
             f"`{command}` needs a sender who proves his name: {why}. Give it with a certificate that "
             "`authority.senders` names (`coec query --zenoh FILE`)"

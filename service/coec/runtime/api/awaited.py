@@ -8,53 +8,53 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, Never
 
-from coec.adapters.exports.told import Frames
+from coec.adapters.exports.told import ExportFrames
 from coec.adapters.ros.messages import CAMERA_INFO
 from coec.adapters.zenoh.bus import Answer
-from coec.calibration.lifecycle import HealthState, Status
+from coec.calibration.lifecycle import CalibrationStatus, HealthState
 from coec.calibration.types import Reason
 from coec.config import OpenPairConfig
 from coec.errors import CoecError
 from coec.runtime.api.extrinsic import axes_of
 from coec.runtime.api.health import reasons_of
-from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.api.snapshots import SerializedReply
 from coec.runtime.decisions.incidents import Side
 from coec.runtime.nominal.findings import info_topic_of
-from coec.runtime.nominal.watch import Nominal
-from coec.runtime.outside import Outside
+from coec.runtime.nominal.watch import NominalStatus
+from coec.runtime.outside import VehicleContext
 from coec.schemas import replies
-from coec.schemas.commands import NAMES
+from coec.schemas.commands import COMMAND_NAMES
 from coec.schemas.keys import Format
 
 
-class AwaitedError(CoecError):
+class PendingPairError(CoecError):
     """The pair has no nominal calibration yet, so there is nothing to serve."""
 
     reply_code = "awaiting"
 
 
-class AwaitedAnswers:
+class PendingPairAnswers:
     """The answers of one pair. `renew` is for the main thread, once a second."""
 
-    def __init__(self, pair: OpenPairConfig, vehicle: str, outside: Outside) -> None:
+    def __init__(self, pair: OpenPairConfig, vehicle: str, context: VehicleContext) -> None:
         self.name = pair.name
         self._vehicle = vehicle
-        self._outside = outside
+        self._context = context
         self._pair = pair
         self._since_ns = time.time_ns()
         self._published: object = None
         self._fault: tuple[Reason, ...] = ()
-        self.commands = AwaitedCommands(pair.name, vehicle, lambda: _sentence(self._nominal))
+        self.commands = PendingPairCommands(pair.name, vehicle, lambda: _sentence(self._nominal))
         self.renew()
 
     @property
-    def _nominal(self) -> Nominal:
-        return self._outside.nominal(self.name)
+    def _nominal(self) -> NominalStatus:
+        return self._context.nominal(self.name)
 
     def renew(self) -> None:
         """Serialises the answers anew, and publishes what has changed."""
         awaits = self._nominal.awaits
-        reasons = (*awaits, *self._outside.vehicle_troubles(), *self._fault)
+        reasons = (*awaits, *self._context.vehicle_problems(), *self._fault)
         self.health_reply = replies.HealthReply(
             vehicle=self._vehicle,
             pair=self.name,
@@ -62,25 +62,25 @@ class AwaitedAnswers:
             level=replies.ROS_LEVELS[HealthState.UNKNOWN.value],
             reasons=reasons_of(reasons),
             metrics={},
-            axes=axes_of(None, Status.NOT_ACCEPTED),
+            axes=axes_of(None, CalibrationStatus.NOT_ACCEPTED),
             needs=(*(reason.text for reason in awaits), *self._absent()),
             data_quality=replies.DataQuality(),
             since_ns=self._since_ns,
             evaluated_ns=None,
             age_s=None,
         )
-        self._snapshot = Snapshot.of(self.health_reply)
+        self._snapshot = SerializedReply.of(self.health_reply)
         if self._published != reasons:
             self._published = reasons
-            self._outside.publish(self._outside.keys.health(self.name), self._snapshot.answer("msgpack"))
+            self._context.publish(self._context.keys.health(self.name), self._snapshot.answer("msgpack"))
 
     def _absent(self) -> list[str]:
         """A sentence for each wanted topic that nobody publishes; it lists the topics that exist."""
-        topics, pair = self._outside.topics(), self._pair
-        wanted = [(stream.topic, stream.types) for stream in pair.streams.values()]
-        wanted.append((info_topic_of(pair), (CAMERA_INFO,)))
-        told = (None if topic is None else topics.absent(topic, types) for topic, types in wanted)
-        return [sentence for sentence in told if sentence is not None]
+        topics, pair = self._context.topics(), self._pair
+        required = [(stream.topic, stream.types) for stream in pair.streams.values()]
+        required.append((info_topic_of(pair), (CAMERA_INFO,)))
+        sentences = (None if topic is None else topics.absent(topic, types) for topic, types in required)
+        return [sentence for sentence in sentences if sentence is not None]
 
     def fail(self, reason: Reason) -> None:
         """Reports that the service is about to end, for this reason."""
@@ -111,7 +111,7 @@ class AwaitedAnswers:
         del form
         self._refuse()
 
-    def exported(self, form: str, frames: Frames) -> Answer:
+    def exported(self, form: str, frames: ExportFrames) -> Answer:
         """As `extrinsic`."""
         del form, frames
         self._refuse()
@@ -151,10 +151,10 @@ class AwaitedAnswers:
         self._refuse()
 
     def _refuse(self) -> Never:
-        raise AwaitedError(_sentence(self._nominal))
+        raise PendingPairError(_sentence(self._nominal))
 
 
-class AwaitedCommands:
+class PendingPairCommands:
     """The commands of one pair: every command is understood, and refused with what is missing."""
 
     def __init__(self, pair: str, vehicle: str, sentence: Callable[[], str]) -> None:
@@ -181,7 +181,7 @@ class AwaitedCommands:
             pair=self._pair,
             command=name,
             accepted=False,
-            code=AwaitedError.reply_code,
+            code=PendingPairError.reply_code,
             text=self._sentence(),
         )
 
@@ -191,12 +191,12 @@ class AwaitedCommands:
     def note_refused(self, name: str, sender: str, why: CoecError) -> None:
         """Counts a command that its sender may not give."""
         del sender, why
-        self._count(f"{name if name in NAMES else 'unknown'}_not_allowed")
+        self._count(f"{name if name in COMMAND_NAMES else 'unknown'}_not_allowed")
 
     def _count(self, what: str) -> None:
         with self._lock:
             self._counts[what] += 1
 
 
-def _sentence(nominal: Nominal) -> str:
+def _sentence(nominal: NominalStatus) -> str:
     return " ".join(["This pair waits for its nominal calibration.", *(reason.text for reason in nominal.awaits)])

@@ -21,16 +21,16 @@ from coec.config import PairConfig
 from coec.errors import CoecError, NotFoundError
 from coec.runtime.api.extrinsic import candidate_of
 from coec.runtime.api.rate_limit import PER_S, RateLimit
-from coec.runtime.decisions.decider import Decider
-from coec.runtime.decisions.mailbox import Mailbox
+from coec.runtime.decisions.decider import CalibrationManager
+from coec.runtime.decisions.mailbox import TaskQueue
 from coec.runtime.decisions.pair_store import MIN_HASH, PairStore
-from coec.runtime.decisions.questions import Questions
+from coec.runtime.decisions.questions import JobClient
 from coec.runtime.handover import BusyError
-from coec.runtime.ingest.chooser import Chooser
+from coec.runtime.ingest.chooser import FrameSelector
 from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
-from coec.schemas.commands import CANDIDATE, NAMES, REASON
+from coec.schemas.commands import CANDIDATE, COMMAND_NAMES, REASON
 from coec.schemas.replies import Acknowledgement, Candidate
 
 _log = logging.getLogger(__name__)
@@ -52,34 +52,34 @@ class Commands:
         pair: PairConfig,
         vehicle: str,
         rig: Rig,
-        decider: Decider,
-        mailbox: Mailbox,
+        manager: CalibrationManager,
+        mailbox: TaskQueue,
         store: PairStore,
         stream: PairStream,
-        chooser: Chooser,
+        selector: FrameSelector,
         recorder: Recorder,
         folder: WindowStore,
-        questions: Questions,
+        job_client: JobClient,
     ) -> None:
         self._pair = pair
         self._vehicle = vehicle
         self._rig = rig
-        self._rules = lifecycle.Rules(pair.policy, pair.tracker, pair.monitor)
-        self._decider = decider
+        self._rules = lifecycle.PairRules(pair.policy, pair.tracker, pair.monitor)
+        self._manager = manager
         self._mailbox = mailbox
         self._store = store
         self._stream = stream
-        self._chooser = chooser
+        self._selector = selector
         self._recorder = recorder
         self._folder = folder
-        self._questions = questions
+        self._job_client = job_client
         self._rate = RateLimit()
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
 
-    def use(self, pair: PairConfig) -> None:
+    def reconfigure(self, pair: PairConfig) -> None:
         """Carries out commands by these settings from now on."""
-        self._pair, self._rules = pair, lifecycle.Rules(pair.policy, pair.tracker, pair.monitor)
+        self._pair, self._rules = pair, lifecycle.PairRules(pair.policy, pair.tracker, pair.monitor)
 
     def reserve_for(self, proven: Iterable[str]) -> None:
         """Reserves a rate for each sender who can prove his name, so that others cannot use it up. The names are those
@@ -105,12 +105,12 @@ class Commands:
             "commission": self._commission,
             "hold": partial(self._hold, sender, reason, release=bool(arguments.get("release", False))),
         }
-        begun = threading.Event()
+        started = threading.Event()
 
         def in_time(command: Callable[[], Acknowledgement]) -> Acknowledgement:
             if time.monotonic() > deadline_s:
                 raise BusyError(EXPIRED)
-            begun.set()
+            started.set()
             return command()
 
         within_s = min(TIMEOUT_S, max(deadline_s - time.monotonic(), 0.0))
@@ -121,13 +121,13 @@ class Commands:
                 acknowledged = self._acknowledge(name, "too_many", text, accepted=False)
             elif name == "calibrate":
                 acknowledged = self._noted(
-                    self._stream.ask(partial(in_time, self._calibrate), within_s), sender, reason
+                    self._stream.call_and_wait(partial(in_time, self._calibrate), within_s), sender, reason
                 )
             else:
                 decide = partial(self._decide, name, decided[name], sender, reason)
-                acknowledged = self._with_durability(self._mailbox.ask(partial(in_time, decide), within_s))
+                acknowledged = self._with_durability(self._mailbox.call_and_wait(partial(in_time, decide), within_s))
         except BusyError as error:
-            late = time.monotonic() >= deadline_s and not begun.is_set()
+            late = time.monotonic() >= deadline_s and not started.is_set()
             code, text = ("expired", EXPIRED) if late else (error.reply_code, str(error))
             fields = {"pair": self._pair.name, "command": name, "sender": sender, "code": code}
             _log.warning(f"a command was not carried out in time: {text}", extra={"fields": fields})
@@ -139,7 +139,7 @@ class Commands:
     def note_refused(self, name: str, sender: str, why: CoecError) -> None:
         """Counts a command that its sender may not give. Only the first and then every 2^n-th is logged, so that
         senders without rights cannot fill the disk."""
-        known = name if name in NAMES else "unknown"
+        known = name if name in COMMAND_NAMES else "unknown"
         with self._lock:
             self._counts[f"{known}_not_allowed"] += 1
             count = self._counts[f"{known}_not_allowed"]
@@ -182,7 +182,7 @@ class Commands:
         _log.info("a command came", extra={"fields": {**fields, "accepted": done.accepted, "code": done.code}})
         self._store.note_command(done.command, done.code, done.text, sender, accepted=done.accepted, reason=reason)
         self._store.save()
-        self._decider.tell_now()
+        self._manager.publish()
 
     def _apply(self, name: str | None) -> Acknowledgement:
         """Applies the candidate that waits. `name`: id of its window, or the beginning of its sha256; another one that
@@ -205,13 +205,15 @@ class Commands:
         return self._replaced("apply", "applied", text, waits.window_id)
 
     def _roll_back(self, to: str | None) -> Acknowledgement:
-        kept, result = self._store.served_before(to)
-        assert kept.entry.camera_from_lidar is not None  # `served_before` returns no other
-        pose, estimate = matrix_of(kept.entry.camera_from_lidar), estimate_of(result)
+        record, result = self._store.served_before(to)
+        assert record.entry.camera_from_lidar is not None  # `served_before` returns no other
+        pose, estimate = matrix_of(record.entry.camera_from_lidar), estimate_of(result)
         self._store.update(
             lambda state: lifecycle.rolled_back(state, pose, estimate, self._rules), None, completed=False
         )
-        text = f"The calibration {kept.sha256[:16]} is served again; the next accepted window may move it: see `hold`."
+        text = (
+            f"The calibration {record.sha256[:16]} is served again; the next accepted window may move it: see `hold`."
+        )
         return self._replaced("rollback", "rolled_back", text, result.window_id)
 
     def _reset(self) -> Acknowledgement:
@@ -223,18 +225,18 @@ class Commands:
         if release:
             self._store.update(lifecycle.released, None, completed=False)
             return self._acknowledge("hold", "released", "Accepted estimates may be applied again.")
-        hold = lifecycle.Hold(time.time_ns(), sender, reason or "")
+        hold = lifecycle.ExtrinsicHold(time.time_ns(), sender, reason or "")
         self._store.update(partial(lifecycle.held, hold=hold), None, completed=False)
         return self._acknowledge("hold", "held", "The extrinsic stays as it is until it is released.")
 
     def _replaced(self, name: str, code: str, text: str, window_id: str | None = None) -> Acknowledgement:
-        self._decider.replaced()
+        self._manager.replaced()
         return self._acknowledge(name, code, text, window_id=window_id)
 
     def _commission(self) -> Acknowledgement:
         """Has the worker learn the baseline from the windows that agree with what is served. A pair has one
         commissioning at a time; those of several pairs are done one after the other."""
-        reached = self._questions.commissioning
+        reached = self._job_client.commissioning
         if reached is not None:
             text = f"The rig is being commissioned already ({reached}); `history` will say how it went."
             return self._acknowledge("commission", "commissioning_underway", text, accepted=False)
@@ -250,8 +252,8 @@ class Commands:
         if not paths:
             text = "No recorded window agrees with what is served: calibrate first."
             return self._acknowledge("commission", "too_few_windows", text, accepted=False)
-        done = partial(self._decider.commissioned, tuple(path.stem for path in paths))
-        self._questions.commission(pose, paths, done)
+        done = partial(self._manager.commissioned, tuple(path.stem for path in paths))
+        self._job_client.commission(pose, paths, done)
         windows = f"{len(paths)} window{'' if len(paths) == 1 else 's'}"
         text = (
             f"The rig is being commissioned from {windows}, between checks; `status` shows how far it is, `history` "
@@ -263,13 +265,13 @@ class Commands:
 
     def _calibrate(self) -> Acknowledgement:
         """Finishes the open window now and solves it, if it has enough pairs; else solves the latest window again."""
-        lacking = self._pair.window.min_pairs - self._chooser.chosen.selected
-        if lacking <= 0 and (ended := self._chooser.finish()) is not None:
-            text = f"The window of {ended.pairs} pair{'' if ended.pairs == 1 else 's'} is being solved."
-            return self._acknowledge("calibrate", "window_finished", text, window_id=ended.window_id)
+        lacking = self._pair.window.min_pairs - self._selector.statistics.selected
+        if lacking <= 0 and (closed := self._selector.finish()) is not None:
+            text = f"The window of {closed.pairs} pair{'' if closed.pairs == 1 else 's'} is being solved."
+            return self._acknowledge("calibrate", "window_finished", text, window_id=closed.window_id)
         latest = self._recorder.latest
         if latest is not None and latest.exists():
-            self._questions.solve(latest.stem, latest, True)
+            self._job_client.solve(latest.stem, latest, True)
             text = f"The latest window is being solved again; {lacking} more pairs are needed for a new one."
             return self._acknowledge("calibrate", "window_again", text, window_id=latest.stem)
         return self._acknowledge("calibrate", "too_few_pairs", f"{lacking} more pairs needed.", accepted=False)

@@ -8,7 +8,7 @@ from coec.adapters.zenoh.endpoints import redacted
 from coec.config import Config
 
 
-def shown(config: Config) -> dict[str, Any]:
+def redacted_configuration(config: Config) -> dict[str, Any]:
     """The configuration as JSON-like values. Keys and passwords in endpoints are hidden. The content of `zenoh.file` is
     not read."""
     document = config.model_dump(mode="json")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.adapters.files.conversions import intrinsics_of, number_or_null, transform_of
-from coec.calibration.lifecycle import PairState, Status
+from coec.calibration.lifecycle import CalibrationStatus, PairState
 from coec.calibration.lifecycle.policy import step_between
 from coec.calibration.types import Rig, Uncertainty
 from coec.geometry import se3
@@ -21,7 +21,7 @@ AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 UNITS: tuple[Literal["deg", "m"], ...] = ("deg", "deg", "deg", "m", "m", "m")
 
 
-def axes_of(result: CalibrationResult | None, status: Status) -> replies.Axes:
+def axes_of(result: CalibrationResult | None, status: CalibrationStatus) -> replies.Axes:
     """Correction and standard deviation per axis, of a result or (None) of the nominal calibration."""
 
     def axis(index: int) -> replies.AxisReply:
@@ -37,7 +37,7 @@ def axes_of(result: CalibrationResult | None, status: Status) -> replies.Axes:
     return replies.Axes(rx=axis(0), ry=axis(1), rz=axis(2), tx=axis(3), ty=axis(4), tz=axis(5))
 
 
-def _axis_status(result: CalibrationResult, index: int, status: Status) -> replies.AxisStatus:
+def _axis_status(result: CalibrationResult, index: int, status: CalibrationStatus) -> replies.AxisStatus:
     if result.unobservable[index]:
         return "not_observable"
     return status.value if result.solved[index] else "not_solved"
@@ -123,15 +123,15 @@ def uncertainty_of_served(state: PairState) -> Uncertainty | None:
 def axes_of_served(state: PairState, rig: Rig, accepted: CalibrationResult | None) -> replies.Axes:
     """Correction and standard deviation per axis of what is served: those of the track if it holds more than one
     window."""
-    axes = axes_of(accepted, Status.ACCEPTED)
+    axes = axes_of(accepted, CalibrationStatus.ACCEPTED)
     if accepted is None or state.track is None or state.track.windows <= 1:
         return axes
     correction = degrees_and_metres(step_between(rig.T_camera_lidar_nominal, state.T_camera_lidar))
     sigma = degrees_and_metres(state.track.uncertainty.sigma)
-    told = {
+    updated = {
         name: getattr(axes, name).model_copy(
             update={"correction": correction[index], "sigma": sigma[index] if accepted.solved[index] else None}
         )
         for index, name in enumerate(AXES)
     }
-    return replies.Axes(**told)
+    return replies.Axes(**updated)

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from coec.adapters.files.conversions import degrees_or_null, result_of
-from coec.calibration.commissioning.baseline import Drift
+from coec.calibration.commissioning.baseline import BaselineDrift
 from coec.calibration.lifecycle import AlarmRecord, Health, HealthState
 from coec.calibration.types import Decision, Estimate, Reason, Rig
 from coec.config import PairConfig
 from coec.runtime.api.extrinsic import axes_of
-from coec.runtime.decisions.decider import HELD, Known
+from coec.runtime.decisions.decider import HELD, PairSnapshot
 from coec.runtime.ingest.decoder import EGO
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
@@ -29,7 +29,7 @@ OLD_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class StampedReply:
     """A reply, and the time (steady clock) at which it was made."""
 
     reply: replies.HealthReply
@@ -44,17 +44,17 @@ class Told:
         text = (
             f"What the service knows of this pair has not been renewed for {age_s:.0f} s: a disk or a thread is stuck."
         )
-        stuck = replies.Reason(code=replies.STUCK, text=text)
+        stuck = replies.Reason(code=replies.SERVICE_STUCK, text=text)
         return self.reply.model_copy(
             update={"state": state, "level": replies.ROS_LEVELS[state], "reasons": (*self.reply.reasons, stuck)}
         )
 
 
 def health_of(
-    known: Known,
+    known: PairSnapshot,
     report: StreamStatistics,
     losses: Mapping[tuple[str, str], int],
-    troubles: tuple[Reason, ...],
+    problems: tuple[Reason, ...],
     missed: tuple[str, ...],
     pair: PairConfig,
     rig: Rig,
@@ -69,7 +69,7 @@ def health_of(
     """
     latest = known.state.latest
     result = None if latest is None else result_of(latest, rig, vehicle)
-    health = with_troubles(Health(known.state.health, known.state.reasons), (*known.troubles, *troubles))
+    health = with_problems(Health(known.state.health, known.state.reasons), (*known.problems, *problems))
     drift, result_drift = known.drift, known.result_drift
     return replies.HealthReply(
         vehicle=vehicle,
@@ -102,19 +102,19 @@ def _alarms_of(record: AlarmRecord) -> replies.Alarms:
     )
 
 
-def with_troubles(health: Health, troubles: tuple[Reason, ...]) -> Health:
+def with_problems(health: Health, problems: tuple[Reason, ...]) -> Health:
     """The health with troubles of the service added to its reasons. They make a healthy pair degraded, except for
     those that say nothing about its calibration."""
-    if not troubles:
+    if not problems:
         return health
-    worse = health.state is HealthState.HEALTHY and any(reason.code not in HARMLESS for reason in troubles)
-    return Health(HealthState.DEGRADED if worse else health.state, (*health.reasons, *troubles))
+    worse = health.state is HealthState.HEALTHY and any(reason.code not in HARMLESS for reason in problems)
+    return Health(HealthState.DEGRADED if worse else health.state, (*health.reasons, *problems))
 
 
 def needs_of(report: StreamStatistics, pair: PairConfig, latest: Estimate | None) -> tuple[str, ...]:
     """What is still missing, one sentence each. `latest` is the last estimate."""
     needs = []
-    lacking = pair.window.min_pairs - report.chosen.selected
+    lacking = pair.window.min_pairs - report.selection.selected
     if lacking > 0:
         needs.append(f"{lacking} more pairs")
     if latest is not None and latest.verdict.decision is Decision.FAILED:
@@ -132,10 +132,10 @@ def needs_of(report: StreamStatistics, pair: PairConfig, latest: Estimate | None
 
 def data_quality_of(report: StreamStatistics, losses: Mapping[tuple[str, str], int]) -> replies.DataQuality:
     """The quality of the streams."""
-    chosen, quality = report.chosen, report.chosen.quality
+    selection, quality = report.selection, report.selection.quality
     drops = drops_of(losses, report.unpaired)
-    if chosen.rejections:
-        drops["pairs"] = dict(chosen.rejections)
+    if selection.rejections:
+        drops["pairs"] = dict(selection.rejections)
     return replies.DataQuality(
         pair_rate_hz=report.rate_hz,
         sync_error_s=report.sync_error_s,
@@ -143,7 +143,7 @@ def data_quality_of(report: StreamStatistics, losses: Mapping[tuple[str, str], i
         sharpness=quality.sharpness if quality else None,
         mean_level=quality.mean_level if quality else None,
         clipped=quality.clipped if quality else None,
-        frozen_image=chosen.frozen,
+        frozen_image=selection.frozen,
         point_times=report.timed_by,
     )
 
@@ -165,9 +165,9 @@ def drops_of(losses: Mapping[tuple[str, str], int], unpaired: Mapping[str, int])
     return drops
 
 
-def _value(drift: Drift | None) -> replies.Maybe6 | None:
+def _value(drift: BaselineDrift | None) -> replies.Maybe6 | None:
     return None if drift is None else degrees_or_null(drift.value)
 
 
-def _sigma(drift: Drift | None) -> replies.Maybe6 | None:
+def _sigma(drift: BaselineDrift | None) -> replies.Maybe6 | None:
     return None if drift is None else degrees_or_null(drift.sigma)

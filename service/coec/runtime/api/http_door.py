@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from coec.adapters.system.http import HttpServer, Page, Request
+from coec.adapters.system.http import HttpRequest, HttpResponse, HttpServer
 from coec.calibration.types import Reason
 from coec.config import MetricsConfig
 from coec.errors import UnavailableError
@@ -16,7 +16,7 @@ STOP_S = 1.0
 """Time for the thread to end, s: it looks five times a second."""
 
 
-class HttpDoor:
+class MetricsServer:
     """The HTTP server, which the main thread opens, moves and closes. Metrics are for people who look after the
     service. If they cannot be served, that is reported, but the service calibrates all the same.
 
@@ -26,27 +26,27 @@ class HttpDoor:
         insecure: the reason to report if other computers can reach the server; else None.
     """
 
-    def __init__(self, find: Callable[[Request], Page | None]) -> None:
+    def __init__(self, find: Callable[[HttpRequest], HttpResponse | None]) -> None:
         """`find(request)` makes a page; see `HttpServer`."""
         self._find = find
         self._config = MetricsConfig()
         self.server: HttpServer | None = None
-        self.trouble: Reason | None = None
+        self.problem: Reason | None = None
         self.insecure: Reason | None = None
 
-    def use(self, config: MetricsConfig) -> None:
+    def reconfigure(self, config: MetricsConfig) -> None:
         """Answers at the address of this configuration, and nowhere else."""
-        if config == self._config and self.trouble is None:
+        if config == self._config and self.problem is None:
             return
         self.close(STOP_S)
-        self._config, self.trouble, self.insecure = config, None, None
+        self._config, self.problem, self.insecure = config, None, None
         if config.address is None:
             return
         try:
             self.server = HttpServer(*config.address, self._find)
         except UnavailableError as error:
-            self.trouble = Reason("http_unavailable", f"Metrics are not served over HTTP: {error}.")
-            _log.error(self.trouble.text)
+            self.problem = Reason("http_unavailable", f"Metrics are not served over HTTP: {error}.")
+            _log.error(self.problem.text)
             return
         self.server.thread.start()
         _log.info(f"metrics at http://{config.http}/metrics, health at /health, liveness at /live")

@@ -10,7 +10,7 @@ from typing import Literal
 from coec.adapters.zenoh.bus import Answer
 from coec.config import UplinkConfig
 from coec.errors import NotFoundError
-from coec.runtime.api.awaited import AwaitedAnswers
+from coec.runtime.api.awaited import PendingPairAnswers
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.snapshots import answer_of
 from coec.schemas.keys import Format, Keys
@@ -20,7 +20,7 @@ from coec.schemas.replies import Maybe6, Vector6
 ServiceState = Literal["starting", "running", "stopping", "failing"]
 
 
-class LastWords:
+class Heartbeats:
     """The last words of one vehicle. `renew` and `use` are for the main thread, `answer` for any."""
 
     def __init__(
@@ -37,24 +37,26 @@ class LastWords:
         self._config = config
         self._publish = publish
         self._clock = clock
-        self._words: dict[str, LastWord] = {}
+        self._latest: dict[str, LastWord] = {}
         self._published: dict[str, tuple[object, float]] = {}
 
-    def use(self, config: UplinkConfig) -> None:
+    def reconfigure(self, config: UplinkConfig) -> None:
         """Publishes as often as this configuration says."""
         self._config = config
 
-    def renew(self, service: ServiceState, config_hash: str, answering: Iterable[PairAnswers | AwaitedAnswers]) -> None:
+    def renew(
+        self, service: ServiceState, config_hash: str, answering: Iterable[PairAnswers | PendingPairAnswers]
+    ) -> None:
         """Makes the present word of each pair, and publishes it if it has changed or was not published for a period."""
         now_s = self._clock()
         for answers in answering:
-            word = self._word_of(service, config_hash, answers)
-            self._words[word.pair] = word
-            essence = _essence(word)
-            before, said_s = self._published.get(word.pair, (None, 0.0))
-            if essence != before or now_s - said_s >= self._config.last_word_s:
-                self._published[word.pair] = (essence, now_s)
-                self._publish(self._keys.last(word.pair), answer_of(word, "msgpack"))
+            heartbeat = self._heartbeat_of(service, config_hash, answers)
+            self._latest[heartbeat.pair] = heartbeat
+            essence = _essence(heartbeat)
+            before, published_s = self._published.get(heartbeat.pair, (None, 0.0))
+            if essence != before or now_s - published_s >= self._config.last_word_s:
+                self._published[heartbeat.pair] = (essence, now_s)
+                self._publish(self._keys.last(heartbeat.pair), answer_of(heartbeat, "msgpack"))
 
     def answer(self, pair: str, form: Format) -> Answer:
         """The present word of a pair.
@@ -62,12 +64,14 @@ class LastWords:
         Raises:
             NotFoundError: there is no such pair.
         """
-        word = self._words.get(pair)
-        if word is None:
+        heartbeat = self._latest.get(pair)
+        if heartbeat is None:
             raise NotFoundError("no pair of this name has reported anything")
-        return answer_of(word, form)
+        return answer_of(heartbeat, form)
 
-    def _word_of(self, service: ServiceState, config_hash: str, answers: PairAnswers | AwaitedAnswers) -> LastWord:
+    def _heartbeat_of(
+        self, service: ServiceState, config_hash: str, answers: PairAnswers | PendingPairAnswers
+    ) -> LastWord:
         health = answers.health_reply
         built = answers if isinstance(answers, PairAnswers) else None
         extrinsic = None if built is None else built.extrinsic_reply
@@ -108,8 +112,16 @@ class LastWords:
         )
 
 
-def _essence(word: LastWord) -> object:
+def _essence(heartbeat: LastWord) -> object:
     """The part of a word whose change makes it published at once."""
-    codes = tuple(reason.code for reason in word.reasons)
-    served = (word.provenance, word.status, word.correction, word.held)
-    return (word.service, word.config_hash, word.state, codes, word.since_ns, served, word.event)
+    codes = tuple(reason.code for reason in heartbeat.reasons)
+    served = (heartbeat.provenance, heartbeat.status, heartbeat.correction, heartbeat.held)
+    return (
+        heartbeat.service,
+        heartbeat.config_hash,
+        heartbeat.state,
+        codes,
+        heartbeat.since_ns,
+        served,
+        heartbeat.event,
+    )

@@ -35,12 +35,12 @@ class TextFormat(Enum):
     `info` and `stateset`, which become gauges, and its families carry the names of their samples."""
 
 
-Sample = tuple[tuple[str, ...], float]
+MetricSample = tuple[tuple[str, ...], float]
 """Values of a family's labels in their order, and the value of the sample."""
 
 
 @dataclass(frozen=True, slots=True)
-class Took:
+class LabelledHistogram:
     """Durations of one part of the service. `label` names the part, in front of the histogram's own labels; it may be
     empty."""
 
@@ -49,7 +49,7 @@ class Took:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class MetricsInput:
     """Everything that the metrics show at one moment.
 
     Attributes:
@@ -65,7 +65,7 @@ class View:
     health: Mapping[str, HealthReply]
     memory_bytes: int = 0
     worker_memory_bytes: int = 0
-    took: Mapping[str, Sequence[Took]] = field(default_factory=dict)
+    durations: Mapping[str, Sequence[LabelledHistogram]] = field(default_factory=dict)
     rig: RigReply | None = None
     uplink: Uplink | None = None
 
@@ -78,7 +78,7 @@ class Family:
     kind: Literal["counter", "gauge", "histogram", "info", "stateset"]
     help: str
     labels: tuple[str, ...] = ()
-    samples: Callable[[View], Iterable[Sample]] = lambda _: ()
+    samples: Callable[[MetricsInput], Iterable[MetricSample]] = lambda _: ()
 
     @property
     def unit(self) -> str:
@@ -90,7 +90,7 @@ class Family:
         """Suffix of the names of its samples; those of a histogram have several."""
         return {"counter": "_total", "info": "_info"}.get(self.kind, "")
 
-    def lines(self, view: View, text_format: TextFormat) -> Iterable[str]:
+    def lines(self, view: MetricsInput, text_format: TextFormat) -> Iterable[str]:
         """The lines of the family."""
         if text_format is TextFormat.OPEN_METRICS:
             yield f"# TYPE {self.name} {self.kind}"
@@ -107,11 +107,11 @@ class Family:
         for values, value in self.samples(view):
             yield f"{self.name}{self.suffix}{_braces(self.labels, values)} {_number(value)}"
 
-    def _buckets(self, view: View) -> Iterable[str]:
-        for took in view.took.get(self.name, ()):
-            bounds = (*took.histogram.bounds_s, math.inf)
-            for values, counted in sorted(took.histogram.counted().items()):
-                own = (*took.label, *values)
+    def _buckets(self, view: MetricsInput) -> Iterable[str]:
+        for labelled in view.durations.get(self.name, ()):
+            bounds = (*labelled.histogram.bounds_s, math.inf)
+            for values, counted in sorted(labelled.histogram.counted().items()):
+                own = (*labelled.label, *values)
                 sums = list(accumulate(counted.counts))
                 for bound_s, count in zip(bounds, sums, strict=True):
                     labels = _braces((*self.labels, "le"), (*own, _number(bound_s)))
@@ -120,7 +120,7 @@ class Family:
                 yield f"{self.name}_sum{_braces(self.labels, own)} {_number(counted.sum_s)}"
 
 
-def render(view: View, text_format: TextFormat = TextFormat.OPEN_METRICS) -> bytes:
+def render(view: MetricsInput, text_format: TextFormat = TextFormat.OPEN_METRICS) -> bytes:
     """The text in a format, UTF-8."""
     lines = [line for family in FAMILIES for line in family.lines(view, text_format)]
     end = ["# EOF"] if text_format is TextFormat.OPEN_METRICS else []
@@ -130,29 +130,29 @@ def render(view: View, text_format: TextFormat = TextFormat.OPEN_METRICS) -> byt
 # --- samples --------------------------------------------------------------------------------------------------------
 
 
-def _one(value: Callable[[View], float | None]) -> Callable[[View], Iterable[Sample]]:
-    def samples(view: View) -> Iterable[Sample]:
-        told = value(view)
-        return () if told is None else (((), float(told)),)
+def _one(value: Callable[[MetricsInput], float | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
+    def samples(view: MetricsInput) -> Iterable[MetricSample]:
+        number = value(view)
+        return () if number is None else (((), float(number)),)
 
     return samples
 
 
-def _per_pair(value: Callable[[PairStatus], float]) -> Callable[[View], Iterable[Sample]]:
+def _per_pair(value: Callable[[PairStatus], float]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
     return lambda view: (((pair.name,), float(value(pair))) for pair in view.status.pairs)
 
 
-def _counts(counts: Callable[[PairStatus], Mapping[str, int]]) -> Callable[[View], Iterable[Sample]]:
+def _counts(counts: Callable[[PairStatus], Mapping[str, int]]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
     return lambda view: (
         ((pair.name, name), float(count)) for pair in view.status.pairs for name, count in counts(pair).items()
     )
 
 
-def _of_worker(counts: Callable[[View], Mapping[str, int]]) -> Callable[[View], Iterable[Sample]]:
+def _of_worker(counts: Callable[[MetricsInput], Mapping[str, int]]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
     return lambda view: (((name,), float(count)) for name, count in counts(view).items())
 
 
-def _of_uplink(counts: Callable[[Uplink], Mapping[str, int]]) -> Callable[[View], Iterable[Sample]]:
+def _of_uplink(counts: Callable[[Uplink], Mapping[str, int]]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
     return lambda view: (
         ()
         if view.uplink is None
@@ -162,89 +162,91 @@ def _of_uplink(counts: Callable[[Uplink], Mapping[str, int]]) -> Callable[[View]
 
 def _of_budget(
     figures: Callable[[BudgetStatus], Mapping[tuple[str, ...], float | None]],
-) -> Callable[[View], Iterable[Sample]]:
-    def samples(view: View) -> Iterable[Sample]:
+) -> Callable[[MetricsInput], Iterable[MetricSample]]:
+    def samples(view: MetricsInput) -> Iterable[MetricSample]:
         if view.status.budget is not None:
-            for labels, told in figures(view.status.budget).items():
-                if told is not None:
-                    yield labels, float(told)
+            for labels, number in figures(view.status.budget).items():
+                if number is not None:
+                    yield labels, float(number)
 
     return samples
 
 
-def _streams(value: Callable[[StreamStatus], float | None]) -> Callable[[View], Iterable[Sample]]:
-    def samples(view: View) -> Iterable[Sample]:
+def _streams(value: Callable[[StreamStatus], float | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
+    def samples(view: MetricsInput) -> Iterable[MetricSample]:
         for pair in view.status.pairs:
             for name, stream in (("camera", pair.camera), ("lidar", pair.lidar), ("ego", pair.ego)):
-                told = None if stream is None else value(stream)
-                if told is not None:
-                    yield (pair.name, name), float(told)
+                number = None if stream is None else value(stream)
+                if number is not None:
+                    yield (pair.name, name), float(number)
 
     return samples
 
 
-def _version(view: View) -> Iterable[Sample]:
+def _version(view: MetricsInput) -> Iterable[MetricSample]:
     yield (view.status.version,), 1.0
 
 
-def _states(view: View) -> Iterable[Sample]:
+def _states(view: MetricsInput) -> Iterable[MetricSample]:
     for pair, reply in view.health.items():
         for state in HealthState:
             yield (pair, state.value), float(state == reply.state)
 
 
-def _sensor_states(view: View) -> Iterable[Sample]:
+def _sensor_states(view: MetricsInput) -> Iterable[MetricSample]:
     for sensor in () if view.rig is None else view.rig.sensors:
         for state in get_args(SensorState):
             yield (sensor.name, state), float(state == sensor.state)
 
 
-def _of_rig(value: Callable[[RigReply], Mapping[tuple[str, ...], float | None]]) -> Callable[[View], Iterable[Sample]]:
-    def samples(view: View) -> Iterable[Sample]:
-        told = {} if view.rig is None else value(view.rig)
-        return tuple((labels, float(figure)) for labels, figure in told.items() if figure is not None)
+def _of_rig(
+    value: Callable[[RigReply], Mapping[tuple[str, ...], float | None]],
+) -> Callable[[MetricsInput], Iterable[MetricSample]]:
+    def samples(view: MetricsInput) -> Iterable[MetricSample]:
+        numbers = {} if view.rig is None else value(view.rig)
+        return tuple((labels, float(figure)) for labels, figure in numbers.items() if figure is not None)
 
     return samples
 
 
-def _reasons(view: View) -> Iterable[Sample]:
+def _reasons(view: MetricsInput) -> Iterable[MetricSample]:
     for pair, reply in view.health.items():
         for code in sorted({reason.code for reason in reply.reasons}):
             yield (pair, code), 1.0
 
 
-def _alarms(view: View) -> Iterable[Sample]:
+def _alarms(view: MetricsInput) -> Iterable[MetricSample]:
     for pair, reply in view.health.items():
         if reply.alarms is not None:
             yield (pair, "confirmed"), float(reply.alarms.confirmed)
             yield (pair, "withdrawn"), float(reply.alarms.withdrawn)
 
 
-def _of_health(value: Callable[[HealthReply], float | None]) -> Callable[[View], Iterable[Sample]]:
-    def samples(view: View) -> Iterable[Sample]:
+def _of_health(value: Callable[[HealthReply], float | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
+    def samples(view: MetricsInput) -> Iterable[MetricSample]:
         for pair, reply in view.health.items():
-            told = value(reply)
-            if told is not None:
-                yield (pair,), told
+            number = value(reply)
+            if number is not None:
+                yield (pair,), number
 
     return samples
 
 
-def _figures(which: Literal["value", "limit"]) -> Callable[[View], Iterable[Sample]]:
-    def samples(view: View) -> Iterable[Sample]:
+def _figures(which: Literal["value", "limit"]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
+    def samples(view: MetricsInput) -> Iterable[MetricSample]:
         for pair, reply in view.health.items():
             for name, metric in sorted(reply.metrics.items()):
-                told = metric.value if which == "value" else metric.limit
-                if told is not None:
-                    yield (pair, name), told
+                number = metric.value if which == "value" else metric.limit
+                if number is not None:
+                    yield (pair, name), number
 
     return samples
 
 
-def _axes(choose: Callable[[HealthReply], Maybe6 | None]) -> Callable[[View], Iterable[Sample]]:
+def _axes(choose: Callable[[HealthReply], Maybe6 | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
     """Samples by pair, axis and unit, without unknown values."""
 
-    def samples(view: View) -> Iterable[Sample]:
+    def samples(view: MetricsInput) -> Iterable[MetricSample]:
         for pair, reply in view.health.items():
             for axis, unit, value in zip(AXES, UNITS, choose(reply) or (), strict=False):
                 if value is not None:
@@ -253,17 +255,17 @@ def _axes(choose: Callable[[HealthReply], Maybe6 | None]) -> Callable[[View], It
     return samples
 
 
-def _check_axes(choose: Callable[[CheckReply], Maybe6 | None]) -> Callable[[View], Iterable[Sample]]:
+def _check_axes(choose: Callable[[CheckReply], Maybe6 | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
     return _axes(lambda reply: None if reply.check is None else choose(reply.check))
 
 
-def _derivatives(choose: Callable[[CheckReply], Maybe6]) -> Callable[[View], Iterable[Sample]]:
+def _derivatives(choose: Callable[[CheckReply], Maybe6]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
     """Samples by pair and axis, without the unit, which the help line names."""
     by_unit = _check_axes(choose)
     return lambda view: (((pair, axis), value) for (pair, axis, _), value in by_unit(view))
 
 
-def _losses(view: View) -> Iterable[Sample]:
+def _losses(view: MetricsInput) -> Iterable[MetricSample]:
     for pair in view.status.pairs:
         places = {
             "camera": pair.camera.losses,
@@ -277,7 +279,7 @@ def _losses(view: View) -> Iterable[Sample]:
                 yield (pair.name, place, cause), float(count)
 
 
-def _job_age(view: View) -> Iterable[Sample]:
+def _job_age(view: MetricsInput) -> Iterable[MetricSample]:
     worker = view.status.worker
     return () if worker.job_age_s is None else (((worker.job or "",), worker.job_age_s),)
 

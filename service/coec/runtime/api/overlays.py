@@ -12,17 +12,17 @@ from pathlib import Path
 from coec.calibration.types import Matrix4, Reason
 from coec.errors import CoecError
 from coec.runtime.worker import jobs
-from coec.runtime.worker.jobs import Drawn, JobOutcome
+from coec.runtime.worker.jobs import JobOutcome, RenderedImage
 from coec.runtime.worker.supervisor import Worker
 
-KEPT = 4
+CACHED_OVERLAYS = 4
 """How many pictures are kept, some hundred kB each."""
 
-TIMEOUT_S = 8.0
+OVERLAY_TIMEOUT_S = 8.0
 """Longest wait for a picture, s: below the 10 s after which clients give up. The worker may be solving."""
 
 
-class NotDrawnError(CoecError):
+class OverlayUnavailableError(CoecError):
     """The worker could not draw the picture, or not in time."""
 
     reply_code = "not_drawn"
@@ -35,7 +35,7 @@ class Overlays:
         self._pair = pair
         self._worker = worker
         self._lock = threading.Lock()
-        self._kept: OrderedDict[tuple[str, bytes], bytes] = OrderedDict()
+        self._cache: OrderedDict[tuple[str, bytes], bytes] = OrderedDict()
 
     def jpeg(self, path: Path, T_camera_lidar: Matrix4, title: str) -> bytes:
         """JPEG of a window with its points drawn at an extrinsic (4, 4); waits for the worker.
@@ -45,21 +45,21 @@ class Overlays:
         """
         key = (path.stem, T_camera_lidar.tobytes())
         with self._lock:
-            if key in self._kept:
-                self._kept.move_to_end(key)
-                return self._kept[key]
-        drawn: Future[bytes | Reason] = Future()
-        self.request(path, T_camera_lidar, title, drawn.set_result, TIMEOUT_S)
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+        rendered: Future[bytes | Reason] = Future()
+        self.request(path, T_camera_lidar, title, rendered.set_result, OVERLAY_TIMEOUT_S)
         try:
-            picture = drawn.result(TIMEOUT_S)
+            picture = rendered.result(OVERLAY_TIMEOUT_S)
         except TimeoutError as error:
-            raise NotDrawnError("the worker is busy with a window; ask again") from error
+            raise OverlayUnavailableError("the worker is busy with a window; ask again") from error
         if isinstance(picture, Reason):
-            raise NotDrawnError(picture.text)
+            raise OverlayUnavailableError(picture.text)
         with self._lock:
-            self._kept[key] = picture
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
+            self._cache[key] = picture
+            while len(self._cache) > CACHED_OVERLAYS:
+                self._cache.popitem(last=False)
         return picture
 
     def request(
@@ -73,11 +73,11 @@ class Overlays:
         """Asks for the picture without waiting. `done` is called once, with the picture or with the reason why there is
         none, at the latest after `deadline_s` if the worker is busy (None: the default of pictures)."""
 
-        def ended(outcome: JobOutcome) -> None:
+        def on_outcome(outcome: JobOutcome) -> None:
             match outcome:
-                case JobOutcome(answer=Drawn(jpeg)):
+                case JobOutcome(answer=RenderedImage(jpeg)):
                     done(jpeg)
                 case JobOutcome(reason=Reason() as reason):
                     done(reason)
 
-        self._worker.ask(jobs.overlay(self._pair, path, T_camera_lidar, title, ended, deadline_s))
+        self._worker.submit(jobs.overlay(self._pair, path, T_camera_lidar, title, on_outcome, deadline_s))

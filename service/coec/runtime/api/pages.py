@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 
-from coec.adapters.system.http import Page, Request
+from coec.adapters.system.http import HttpRequest, HttpResponse
 from coec.runtime.api.metrics import ENCODING, TEXT, TextFormat
 from coec.schemas.replies import HealthReply, StatusReply
 
-GOOD_ENOUGH = frozenset({0, 1})
+USABLE_LEVELS = frozenset({0, 1})
 """ROS levels of health at which a calibration may be used: OK and WARN."""
 
 
@@ -18,7 +18,7 @@ def pages(
     status: Callable[[], StatusReply],
     health: Callable[[], Mapping[str, HealthReply]],
     is_alive: Callable[[], bool],
-) -> Callable[[Request], Page | None]:
+) -> Callable[[HttpRequest], HttpResponse | None]:
     """A function that makes the page of a request (None for an unknown path).
 
     `/health` is 200 if the service runs and every pair may be used, else 503: a pair that was not looked at is not
@@ -26,16 +26,18 @@ def pages(
     restart help.
     """
 
-    def page(request: Request) -> Page | None:
+    def page(request: HttpRequest) -> HttpResponse | None:
         match request.path:
             case "/metrics":
                 text_format = accepted_format(request.accept)
-                return Page(200, metrics(text_format), text_format.value)
+                return HttpResponse(200, metrics(text_format), text_format.value)
             case "/health":
                 return _health(status(), health())
             case "/live":
                 alive = is_alive()
-                return Page(200 if alive else 503, b"alive\n" if alive else b"stuck\n", "text/plain; charset=utf-8")
+                return HttpResponse(
+                    200 if alive else 503, b"alive\n" if alive else b"stuck\n", "text/plain; charset=utf-8"
+                )
             case _:
                 return None
 
@@ -67,8 +69,8 @@ def _quality(parameters: list[str]) -> float:
     return 1.0
 
 
-def _health(status: StatusReply, health: Mapping[str, HealthReply]) -> Page:
-    good = status.state == "running" and all(reply.level in GOOD_ENOUGH for reply in health.values())
+def _health(status: StatusReply, health: Mapping[str, HealthReply]) -> HttpResponse:
+    good = status.state == "running" and all(reply.level in USABLE_LEVELS for reply in health.values())
     document = {
         "state": status.state,
         "pairs": {
@@ -81,4 +83,4 @@ def _health(status: StatusReply, health: Mapping[str, HealthReply]) -> Page:
         },
     }
     text = json.dumps(document, sort_keys=True, ensure_ascii=False) + "\n"
-    return Page(200 if good else 503, text.encode(), "application/json")
+    return HttpResponse(200 if good else 503, text.encode(), "application/json")

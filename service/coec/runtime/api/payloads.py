@@ -9,7 +9,7 @@ from typing import Any, Final
 import msgpack
 
 from coec.errors import UsageError
-from coec.schemas.commands import MAX_REASON, NAMES, REASON, arguments_of
+from coec.schemas.commands import COMMAND_NAMES, MAX_REASON, REASON, arguments_of
 
 MAX_SENDER: Final = 96
 """Most characters of a sender in log and history."""
@@ -26,14 +26,14 @@ ANONYMOUS: Final = "anonymous"
 _HARMLESS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789 ._:/@+-=,")
 
 
-def parse(name: str, payload: bytes, *, for_rig: bool = False) -> dict[str, Any]:
+def parse_payload(name: str, payload: bytes, *, for_rig: bool = False) -> dict[str, Any]:
     """The arguments of a command for a pair or for the rig. A payload is empty, or a map in msgpack or JSON.
 
     Raises:
         UsageError: no such command, or the payload does not hold the arguments that it takes.
     """
-    if name not in NAMES:
-        raise UsageError(f"no such command; known: {', '.join(NAMES)}")
+    if name not in COMMAND_NAMES:
+        raise UsageError(f"no such command; known: {', '.join(COMMAND_NAMES)}")
     known = {argument.name: argument.kind for argument in arguments_of(name, for_rig=for_rig)}
     document = _document(payload)
     for key, value in document.items():

@@ -24,7 +24,7 @@ SENDERS = 64
 
 
 @dataclass(slots=True)
-class _Bucket:
+class _CommandBucket:
     tokens: float
     at_s: float
 
@@ -36,16 +36,16 @@ class RateLimit:
         """`clock`: a clock in seconds."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._reserved: dict[str, _Bucket] = {}
-        self._buckets: dict[str, _Bucket] = {}
-        self._others = _Bucket(BURST, clock())
+        self._reserved: dict[str, _CommandBucket] = {}
+        self._buckets: dict[str, _CommandBucket] = {}
+        self._others = _CommandBucket(BURST, clock())
 
     def reserve_for(self, proven: Iterable[str]) -> None:
         """Gives these proven senders, and no others, buckets of their own for good. A sender who had one keeps its
         content."""
         with self._lock:
             before, now_s = self._reserved, self._clock()
-            self._reserved = {sender: before.get(sender, _Bucket(BURST, now_s)) for sender in proven}
+            self._reserved = {sender: before.get(sender, _CommandBucket(BURST, now_s)) for sender in proven}
 
     def take(self, sender: str) -> float:
         """0 if `sender` may give a command now, which is then counted; else how many seconds he has to wait."""
@@ -59,7 +59,7 @@ class RateLimit:
             bucket.tokens -= 1.0
             return 0.0
 
-    def _bucket_of(self, sender: str, now_s: float) -> _Bucket:
+    def _bucket_of(self, sender: str, now_s: float) -> _CommandBucket:
         if sender in self._reserved:
             return self._reserved[sender]
         if sender not in self._buckets and len(self._buckets) >= SENDERS:
@@ -68,10 +68,10 @@ class RateLimit:
         if sender not in self._buckets:
             if len(self._buckets) >= SENDERS:
                 return self._others
-            self._buckets[sender] = _Bucket(BURST, now_s)
+            self._buckets[sender] = _CommandBucket(BURST, now_s)
         return self._buckets[sender]
 
 
-def _filled(bucket: _Bucket, now_s: float) -> float:
+def _filled(bucket: _CommandBucket, now_s: float) -> float:
     """Tokens in the bucket by now."""
     return min(BURST, bucket.tokens + (now_s - bucket.at_s) * PER_S)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from pydantic import BaseModel
 
-from coec.adapters.tls.conversation import Heard, Listener
+from coec.adapters.tls.conversation import AuthenticatedCommand, CommandListener
 from coec.adapters.zenoh.bus import Answer, Request
 from coec.errors import NotProvenError, UsageError
 from coec.runtime.api import payloads
 from coec.runtime.api.authority import Authority, NotAllowedError
-from coec.runtime.api.awaited import AwaitedCommands
+from coec.runtime.api.awaited import PendingPairCommands
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.rig_commands import RigCommands
 from coec.runtime.api.snapshots import answer_of
@@ -26,11 +26,11 @@ SEALED = "application/octet-stream"
 
 
 @dataclass(frozen=True, slots=True)
-class Rules:
+class CommandRules:
     """Who may give commands. `listener` is None if the service has no certificate; then nobody can prove his name."""
 
     authority: Authority
-    listener: Listener | None
+    listener: CommandListener | None
 
     @property
     def digest(self) -> str | None:
@@ -38,25 +38,28 @@ class Rules:
         return None if self.listener is None else self.listener.digest
 
 
-class Reception:
+class CommandHandler:
     """Takes the commands for all pairs of a vehicle and for their rig."""
 
     def __init__(
-        self, rules: Rules, commands: Mapping[str, Commands | AwaitedCommands], rig: RigCommands | None = None
+        self,
+        rules: CommandRules,
+        commands: Mapping[str, Commands | PendingPairCommands],
+        rig: RigCommands | None = None,
     ) -> None:
         """`commands` are those of each pair, and may be replaced while queries come; `rig` are those for all pairs."""
         self._pairs = commands
         self._rig = rig
-        self.use(rules)
+        self.reconfigure(rules)
 
-    def use(self, rules: Rules) -> None:
+    def reconfigure(self, rules: CommandRules) -> None:
         """Applies these rules from the next command on. For any thread."""
         proven = [payloads.proven_sender(name) for name in rules.authority.senders]
         for commands in self._pairs.values():
             commands.reserve_for(proven)
         self._rules = rules
 
-    def take(self, pair: str, name: str, request: Request) -> Answer:
+    def handle(self, pair: str, name: str, request: Request) -> Answer:
         """The answer to a query for `command/<name>`.
 
         Raises:
@@ -64,52 +67,60 @@ class Reception:
             NotAllowedError: the sender may not give it.
             NotProvenError: the sender has tried to prove his name and failed.
         """
-        chosen, rules = parse_command_selector(request.parameters), self._rules
-        if chosen.conversation is None:
+        selector, rules = parse_command_selector(request.parameters), self._rules
+        if selector.conversation is None:
             claimed = payloads.sender_of(request.attachment)
-            done = self._done(rules, pair, name, None, claimed, request.payload, request.received_s, chosen)
-            return answer_of(done, chosen.format)
+            done = self._execute(rules, pair, name, None, claimed, request.payload, request.received_s, selector)
+            return answer_of(done, selector.format)
         if rules.listener is None:
             raise NotProvenError(
                 "this service has no certificate (`authority.certificate`), so that nobody can prove his name to it: "
                 "give the command as `--anonymous`, if that is allowed here"
             )
         try:
-            heard = rules.listener.hear(chosen.conversation, request.payload)
+            received = rules.listener.receive(selector.conversation, request.payload)
         except NotProvenError as error:
             self._of(pair).note_refused(name, payloads.sender_of(request.attachment), error)
             raise
-        return Answer(heard, SEALED) if isinstance(heard, bytes) else self._proven(rules, pair, name, heard, request)
+        return (
+            Answer(received, SEALED)
+            if isinstance(received, bytes)
+            else self._answer_authenticated(rules, pair, name, received, request)
+        )
 
-    def _of(self, pair: str) -> Commands | AwaitedCommands | RigCommands:
+    def _of(self, pair: str) -> Commands | PendingPairCommands | RigCommands:
         return self._rig if pair == RIG and self._rig is not None else self._pairs[pair]
 
-    def _proven(self, rules: Rules, pair: str, name: str, heard: Heard, request: Request) -> Answer:
-        call = from_json(ProvenCommand, heard.said)
+    def _answer_authenticated(
+        self, rules: CommandRules, pair: str, name: str, authenticated: AuthenticatedCommand, request: Request
+    ) -> Answer:
+        call = from_json(ProvenCommand, authenticated.payload)
         key, _, parameters = call.selector.partition("?")
         if key != request.key:
             raise UsageError("what was said in the conversation is not the command that was asked for")
-        chosen = parse_command_selector(parameters)
-        sender = payloads.proven_sender(heard.name)
-        done = self._done(rules, pair, name, heard.name, sender, call.payload.encode(), request.received_s, chosen)
-        return Answer(heard.sealed(answer_of(done, chosen.format).payload), SEALED)
+        selector = parse_command_selector(parameters)
+        sender = payloads.proven_sender(authenticated.sender)
+        done = self._execute(
+            rules, pair, name, authenticated.sender, sender, call.payload.encode(), request.received_s, selector
+        )
+        return Answer(authenticated.seal(answer_of(done, selector.format).payload), SEALED)
 
-    def _done(
+    def _execute(
         self,
-        rules: Rules,
+        rules: CommandRules,
         pair: str,
         name: str,
         proven: str | None,
         sender: str,
         payload: bytes,
         received_s: float,
-        chosen: CommandSelector,
+        selector: CommandSelector,
     ) -> BaseModel:
         commands = self._of(pair)
-        arguments = payloads.parse(name, payload, for_rig=pair == RIG)
+        arguments = payloads.parse_payload(name, payload, for_rig=pair == RIG)
         try:
             rules.authority.require(proven, name)
         except NotAllowedError as error:
             commands.note_refused(name, sender, error)
             raise
-        return commands.carry_out(name, arguments, sender, received_s + chosen.timeout_ms / 1e3)
+        return commands.carry_out(name, arguments, sender, received_s + selector.timeout_ms / 1e3)

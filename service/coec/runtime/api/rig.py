@@ -14,15 +14,15 @@ from coec.adapters.zenoh.bus import Answer
 from coec.calibration.rig.attribution import SensorHealth, SensorState
 from coec.calibration.rig.joint import JointEstimate
 from coec.calibration.rig.moves import Moved
-from coec.calibration.rig.types import Kind, RigGraph
-from coec.calibration.rig.vehicle import Move, VehicleRig, pairs_of
+from coec.calibration.rig.types import RigGraph, SensorKind
+from coec.calibration.rig.vehicle import MoveRecord, VehicleRig, pairs_of
 from coec.calibration.types import Reason
 from coec.geometry import se3
 from coec.runtime.api.health import reasons_of
-from coec.runtime.api.rig_troubles import troubles_of
-from coec.runtime.api.snapshots import Snapshot
-from coec.runtime.rig.keeper import ONE_PAIR, RigKnown
-from coec.runtime.rig.lidar_side import LidarsKnown
+from coec.runtime.api.rig_troubles import rig_problems
+from coec.runtime.api.snapshots import SerializedReply
+from coec.runtime.rig.keeper import ONE_PAIR, RigSnapshot
+from coec.runtime.rig.lidar_side import LidarPairStatus
 from coec.schemas import rig_state
 from coec.schemas.keys import Format, Keys
 from coec.schemas.replies import Maybe6x6, Vector6
@@ -35,15 +35,15 @@ class RigAnswers:
         self._keys = keys
         self._publish = publish
         self._essence: object = None
-        self._troubles: dict[str, tuple[Reason, ...]] = {}
-        self.hear(RigKnown())
+        self._problems: dict[str, tuple[Reason, ...]] = {}
+        self.on_update(RigSnapshot())
 
-    def hear(self, known: RigKnown) -> None:
+    def on_update(self, known: RigSnapshot) -> None:
         """Serialises the answer anew, and publishes it if it says something new about a sensor or about all of
         them."""
         self.reply = reply_of(self._keys.vehicle, known)
-        self._snapshot = Snapshot.of(self.reply)
-        self._troubles = {} if known.rig is None else troubles_of(known.rig)
+        self._snapshot = SerializedReply.of(self.reply)
+        self._problems = {} if known.rig is None else rig_problems(known.rig)
         joint = self.reply.joint
         essence = (
             tuple((sensor.name, sensor.state, tuple(r.code for r in sensor.reasons)) for sensor in self.reply.sensors),
@@ -62,19 +62,19 @@ class RigAnswers:
         """The reply, serialised in advance."""
         return self._snapshot.answer(form)
 
-    def troubles(self, pair: str) -> tuple[Reason, ...]:
+    def problems(self, pair: str) -> tuple[Reason, ...]:
         """Why the rig does not let a pair count as healthy, even if the pair is healthy by itself."""
-        return self._troubles.get(pair, ())
+        return self._problems.get(pair, ())
 
 
-def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
+def reply_of(vehicle: str, known: RigSnapshot) -> rig_state.RigReply:
     """What is known of the rig in its wire form."""
     rig = known.rig
     if rig is None:
         return rig_state.RigReply(
             vehicle=vehicle,
             stamp_ns=None,
-            sensors=() if known.graph is None else _untold(known.graph, known.why),
+            sensors=() if known.graph is None else _unknown_sensors(known.graph, known.why),
             nobody=None,
             disturbed={},
             joint=None,
@@ -100,18 +100,18 @@ def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
         move=None if rig.move is None else _move(rig.move),
         lidars=tuple(_lidars(one) for one in known.lidars),
         reasons=reasons_of(known.why),
-        looks=dict(rig.looks),
+        looks=dict(rig.observations),
         losses=dict(known.losses),
     )
 
 
-def _untold(graph: RigGraph, why: tuple[Reason, ...]) -> tuple[rig_state.SensorReply, ...]:
+def _unknown_sensors(graph: RigGraph, why: tuple[Reason, ...]) -> tuple[rig_state.SensorReply, ...]:
     """Replies for sensors of which nothing can be said."""
     undecided = ONE_PAIR in why
     return tuple(
         rig_state.SensorReply(
             name=sensor.name,
-            kind="camera" if sensor.kind is Kind.CAMERA else "lidar",
+            kind="camera" if sensor.kind is SensorKind.CAMERA else "lidar",
             state="undecided" if undecided else "unknown",
             probability=None,
             since_ns=None,
@@ -128,7 +128,7 @@ def _sensor(rig: VehicleRig, sensor: SensorState) -> rig_state.SensorReply:
     moved = sensor.moved
     return rig_state.SensorReply(
         name=sensor.name,
-        kind="camera" if sensor.kind is Kind.CAMERA else "lidar",
+        kind="camera" if sensor.kind is SensorKind.CAMERA else "lidar",
         state=sensor.health.value,
         probability=None if unknown else _share(sensor.probability),
         since_ns=rig.since_ns.get(sensor.name),
@@ -138,7 +138,7 @@ def _sensor(rig: VehicleRig, sensor: SensorState) -> rig_state.SensorReply:
     )
 
 
-def _move(move: Move) -> rig_state.RigMove:
+def _move(move: MoveRecord) -> rig_state.RigMove:
     event = move.event
     return rig_state.RigMove(
         sensors=event.sensors,
@@ -158,10 +158,10 @@ def _pairs(graph: RigGraph, sensor: str) -> tuple[str, ...]:
     return tuple(name for name in pairs_of(graph, (sensor,)) if name not in graph.of_lidars)
 
 
-def _lidars(known: LidarsKnown) -> rig_state.LidarsReply:
-    told, edge = known.told, known.edge
-    pose = None if told is None else told.window.measurement.T_camera_lidar
-    bias = None if told is None else told.range_bias
+def _lidars(known: LidarPairStatus) -> rig_state.LidarsReply:
+    registration, edge = known.registration, known.edge
+    pose = None if registration is None else registration.window.measurement.T_camera_lidar
+    bias = None if registration is None else registration.range_bias
     return rig_state.LidarsReply(
         name=edge.name,
         a=edge.a,
@@ -169,15 +169,15 @@ def _lidars(known: LidarsKnown) -> rig_state.LidarsReply:
         state=known.state.value,
         reasons=reasons_of(known.reasons),
         stamp_ns=known.stamp_ns,
-        measured_ns=None if told is None else told.look.stamp_ns,
+        measured_ns=None if registration is None else registration.observation.stamp_ns,
         a_from_b=None if pose is None else transform_of(pose),
-        sigma=None if told is None else _degrees(told.window.measurement.uncertainty.sigma),
+        sigma=None if registration is None else _degrees(registration.window.measurement.uncertainty.sigma),
         correction=None if pose is None else _degrees(se3.difference(pose, edge.T_a_b)),
         range_bias_m=None if bias is None else bias.longer_m,
         range_bias_sigma_m=None if bias is None else bias.sigma_m,
-        rms_m=None if told is None or not isfinite(told.rms_m) else told.rms_m,
-        share=None if told is None else _share(told.share),
-        looks=known.looks,
+        rms_m=None if registration is None or not isfinite(registration.rms_m) else registration.rms_m,
+        share=None if registration is None else _share(registration.share),
+        looks=known.registrations,
         losses=dict(known.losses),
     )
 

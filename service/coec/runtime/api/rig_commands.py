@@ -12,19 +12,19 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from coec.errors import CoecError, NotFoundError
-from coec.runtime.api.awaited import AwaitedCommands
+from coec.runtime.api.awaited import PendingPairCommands
 from coec.runtime.api.commands import EXPIRED, Commands
 from coec.schemas.keys import RIG
 from coec.schemas.replies import Acknowledgement
 from coec.schemas.rig_state import RigReply
 
-Given = Commands | AwaitedCommands
+PairCommands = Commands | PendingPairCommands
 
 
 class RigCommands:
     """The rig commands of one vehicle. `pairs` may gain pairs while commands come."""
 
-    def __init__(self, vehicle: str, pairs: Mapping[str, Given], rig: Callable[[], RigReply]) -> None:
+    def __init__(self, vehicle: str, pairs: Mapping[str, PairCommands], rig: Callable[[], RigReply]) -> None:
         """`rig()` gives the reply that names the pairs of each sensor."""
         self._vehicle = vehicle
         self._pairs = pairs
@@ -41,16 +41,16 @@ class RigCommands:
         Raises:
             NotFoundError: there is no such sensor.
         """
-        told = dict(arguments)
-        chosen = self._chosen(told.pop("sensor", None))
+        pair_arguments = dict(arguments)
+        pairs = self._pairs_of(pair_arguments.pop("sensor", None))
         done = []
-        for pair in chosen:
+        for pair in pairs:
             if time.monotonic() > deadline_s:
                 done.append(Acknowledgement(
                     vehicle=self._vehicle, pair=pair, command=name, accepted=False, code="expired", text=EXPIRED
                 ))  # fmt: skip
             else:
-                done.append(self._pairs[pair].carry_out(name, dict(told), sender, deadline_s))
+                done.append(self._pairs[pair].carry_out(name, dict(pair_arguments), sender, deadline_s))
         refused = [one for one in done if not one.accepted]
         code = refused[0].code if refused else done[0].code
         durable = [one.durable for one in done if one.durable is not None]
@@ -69,7 +69,7 @@ class RigCommands:
         for commands in self._pairs.values():
             commands.note_refused(name, sender, why)
 
-    def _chosen(self, sensor: str | None) -> tuple[str, ...]:
+    def _pairs_of(self, sensor: str | None) -> tuple[str, ...]:
         if sensor is None:
             return tuple(self._pairs)
         sensors = {one.name: one.pairs for one in self._rig().sensors}

@@ -6,7 +6,7 @@ from math import degrees, isfinite
 
 from coec.calibration.rig.attribution import SensorHealth
 from coec.calibration.rig.joint import JointEstimate
-from coec.calibration.rig.objections import Objection, objections
+from coec.calibration.rig.objections import RigAlarm, rig_alarms
 from coec.calibration.rig.vehicle import VehicleRig
 from coec.calibration.types import Reason
 
@@ -20,18 +20,18 @@ SUSPECTED = "sensor_suspected"
 """Code of the reason that the pair does not fit the others, and a sensor of it may have moved."""
 
 
-def troubles_of(rig: VehicleRig) -> dict[str, tuple[Reason, ...]]:
+def rig_problems(rig: VehicleRig) -> dict[str, tuple[Reason, ...]]:
     """A reason for each pair to which the rig objects, by pair; pairs that fit are left out."""
-    return {pair: (_reason(rig, pair, objection),) for pair, objection in objections(rig).items()}
+    return {pair: (_reason(rig, pair, objection),) for pair, objection in rig_alarms(rig).items()}
 
 
-def _reason(rig: VehicleRig, pair: str, objection: Objection) -> Reason:
+def _reason(rig: VehicleRig, pair: str, objection: RigAlarm) -> Reason:
     edge = rig.graph.edge[pair]
-    if objection is Objection.MOVED and rig.event is not None:
+    if objection is RigAlarm.MOVED and rig.event is not None:
         moved = " and ".join(name for name in rig.event.sensors if name in (edge.a, edge.b))
         text = f"{moved} moved, and this pair still serves what was before; a window from after the move puts it right."
         return Reason(MOVED, text)
-    if objection is Objection.SUSPECTED:
+    if objection is RigAlarm.SUSPECTED:
         undecided = (one.name for one in rig.sensors if one.health is SensorHealth.UNDECIDED)
         may_be = " or ".join(name for name in undecided if name in (edge.a, edge.b))
         return Reason(

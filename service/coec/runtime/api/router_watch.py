@@ -16,7 +16,7 @@ FIRST_REMINDER_S, LONGEST_REMINDER_S = 60.0, 3600.0
 So the last screen of a log shows it, and a night without a router gives twenty lines."""
 
 
-class RouterWatch:
+class RouterMonitor:
     """For one thread.
 
     Attributes:
@@ -31,27 +31,27 @@ class RouterWatch:
         self._is_there = is_there
         self._now_s = now_s
         self._seen: bool | None = None
-        self._away_since_s = self._told_s = 0.0
+        self._away_since_s = self._reported_s = 0.0
         self._reminder_s = FIRST_REMINDER_S
-        self.trouble: Reason | None = None
+        self.problem: Reason | None = None
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Looks now. Zenoh itself tries to connect again and again, without end."""
         if not self._endpoints:
             return
         there = self._is_there()
         now_s = self._now_s()
         if there == self._seen:
-            if not there and now_s - self._told_s >= self._reminder_s:
+            if not there and now_s - self._reported_s >= self._reminder_s:
                 _log.warning(f"no router at {self._endpoints} for {now_s - self._away_since_s:.0f} s, trying again")
-                self._told_s, self._reminder_s = now_s, min(2.0 * self._reminder_s, LONGEST_REMINDER_S)
+                self._reported_s, self._reminder_s = now_s, min(2.0 * self._reminder_s, LONGEST_REMINDER_S)
             return
         if there:
             again = "" if self._seen is None else f" again, after {now_s - self._away_since_s:.0f} s"
             _log.info(f"the router at {self._endpoints} is there{again}")
-            self.trouble = None
+            self.problem = None
         else:
-            self._away_since_s = self._told_s = now_s
+            self._away_since_s = self._reported_s = now_s
             self._reminder_s = FIRST_REMINDER_S
             away = "no router" if self._seen is None else "the router has gone: none"
             _log.warning(f"{away} at {self._endpoints}, trying again")
@@ -59,5 +59,5 @@ class RouterWatch:
                 f"No router at {self._endpoints}: no frames come in and nobody is answered until there is one; "
                 "`coec doctor` says what stands in the way."
             )
-            self.trouble = Reason("no_router", text)
+            self.problem = Reason("no_router", text)
         self._seen = there

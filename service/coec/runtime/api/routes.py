@@ -11,16 +11,16 @@ import zenoh
 from pydantic import BaseModel
 
 from coec.adapters.exports import FORMATS
-from coec.adapters.exports.told import Frames
-from coec.adapters.zenoh.bus import Answer, Bus, Lane, Request, Route
+from coec.adapters.exports.told import ExportFrames
+from coec.adapters.zenoh.bus import Answer, Bus, QueryLane, Request, Route
 from coec.errors import UsageError
 from coec.runtime.api import metrics as metrics_text
-from coec.runtime.api.awaited import AwaitedAnswers
-from coec.runtime.api.last_words import LastWords
+from coec.runtime.api.awaited import PendingPairAnswers
+from coec.runtime.api.last_words import Heartbeats
 from coec.runtime.api.pair_answers import PairAnswers
-from coec.runtime.api.reception import Reception
+from coec.runtime.api.reception import CommandHandler
 from coec.runtime.api.rig import RigAnswers
-from coec.runtime.api.snapshots import Snapshot, answer_of
+from coec.runtime.api.snapshots import SerializedReply, answer_of
 from coec.runtime.api.uplink import Uplink
 from coec.runtime.timings import QUICK_S, Histogram
 from coec.schemas.keys import (
@@ -40,11 +40,11 @@ OCTETS = "application/octet-stream"
 JPEG = "image/jpeg"
 
 
-Answering = PairAnswers | AwaitedAnswers
+AnyPairAnswers = PairAnswers | PendingPairAnswers
 """What answers about a pair."""
 
 
-class VehicleAnswers:
+class VehicleRoutes:
     """Routes of the vehicle and of each of its pairs.
 
     Attributes:
@@ -54,27 +54,27 @@ class VehicleAnswers:
     def __init__(
         self,
         keys: Keys,
-        pairs: Mapping[str, Answering],
-        reception: Reception,
-        status: Callable[[], Snapshot],
+        pairs: Mapping[str, AnyPairAnswers],
+        command_handler: CommandHandler,
+        status: Callable[[], SerializedReply],
         metrics: Callable[[], bytes],
-        config: Callable[[], Snapshot],
+        config: Callable[[], SerializedReply],
         rig: RigAnswers,
-        last_words: LastWords,
+        heartbeats: Heartbeats,
         uplink: Uplink,
     ) -> None:
         """`status()` and `config()` are serialised in advance; `metrics()` is rendered when it is asked for."""
         self.took = Histogram(QUICK_S)
         self._keys = keys
         self._pairs = dict(pairs)
-        self._reception = reception
-        self._last_words = last_words
+        self._command_handler = command_handler
+        self._heartbeats = heartbeats
         self._uplink = uplink
         self._vehicle_routes = {
-            keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
-            keys.config: Route(keys.config, lambda request: config().answer(_format(request)), Lane.AT_ONCE),
-            keys.rig: Route(keys.rig, lambda request: rig.answer(_format(request)), Lane.AT_ONCE),
-            keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), Lane.FILES),
+            keys.status: Route(keys.status, lambda request: status().answer(_format(request)), QueryLane.AT_ONCE),
+            keys.config: Route(keys.config, lambda request: config().answer(_format(request)), QueryLane.AT_ONCE),
+            keys.rig: Route(keys.rig, lambda request: rig.answer(_format(request)), QueryLane.AT_ONCE),
+            keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), QueryLane.FILES),
         }
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
 
@@ -123,21 +123,21 @@ class VehicleAnswers:
         if key in readable:
             return [readable[key]]
         if _has_wildcard(key):
-            asked = zenoh.KeyExpr(key)
-            matching = [route for known, route in readable.items() if asked.intersects(zenoh.KeyExpr(known))]
+            expression = zenoh.KeyExpr(key)
+            matching = [route for known, route in readable.items() if expression.intersects(zenoh.KeyExpr(known))]
             # A picture is drawn only for those who ask for one, not for a query of everything.
             return (
                 matching
                 if key.endswith("/overlay")
-                else [route for route in matching if route.lane is not Lane.DRAWING]
+                else [route for route in matching if route.lane is not QueryLane.DRAWING]
             )
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
-            return [self._metered(Route(key, self._window(self._pairs[pair], address.argument), Lane.FILES))]
+            return [self._metered(Route(key, self._window(self._pairs[pair], address.argument), QueryLane.FILES))]
         if address.resource == "command":
-            return [Route(key, partial(self._reception.take, pair, str(address.argument)), Lane.COMMANDS)]
+            return [Route(key, partial(self._command_handler.handle, pair, str(address.argument)), QueryLane.COMMANDS)]
         if address.resource == "evidence" and address.argument is not None:
-            return [self._metered(Route(key, self._evidence(self._pairs[pair], address.argument), Lane.FILES))]
+            return [self._metered(Route(key, self._evidence(self._pairs[pair], address.argument), QueryLane.FILES))]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_of_rig(self, key: str) -> Sequence[Route]:
@@ -151,17 +151,17 @@ class VehicleAnswers:
         address = self._keys.parse(key)
         if address.resource != "command":
             raise UsageError("the rig takes commands; what all pairs say together is `rig` itself")
-        command = Route(key, partial(self._reception.take, RIG, str(address.argument)), Lane.COMMANDS)
+        command = Route(key, partial(self._command_handler.handle, RIG, str(address.argument)), QueryLane.COMMANDS)
         return [self._timed(command, "command")]
 
     def _find_last(self, pair: str) -> Callable[[str], Sequence[Route]]:
         """A function that finds the route for the last word of a pair, for queries of that word or of all last words.
         It finds none for queries of something else about a pair that happens to be called `last`."""
-        route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), Lane.AT_ONCE), LAST)
+        route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), QueryLane.AT_ONCE), LAST)
         return lambda key: [route] if key.split("/")[-2] == LAST else []
 
     def _last(self, pair: str, request: Request) -> Answer:
-        return self._last_words.answer(pair, _format(request))
+        return self._heartbeats.answer(pair, _format(request))
 
     def _find_unknown(self, key: str) -> Sequence[Route]:
         """No routes. Does not raise if another queryable answers, because a session hands a query to all that match.
@@ -174,15 +174,15 @@ class VehicleAnswers:
             return []
         raise UsageError(f"no such pair or resource; pairs served here: {', '.join(self._pairs)}")
 
-    def _readable(self, pair: Answering) -> dict[str, Route]:
+    def _readable(self, pair: AnyPairAnswers) -> dict[str, Route]:
         keys, name = self._keys, pair.name
         routes = (
-            Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), Lane.AT_ONCE),
-            Route(keys.health(name), lambda request: pair.health(_format(request)), Lane.AT_ONCE),
-            self._metered(Route(keys.history(name), lambda request: _history(pair, request), Lane.FILES)),
-            Route(keys.windows(name), lambda request: pair.windows(_format(request)), Lane.FILES),
-            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), Lane.FILES),
-            self._metered(Route(keys.overlay(name), lambda request: _overlay(pair, request), Lane.DRAWING)),
+            Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), QueryLane.AT_ONCE),
+            Route(keys.health(name), lambda request: pair.health(_format(request)), QueryLane.AT_ONCE),
+            self._metered(Route(keys.history(name), lambda request: _history(pair, request), QueryLane.FILES)),
+            Route(keys.windows(name), lambda request: pair.windows(_format(request)), QueryLane.FILES),
+            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), QueryLane.FILES),
+            self._metered(Route(keys.overlay(name), lambda request: _overlay(pair, request), QueryLane.DRAWING)),
         )
         return {route.key: route for route in routes}
 
@@ -191,38 +191,38 @@ class VehicleAnswers:
         resource = self._keys.parse(route.key).resource
         return replace(route, answer=lambda request: self._uplink.metered(resource, lambda: route.answer(request)))
 
-    def _window(self, pair: Answering, window_id: str) -> Callable[[Request], Answer]:
+    def _window(self, pair: AnyPairAnswers, window_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
-            chosen = parse_range_selector(request.parameters)
-            return Answer(pair.read_window(window_id, chosen.offset, chosen.length), OCTETS)
+            selector = parse_range_selector(request.parameters)
+            return Answer(pair.read_window(window_id, selector.offset, selector.length), OCTETS)
 
         return answer
 
-    def _evidence(self, pair: Answering, event_id: str) -> Callable[[Request], Answer]:
+    def _evidence(self, pair: AnyPairAnswers, event_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
-            chosen = parse_evidence_selector(request.parameters)
-            if chosen.overlay is not None:
-                return Answer(pair.event_overlay(event_id, chosen.overlay), JPEG)
-            return answer_of(pair.event(event_id), chosen.format)
+            selector = parse_evidence_selector(request.parameters)
+            if selector.overlay is not None:
+                return Answer(pair.event_overlay(event_id, selector.overlay), JPEG)
+            return answer_of(pair.event(event_id), selector.format)
 
         return answer
 
 
-def _extrinsic(pair: Answering, request: Request) -> Answer:
-    chosen = parse_extrinsic_selector(request.parameters, FORMATS)
-    if chosen.export is None:
-        return pair.extrinsic(chosen.format)
-    return pair.exported(chosen.export, Frames(chosen.parent, chosen.child))
+def _extrinsic(pair: AnyPairAnswers, request: Request) -> Answer:
+    selector = parse_extrinsic_selector(request.parameters, FORMATS)
+    if selector.export is None:
+        return pair.extrinsic(selector.format)
+    return pair.exported(selector.export, ExportFrames(selector.parent, selector.child))
 
 
-def _overlay(pair: Answering, request: Request) -> Answer:
-    chosen = parse_overlay_selector(request.parameters)
-    return Answer(pair.overlay(chosen.window_id, nominal=chosen.at == "nominal"), JPEG)
+def _overlay(pair: AnyPairAnswers, request: Request) -> Answer:
+    selector = parse_overlay_selector(request.parameters)
+    return Answer(pair.overlay(selector.window_id, nominal=selector.at == "nominal"), JPEG)
 
 
-def _history(pair: Answering, request: Request) -> Answer:
-    chosen = parse_history_selector(request.parameters)
-    return answer_of(pair.history(chosen.since_ns, chosen.until_ns, chosen.limit), chosen.format)
+def _history(pair: AnyPairAnswers, request: Request) -> Answer:
+    selector = parse_history_selector(request.parameters)
+    return answer_of(pair.history(selector.since_ns, selector.until_ns, selector.limit), selector.format)
 
 
 def _in_format(request: Request, make: Callable[[], BaseModel]) -> Answer:

@@ -16,19 +16,19 @@ from coec.schemas.keys import Format
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class SerializedReply:
     """A reply in both encodings, serialised before anyone asks."""
 
     msgpack: bytes
     json: bytes
 
     @classmethod
-    def of(cls, model: BaseModel) -> Snapshot:
+    def of(cls, model: BaseModel) -> SerializedReply:
         """Both encodings of the model."""
         return cls(to_msgpack(model), to_json(model))
 
     @classmethod
-    def of_document(cls, document: Mapping[str, Any]) -> Snapshot:
+    def of_document(cls, document: Mapping[str, Any]) -> SerializedReply:
         """Both encodings of JSON-like values that have no model of their own."""
         text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
         return cls(msgpack.packb(json.loads(text)), text.encode())

@@ -7,7 +7,7 @@ from typing import Literal
 
 from coec.runtime.api.health import drops_of
 from coec.runtime.budget.budget import BudgetReport
-from coec.runtime.decisions.decider import Known
+from coec.runtime.decisions.decider import PairSnapshot
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, StreamCounts
 from coec.runtime.ingest.inbox import Arrivals
 from coec.runtime.ingest.stream_statistics import StreamStatistics
@@ -18,7 +18,7 @@ from coec.schemas import replies
 
 def pair_status_of(
     name: str,
-    known: Known,
+    known: PairSnapshot,
     report: StreamStatistics,
     losses: Mapping[tuple[str, str], int],
     recorded: int,
@@ -30,16 +30,16 @@ def pair_status_of(
 ) -> replies.PairStatus:
     """Status of a pair. `losses` are its losses by place and cause, `recorded` the number of its windows on the disk,
     `unwritten` the number of pairs that wait for the disk."""
-    drops, chosen = drops_of(losses, report.unpaired), report.chosen
+    drops, selection = drops_of(losses, report.unpaired), report.selection
 
     def stream(name: str) -> replies.StreamStatus:
         counts = report.streams.get(name, StreamCounts(0, 0))
-        came = arrivals[name]
+        arrival = arrivals[name]
         return replies.StreamStatus(
             received=counts.received,
             accepted=counts.accepted,
-            waiting=came.waiting,
-            age_s=came.age_s,
+            waiting=arrival.waiting,
+            age_s=arrival.age_s,
             losses=drops.get(name, {}),
         )
 
@@ -50,10 +50,10 @@ def pair_status_of(
         ego=stream(EGO) if has_ego else None,
         pairs=report.pairs,
         held=report.held,
-        unanswered=chosen.unanswered,
-        selected=chosen.selected,
+        unanswered=selection.unanswered,
+        selected=selection.selected,
         unwritten=unwritten,
-        rejections=dict(chosen.rejections),
+        rejections=dict(selection.rejections),
         losses={**drops.get("window", {}), **drops.get("storage", {}), **drops.get("monitor", {})},
         windows=recorded,
         solved=known.solved,
@@ -99,13 +99,13 @@ def budget_status_of(report: BudgetReport) -> replies.BudgetStatus:
     return replies.BudgetStatus(
         cores=report.cores,
         spent=report.spent,
-        wanted=report.wanted,
+        wanted=report.demand,
         stretched_by=report.stretched_by,
         in_store_s=report.in_store_s,
         spent_s={kind: sum(cpu_s for (each, _), cpu_s in report.totals_s.items() if each == kind) for kind in kinds},
         pairs={
             name: replies.BudgetShare(
-                look_s=share.look_s,
+                look_s=share.check_s,
                 window_s=share.window_s,
                 unseen_s=report.unseen_s.get(name),
                 suspected=share.suspected,

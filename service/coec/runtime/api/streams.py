@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from coec.adapters.zenoh.ros_topics import Topics, listed
+from coec.adapters.zenoh.ros_topics import RosTopicList, listed
 from coec.calibration.types import Reason
 from coec.config import PairConfig
 from coec.runtime.ingest.decoder import StreamCounts
@@ -15,9 +15,9 @@ SILENT_S = 5.0
 """After this time without a sample, s, a stream whose topic nobody publishes is reported as missing."""
 
 
-def troubles_of(streams: Mapping[str, StreamCounts], pair: PairConfig, topics: Topics) -> tuple[Reason, ...]:
+def stream_problems(streams: Mapping[str, StreamCounts], pair: PairConfig, topics: RosTopicList) -> tuple[Reason, ...]:
     """Troubles of the streams, for `health`."""
-    found = []
+    reasons = []
     for name, stream in pair.streams.items():
         counts = streams.get(name)
         if counts is None:
@@ -28,22 +28,22 @@ def troubles_of(streams: Mapping[str, StreamCounts], pair: PairConfig, topics: T
             # Senders without names are told apart by what they send, which does not count them.
             several = f"{len(counts.taking_turns)} publishers" if known else "Several programs"
             text = f"{several} send on {stream.place} at the same time{who}."
-            found.append(Reason("two_senders", f"{text} Their frames are refused until only one sends."))
+            reasons.append(Reason("two_senders", f"{text} Their frames are refused until only one sends."))
         if counts.foreign:
             text = f"On {stream.place} come frames with another frame id or image size beside those of the sensor"
-            found.append(Reason("foreign_frames", f"{text}; they are refused."))
+            reasons.append(Reason("foreign_frames", f"{text}; they are refused."))
         if counts.stamped_by_sender:
             text = f"Messages on {stream.place} have no stamp: each has the stamp from the sender's clock."
-            found.append(Reason("sender_clock", text))
-    return tuple(found)
+            reasons.append(Reason("sender_clock", text))
+    return tuple(reasons)
 
 
-def missed_of(arrivals: Mapping[str, Arrivals], pair: PairConfig, topics: Topics) -> tuple[str, ...]:
+def missed_of(arrivals: Mapping[str, Arrivals], pair: PairConfig, topics: RosTopicList) -> tuple[str, ...]:
     """Sentences about the streams that nobody publishes, for `needs` of `health`."""
-    found = []
+    sentences = []
     for name, stream in pair.streams.items():
         age_s = arrivals[name].age_s
         if stream.topic is not None and (age_s is None or age_s > SILENT_S):
             absent = topics.absent(stream.topic, stream.types)
-            found += [f"{name}: {absent}"] if absent else []
-    return tuple(found)
+            sentences += [f"{name}: {absent}"] if absent else []
+    return tuple(sentences)

@@ -10,237 +10,237 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Trouble:
+class Problem:
     """What a trouble means, and what to do about it."""
 
     meaning: str
     advice: str
 
 
-TROUBLES: Mapping[str, Trouble] = {
-    "no_router": Trouble(
+PROBLEMS: Mapping[str, Problem] = {
+    "no_router": Problem(
         "There is no router: no frames come in, and nobody is answered.",
         "Start it, or check the network; `coec doctor` says how far a connection gets. The service connects by itself.",
     ),
-    "two_senders": Trouble(
+    "two_senders": Problem(
         "Two publishers send on one topic or key at the same time. Nobody knows whose frames are the sensor's, so that "
         "all are refused until only one has sent for 64 messages; nothing is checked or calibrated meanwhile.",
         "End one of the two, or name the topic of the one that is meant; `coec doctor` lists topics and nodes. If the "
         "other is of another vehicle, give each vehicle keys of its own.",
     ),
-    "foreign_frames": Trouble(
+    "foreign_frames": Problem(
         "Frames with another frame id or image size come beside those of the sensor; they are refused and counted.",
         "Find the program that sends them on this topic or key (another sensor, another vehicle), and end it.",
     ),
-    "sender_clock": Trouble(
+    "sender_clock": Problem(
         "Messages of a stream have no stamp; the time at which they were sent replaces the sensor's.",
         "Have the driver stamp its messages by the clock of the sensors.",
     ),
-    "inconsistent_rig": Trouble(
+    "inconsistent_rig": Problem(
         "The pairs of the vehicle do not agree where its sensors are; `coec query rig` shows what does not fit.",
         "Nothing while windows come: a pair whose window is from before a move fits again with its next one. If it "
         "stays, check what a pair has of its own (intrinsics, clocks, masks), and `links`.",
     ),
-    "sensor_suspected": Trouble(
+    "sensor_suspected": Problem(
         "The pairs of the vehicle do not agree where its sensors are, and one of this pair may have moved; `coec query "
         "rig` says by how much, and how likely that is.",
         "Nothing: the next looks name the sensor, or lead to `inconsistent_rig`, or show that all fits.",
     ),
-    "sensor_moved": Trouble(
+    "sensor_moved": Problem(
         "A sensor of the pair moved (see `coec query rig`), and the pair still serves the calibration from before.",
         "Nothing while windows come: one correction puts all its pairs right. If it stays, `health` says what the "
         "windows of the pair lack, or the pair is held or waits for `apply`.",
     ),
-    "one_pair": Trouble(
+    "one_pair": Problem(
         "About `rig`: the vehicle has one pair, which cannot tell its camera from its LiDAR.",
         "Nothing: `health` of the pair says whether either moved. A second camera on that LiDAR would tell them apart.",
     ),
-    "no_rig": Trouble(
+    "no_rig": Problem(
         "About `rig`: its pairs are not put together, because the vehicle has more sensors than that can handle.",
         "Nothing: every pair is calibrated by itself. Leave out pairs that are of no use, to have the others together.",
     ),
-    "lidars_not_installed": Trouble(
+    "lidars_not_installed": Problem(
         "There are several LiDARs, and the package that measures their poses to one another is not installed.",
         "Install the extra `lidars`, or set `lidar_edges.period_s: 0`; all else goes on without it.",
     ),
-    "rig_state_damaged": Trouble(
+    "rig_state_damaged": Problem(
         "About `rig`: something that was known of it before the restart cannot be read; it is kept aside, and learnt "
         "anew.",
         "Nothing after an update of the software, else check the disk of `state.directory`. Only its pairs report a "
         "sensor that was knocked meanwhile.",
     ),
-    "insecure": Trouble(
+    "insecure": Problem(
         "The service listens where anyone is let in without a certificate.",
         "Listen on loopback or on TLS with client certificates, and take `zenoh.insecure` out.",
     ),
-    "http_unavailable": Trouble(
+    "http_unavailable": Problem(
         "Metrics are not served over HTTP: the address is not available.",
         "Free the port or name another in `metrics.http`, and reload.",
     ),
-    "http_insecure": Trouble(
+    "http_insecure": Problem(
         "Other computers can read the metrics over HTTP.",
         "Listen on loopback, and take `metrics.insecure` out.",
     ),
-    "worker_failed": Trouble(
+    "worker_failed": Problem(
         "The process that infers and solves has ended and is being replaced.",
         "Nothing if it happens once; if it goes on, check its memory (`worker.max_memory_bytes`) and the log.",
     ),
-    "compiling_kernels": Trouble(
+    "compiling_kernels": Problem(
         "The worker compiles its kernels, once on a machine and after an update; the text says how many are there. The "
         "extrinsic is served and windows are recorded meanwhile; checks and solves begin afterwards.",
         "Nothing: it takes a minute, and longer on a busy machine. `coec warmup` compiles the kernels beforehand.",
     ),
-    "recording_failed": Trouble(
+    "recording_failed": Problem(
         "The last window could not be written; the next one is tried.",
         "Check the disk of `state.directory`: room, owner, errors.",
     ),
-    "recording_stuck": Trouble(
+    "recording_stuck": Problem(
         "The disk does not answer: no window can be written.",
         "Check the disk of `state.directory`; `coec doctor` measures it.",
     ),
-    "disk_slow": Trouble(
+    "disk_slow": Problem(
         "The disk takes longer than a command may wait: acknowledgements say that the command is not durable yet.",
         "Check what else writes to the disk of `state.directory`; `coec doctor` measures it.",
     ),
-    "disk_failing": Trouble(
+    "disk_failing": Problem(
         "The disk refuses what is to be remembered; it is kept in memory and tried again.",
         "Check the disk of `state.directory`: errors, owner, mount.",
     ),
-    "disk_read_only": Trouble(
+    "disk_read_only": Problem(
         "The state directory is mounted read-only: nothing is remembered over a restart.",
         "Mount it for writing; nothing has to be restarted.",
     ),
-    "disk_full": Trouble(
+    "disk_full": Problem(
         "The disk of the state directory is full: what is to be remembered waits in memory.",
         "Make room; nothing has to be restarted.",
     ),
-    "state_damaged": Trouble(
+    "state_damaged": Problem(
         "What was remembered, or a part of it, cannot be used and is kept aside; the text says what is lost and what "
         "is served.",
         "Restore the file from a backup, or calibrate if the nominal calibration is served; check the disk.",
     ),
-    "state_other_version": Trouble(
+    "state_other_version": Problem(
         "Another version of the software wrote parts of the state in a form that this one cannot read. Only these "
         "parts start anew; the text names them, and the file is kept aside.",
         "Nothing, unless the text says that the nominal calibration is served: then calibrate, or return to the "
         "version that wrote the file.",
     ),
-    "history_damaged": Trouble(
+    "history_damaged": Problem(
         "The chain of the history is broken; what there was is kept aside.",
         "Find out who may write the state directory, and check the disk.",
     ),
-    "baseline_damaged": Trouble(
+    "baseline_damaged": Problem(
         "The baseline of the rig cannot be read; limits are those of the configuration.",
         "Commission the rig again, or restore the file.",
     ),
-    "baseline_mismatch": Trouble(
+    "baseline_mismatch": Problem(
         "The baseline of the rig was learned with another rig, network or configuration, and is not used.",
         "Commission the rig again, or go back to what it was learned with.",
     ),
-    "monitor_blind": Trouble(
+    "monitor_blind": Problem(
         "Check after check comes to nothing.",
         "Read the reason: it names what fails; check frames and network.",
     ),
-    "windows_in_vain": Trouble(
+    "windows_in_vain": Problem(
         "Window after window comes to nothing.",
         "Read the reason: it names what fails; check frames and network.",
     ),
-    "overdue_worker": Trouble(
+    "overdue_worker": Problem(
         "No check has been completed for three periods: the worker has not answered.",
         "Nothing while it starts or compiles kernels; else check its load and the log.",
     ),
-    "overdue_depth": Trouble(
+    "overdue_depth": Problem(
         "No check has been completed for three periods: no depth comes.",
         "Check the depth network, or the depth maps that come with the frames.",
     ),
-    "overdue_pairing": Trouble(
+    "overdue_pairing": Problem(
         "No check has been completed for three periods: frames come, but make no pairs.",
         "Check the clocks of camera and LiDAR: `coec doctor` says how far they are apart.",
     ),
-    "overdue_data": Trouble(
+    "overdue_data": Problem(
         "No check has been completed for three periods: frames do not come, are refused, or are too few.",
         "Check the sensors, their keys and the router's rules: `coec doctor` listens for frames.",
     ),
-    "overdue_budget": Trouble(
+    "overdue_budget": Problem(
         "No check has been completed for three periods: the processor budget does not suffice.",
         "Raise `budget.cores` to what `status` says under `budget.wanted`, or lengthen `monitor.period_s` and "
         "`window.slice_s`.",
     ),
-    "service_stuck": Trouble(
+    "service_stuck": Problem(
         "What is known of the pair is not renewed: a disk or a thread is stuck.",
         "The service manager restarts the service if it stays so; check the disk.",
     ),
-    "thread_died": Trouble(
+    "thread_died": Problem(
         "A thread of the service has died; the service ends with exit code 70.",
         "The service manager starts it again; report the traceback in the log.",
     ),
-    "tokens_hidden": Trouble(
+    "tokens_hidden": Problem(
         "The router hides the liveliness tokens of this vehicle: a second daemon could serve it unseen.",
         "Let its rules allow the service `liveliness_token` and `liveliness_query`, as `deploy/router.json5` does.",
     ),
-    "two_daemons": Trouble(
+    "two_daemons": Problem(
         "Another daemon serves the vehicle; this one ends with exit code 75.",
         "End one of the two, or give them different vehicles.",
     ),
-    "rival_unproven": Trouble(
+    "rival_unproven": Problem(
         "A program holds the liveliness token of another daemon of this vehicle, but no daemon answers for it; the "
         "token is ignored, and the calibration is served as before.",
         "Find the program and end it. Let the router's rules allow tokens below `coec/@v1/<vehicle>` to the service "
         "alone, as `deploy/router.json5` does.",
     ),
-    "no_look_yet": Trouble(
+    "no_look_yet": Problem(
         "The service has not looked yet for what the configuration leaves out.",
         "Nothing; it looks four times a second.",
     ),
-    "no_image": Trouble(
+    "no_image": Problem(
         "A pair waits for its first image, which gives the camera's frame and the size of its images.",
         "Check the camera and its topic (`camera.topic`), or set `camera.frame_id` and `camera.intrinsics`.",
     ),
-    "no_cloud": Trouble(
+    "no_cloud": Problem(
         "A pair waits for its first cloud, which gives the frame of the points.",
         "Check the LiDAR and its topic, or set `lidar.frame_id` and `lidar.cloud_frame_id`.",
     ),
-    "no_motion": Trouble(
+    "no_motion": Problem(
         "A pair waits for its first ego-motion, which gives the frame of the velocities.",
         "Check its topic, set `ego.T_lidar_ego`, or take `ego` out.",
     ),
-    "no_frame_id": Trouble(
+    "no_frame_id": Problem(
         "The headers of a stream name no frame.",
         "Set the frame that the text names, or have the driver say it.",
     ),
-    "no_camera_info": Trouble(
+    "no_camera_info": Problem(
         "A pair waits for the `CameraInfo` that gives the intrinsics.",
         "Have the driver publish it, name its topic in `camera.info_topic`, or set `camera.intrinsics`.",
     ),
-    "camera_info_refused": Trouble(
+    "camera_info_refused": Problem(
         "The `CameraInfo` cannot be used: it is not in CDR, uncalibrated, or of a lens that is not known here.",
         "Calibrate the camera, or set `camera.intrinsics`.",
     ),
-    "camera_info_size": Trouble(
+    "camera_info_size": Problem(
         "The `CameraInfo` is for images of another size.",
         "Have the driver say its binning and region of interest, or set `camera.intrinsics`.",
     ),
-    "tf_static": Trouble(
+    "tf_static": Problem(
         "`/tf_static` does not connect two frames of a pair.",
         "Publish the joint that is missing (robot_state_publisher does so from a URDF), or set what the text names.",
     ),
-    "tf_static_no_tree": Trouble(
+    "tf_static_no_tree": Problem(
         "`/tf_static` contradicts itself on the way between two frames: a frame with two parents, or a loop.",
         "Have one publisher per frame; the text names the frames.",
     ),
-    "being_built": Trouble(
+    "being_built": Problem(
         "Everything that the configuration leaves out is found, and the pair is being built.",
         "Nothing; it takes a second.",
     ),
-    "cannot_be_built": Trouble(
+    "cannot_be_built": Problem(
         "What was found does not make a rig: a mask of another size, for instance.",
         "Correct what the text says; the service tries again when something on the bus changes.",
     ),
-    "nominal_changed": Trouble(
+    "nominal_changed": Problem(
         "`/tf_static` or `CameraInfo` now differ from when the pair was built; its nominal calibration stays.",
         "If the new one is right: stop the service, remove `nominal.json` from `state.directory`, start it.",
     ),
-    "held": Trouble(
+    "held": Problem(
         "A person holds the extrinsic as it is; its text says who, since when and why. The service itself is well.",
         "`coec query command/hold --release` releases it.",
     ),

@@ -37,7 +37,7 @@ class Uplink:
         self._sent: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
 
-    def use(self, config: UplinkConfig) -> None:
+    def reconfigure(self, config: UplinkConfig) -> None:
         """Keeps to this rate from now on."""
         with self._lock:
             self._fill()

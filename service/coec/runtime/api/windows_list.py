@@ -13,7 +13,7 @@ from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class _CachedListing:
     """A listing, and the answers that were made of it."""
 
     windows: tuple[WindowInfo, ...]
@@ -27,19 +27,19 @@ class WindowsList:
     def __init__(self, vehicle: str, pair: str, windows: WindowStore, snippets: SnippetStore | None) -> None:
         self._vehicle, self._pair = vehicle, pair
         self._windows, self._snippets = windows, snippets
-        self._told = _Told((), ())
+        self._listing = _CachedListing((), ())
 
     def answer(self, form: Format) -> Answer:
         """The present list in the encoding that is asked for."""
         windows = self._windows.listing(self._pair)
         snippets = () if self._snippets is None else self._snippets.listing(self._pair)
-        told = self._told
+        listing = self._listing
         # The store hands out the same tuple until it changes. Identity is compared, because comparing thousands of
         # entries takes as long as packing them.
-        if told.windows is not windows or told.snippets != snippets:
-            told = self._told = _Told(windows, snippets)
-        answer = told.answers.get(form)
+        if listing.windows is not windows or listing.snippets != snippets:
+            listing = self._listing = _CachedListing(windows, snippets)
+        answer = listing.answers.get(form)
         if answer is None:
             reply = WindowsReply(vehicle=self._vehicle, pair=self._pair, windows=windows, snippets=snippets)
-            answer = told.answers[form] = answer_of(reply, form)
+            answer = listing.answers[form] = answer_of(reply, form)
         return answer

@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from coec.config import BudgetConfig, MonitorConfig, WindowConfig
-from coec.runtime.budget.spending import Spending
-from coec.runtime.budget.turns import Share, Turns
+from coec.runtime.budget.spending import CpuUsage
+from coec.runtime.budget.turns import CheckScheduler, Share
 from coec.runtime.worker import jobs
 from coec.runtime.worker.costs import Cost
 
@@ -37,7 +37,7 @@ class BudgetReport:
 
     cores: float
     spent: float
-    wanted: float
+    demand: float
     stretched_by: float
     in_store_s: float
     pairs: Mapping[str, Share]
@@ -52,43 +52,43 @@ class Budget:
         """`clock`: a steady clock, s."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._turns = Turns(config.cores)
-        self._spending = Spending(clock())
-        self._looked_s: dict[str, float] = {}
+        self._scheduler = CheckScheduler(config.cores)
+        self._usage = CpuUsage(clock())
+        self._checked_s: dict[str, float] = {}
 
-    def use(self, config: BudgetConfig) -> None:
+    def reconfigure(self, config: BudgetConfig) -> None:
         """Spends by these settings from now on."""
         with self._lock:
-            self._turns.use(config.cores)
+            self._scheduler.reconfigure(config.cores)
 
     def join(self, pair: str, monitor: MonitorConfig, window: WindowConfig) -> float:
         """A pair joins. Returns how long its first slice is to be, s, so that windows of different pairs end at
         different times. It is no shorter than an urgent slice, which suffices for a window."""
         with self._lock:
-            phase = self._turns.join(pair, monitor.period_s, window.slice_s)
+            phase = self._scheduler.join(pair, monitor.period_s, window.slice_s)
         return window.slice_s - phase * max(window.slice_s - monitor.urgent_slice_s, 0.0)
 
-    def join_looks(self, name: str, period_s: float) -> None:
+    def join_checks(self, name: str, period_s: float) -> None:
         """Something joins that wants a look in each period but no windows."""
         with self._lock:
-            self._turns.join_looks(name, period_s)
+            self._scheduler.join_checks(name, period_s)
 
-    def affords(self, pair: str, stamp_ns: int, *, suspected: bool) -> bool:
+    def try_acquire(self, pair: str, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether a check of a pair may begin now that its stream has come to this stamp. If so, call `ended` after
         it."""
         with self._lock:
-            return self._turns.affords(pair, stamp_ns, suspected=suspected)
+            return self._scheduler.try_acquire(pair, stamp_ns, suspected=suspected)
 
     def window_turn_s(self, pair: str, stamp_ns: int) -> float:
         """By how much the end of a window that the rig wants of a pair may be delayed, s, now that the pair's stream
         has come to this stamp. The windows before it are paid by then. It then counts as being on its way."""
         with self._lock:
-            return self._turns.window_turn_s(pair, stamp_ns)
+            return self._scheduler.window_turn_s(pair, stamp_ns)
 
-    def ended(self, pair: str) -> None:
+    def release(self, pair: str) -> None:
         """A check that had begun has ended, with or without a result."""
         with self._lock:
-            self._turns.ended(pair)
+            self._scheduler.release(pair)
 
     def pay(self, cost: Cost) -> None:
         """Books the cost of the worker's work, for a pair that has joined or for none. Windows of earlier runs,
@@ -96,34 +96,34 @@ class Budget:
         are earned."""
         now_s = self._clock()
         with self._lock:
-            self._spending.add(cost.kind, cost.pair, cost.cpu_s, now_s)
+            self._usage.add(cost.kind, cost.pair, cost.cpu_s, now_s)
             match cost.kind:
                 case jobs.Kind.CHECK | jobs.Kind.REGISTER:
-                    self._looked_s[cost.pair] = now_s
-                    self._turns.looked(cost.pair, cost.cpu_s)
+                    self._checked_s[cost.pair] = now_s
+                    self._scheduler.record_check(cost.pair, cost.cpu_s)
                 case jobs.Kind.SOLVE:
-                    self._turns.solved(cost.pair, cost.cpu_s)
+                    self._scheduler.record_solve(cost.pair, cost.cpu_s)
                 case jobs.PREFETCH:
-                    self._turns.prepared(cost.pair, cost.cpu_s)
+                    self._scheduler.record_preparation(cost.pair, cost.cpu_s)
 
     @property
     def stretch(self) -> float:
         """Factor by which slices are to be longer than configured, at least 1."""
         with self._lock:
-            return self._turns.stretch
+            return self._scheduler.stretch
 
     def report(self) -> BudgetReport:
         """How the budget is spent."""
         now_s = self._clock()
         with self._lock:
-            turns = self._turns
+            scheduler = self._scheduler
             return BudgetReport(
-                turns.cores,
-                self._spending.cores(now_s),
-                turns.wanted,
-                turns.stretch,
-                turns.in_store_s,
-                turns.shares(),
-                {pair: now_s - looked_s for pair, looked_s in self._looked_s.items()},
-                self._spending.totals_s,
+                scheduler.cores,
+                self._usage.cores(now_s),
+                scheduler.demand,
+                scheduler.stretch,
+                scheduler.in_store_s,
+                scheduler.shares(),
+                {pair: now_s - checked_s for pair, checked_s in self._checked_s.items()},
+                self._usage.totals_s,
             )

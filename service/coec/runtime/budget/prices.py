@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 
-KEPT = 9
+COST_SAMPLES = 9
 """How many measurements are kept; their median is the price. Outliers (other load on the machine, a new process, a hard
 scene) do not move it while they are fewer than half."""
 
-MOST_S = 600.0
+LARGEST_COST_S = 600.0
 """Most processor time that one measurement counts, s: five times the longest that a job may take by default."""
 
 
-class Price:
+class CostModel:
     """Processor time of one kind of work, s.
 
     Attributes:
@@ -20,13 +20,13 @@ class Price:
     """
 
     def __init__(self) -> None:
-        self._seen: deque[float] = deque(maxlen=KEPT)
+        self._seen: deque[float] = deque(maxlen=COST_SAMPLES)
         self.cpu_s = 0.0
 
     def add(self, cpu_s: float) -> None:
         """Adds a measurement."""
-        self._seen.append(min(max(cpu_s, 0.0), MOST_S))
-        self.cpu_s = middle_s(list(self._seen))
+        self._seen.append(min(max(cpu_s, 0.0), LARGEST_COST_S))
+        self.cpu_s = lower_median_s(list(self._seen))
 
     @property
     def known(self) -> bool:
@@ -34,6 +34,6 @@ class Price:
         return bool(self._seen)
 
 
-def middle_s(measured_s: list[float]) -> float:
+def lower_median_s(measured_s: list[float]) -> float:
     """The median, the lower one of two; 0 if there are no measurements."""
     return sorted(measured_s)[(len(measured_s) - 1) // 2] if measured_s else 0.0

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-DEPTH_S = 10.0
+BUCKET_DEPTH_S = 10.0
 """Depth of the store, in seconds of the budget: two rounds of checks every five seconds. As much may be borrowed, so
 others wait at most this time longer for their turn."""
 
-LOOKS_SHARE = 0.25
+CHECKS_SHARE = 0.25
 """Share of the budget that is reserved for looks: however much windows cost, what is served has to be checked."""
 
 
@@ -34,7 +34,7 @@ class Debt:
     next_s: float = 0.0
 
 
-class Store:
+class TokenBucket:
     """The store of the whole service. It begins full."""
 
     def __init__(self, cores: float) -> None:
@@ -46,9 +46,9 @@ class Store:
     @property
     def depth_s(self) -> float:
         """Largest level of the store, and largest debt, s."""
-        return DEPTH_S * self._cores
+        return BUCKET_DEPTH_S * self._cores
 
-    def use(self, cores: float) -> None:
+    def reconfigure(self, cores: float) -> None:
         """Sets another budget. What is in store stays, up to the new depth."""
         self._cores = cores
         self.level_s = min(self.level_s, self.depth_s)
@@ -59,7 +59,7 @@ class Store:
         passed_s, self._now_s = max(now_s - self._now_s, 0.0), max(now_s, self._now_s)
         earned_s = self._cores * passed_s
         due_s = [max(debt.owed_s + debt.next_s, 0.0) * -math.expm1(-passed_s / debt.over_s) for debt in debts]
-        paid_s = min(sum(due_s), (1.0 - LOOKS_SHARE) * earned_s)
+        paid_s = min(sum(due_s), (1.0 - CHECKS_SHARE) * earned_s)
         for debt, part_s in zip(debts, due_s, strict=True):
             debt.owed_s -= part_s * paid_s / sum(due_s) if paid_s else 0.0
         self.level_s = min(self.level_s + earned_s - paid_s, self.depth_s)

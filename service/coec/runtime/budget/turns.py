@@ -15,14 +15,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from coec.runtime.budget.drive_clock import DriveClock
-from coec.runtime.budget.prices import Price, middle_s
-from coec.runtime.budget.store import LOOKS_SHARE, Debt, Store
+from coec.runtime.budget.prices import CostModel, lower_median_s
+from coec.runtime.budget.store import CHECKS_SHARE, Debt, TokenBucket
 
 SEEN_PERIODS = 6
 """A pair that has asked for nothing for so many of its periods takes no part, because its streams or the vehicle have
 stopped. The pairs of one check may span as many periods."""
 
-STEPS = 20
+STRETCH_STEPS = 20
 """Lengths are stretched in steps of one twentieth, so that small changes of a price change nothing."""
 
 
@@ -38,7 +38,7 @@ class Share:
         active: the pair's streams ask for checks.
     """
 
-    look_s: float | None
+    check_s: float | None
     window_s: float | None
     suspected: bool
     waiting: bool
@@ -46,64 +46,64 @@ class Share:
 
 
 @dataclass(slots=True)
-class _Pair:
+class _PairBudget:
     """A pair that shares the budget. `asked_s`: when it last asked; `waits`: whether it was refused then. `begun_s`:
     when its last check began. `has_windows`: False if it wants looks only. `in_hand`: number of checks that have begun
     and not ended. `prepared_s`: cost of the depth for the open window so far."""
 
     period_s: float
     debt: Debt
-    begun_s: float
+    started_s: float
     has_windows: bool = True
-    asked_s: float = -math.inf
+    requested_s: float = -math.inf
     waits: bool = False
     suspected: bool = False
     in_hand: int = 0
-    look: Price = field(default_factory=Price)
-    window: Price = field(default_factory=Price)
+    check_cost: CostModel = field(default_factory=CostModel)
+    window_cost: CostModel = field(default_factory=CostModel)
     prepared_s: float = 0.0
 
 
-class Turns:
+class CheckScheduler:
     """The turns of all pairs of a service."""
 
     def __init__(self, cores: float) -> None:
         self._cores = cores
         self._clock = DriveClock()
-        self._store = Store(cores)
-        self._pairs: dict[str, _Pair] = {}
+        self._bucket = TokenBucket(cores)
+        self._pairs: dict[str, _PairBudget] = {}
         self._windows_until_s = 0.0
 
-    def use(self, cores: float) -> None:
+    def reconfigure(self, cores: float) -> None:
         """Sets another budget."""
         self._cores = cores
-        self._store.use(cores)
+        self._bucket.reconfigure(cores)
 
     def join(self, name: str, period_s: float, slice_s: float) -> float:
         """A pair joins that wants a check in each period and a window in each slice. Returns at which part of its
         slice, from 0 to 1, its first window begins. Windows of different pairs are to end at different times, because
         the worker solves one after the other and each pair waits for its own."""
         phase = _phase(len(self._pairs))
-        self._pairs[name] = _Pair(period_s, Debt(slice_s), self._clock.now_s)
+        self._pairs[name] = _PairBudget(period_s, Debt(slice_s), self._clock.now_s)
         return phase
 
-    def join_looks(self, name: str, period_s: float) -> None:
+    def join_checks(self, name: str, period_s: float) -> None:
         """Something joins that wants a look in each period but no windows."""
-        self._pairs[name] = _Pair(period_s, Debt(period_s), self._clock.now_s, has_windows=False)
+        self._pairs[name] = _PairBudget(period_s, Debt(period_s), self._clock.now_s, has_windows=False)
 
-    def affords(self, name: str, stamp_ns: int, *, suspected: bool) -> bool:
+    def try_acquire(self, name: str, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether a check of a pair may begin, now that its stream has come to a stamp. If so, it counts as begun."""
         pair = self._pairs[name]
         now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * pair.period_s)
         self._earn(now_s)
-        pair.asked_s, pair.waits, pair.suspected = now_s, True, suspected
+        pair.requested_s, pair.waits, pair.suspected = now_s, True, suspected
         claim = self._claim(name, now_s)
         others = [each for each in self._pairs if each != name and self._waits(each)]
-        ahead_s = sum(self._look_s(self._pairs[each]) for each in others if self._claim(each, now_s) > claim)
-        in_hand_s = sum(each.in_hand * self._look_s(each) for each in self._pairs.values() if each.in_hand)
-        if self._store.level_s - in_hand_s - ahead_s < (-self._store.depth_s if suspected else 0.0):
+        ahead_s = sum(self._check_s(self._pairs[each]) for each in others if self._claim(each, now_s) > claim)
+        in_hand_s = sum(each.in_hand * self._check_s(each) for each in self._pairs.values() if each.in_hand)
+        if self._bucket.level_s - in_hand_s - ahead_s < (-self._bucket.depth_s if suspected else 0.0):
             return False
-        pair.begun_s, pair.waits = now_s, False
+        pair.started_s, pair.waits = now_s, False
         pair.in_hand += 1
         return True
 
@@ -114,30 +114,30 @@ class Turns:
         so that small changes of a price move no slice."""
         now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * self._pairs[name].period_s)
         begin_s = max(self._windows_until_s, now_s)
-        earned_in_s = self._window_s(self._pairs[name]) / ((1.0 - LOOKS_SHARE) * self._cores)
+        earned_in_s = self._window_s(self._pairs[name]) / ((1.0 - CHECKS_SHARE) * self._cores)
         self._windows_until_s = begin_s + math.ceil(earned_in_s)
         return begin_s - now_s
 
-    def ended(self, name: str) -> None:
+    def release(self, name: str) -> None:
         """A check that had begun has ended, with or without a result."""
         self._pairs[name].in_hand -= 1
 
-    def looked(self, name: str, cpu_s: float) -> None:
+    def record_check(self, name: str, cpu_s: float) -> None:
         """Books the cost of a check."""
         pair = self._pairs[name]
-        pair.look.add(cpu_s)
-        self._store.pay(cpu_s, pair.look.cpu_s)
+        pair.check_cost.add(cpu_s)
+        self._bucket.pay(cpu_s, pair.check_cost.cpu_s)
 
-    def prepared(self, name: str, cpu_s: float) -> None:
+    def record_preparation(self, name: str, cpu_s: float) -> None:
         """Books the cost of depth for the open window."""
         pair = self._pairs[name]
         pair.prepared_s += cpu_s
         pair.debt.owed_s += cpu_s
 
-    def solved(self, name: str, cpu_s: float) -> None:
+    def record_solve(self, name: str, cpu_s: float) -> None:
         """Books the cost of a window, in addition to what was prepared."""
         pair = self._pairs[name]
-        pair.window.add(pair.prepared_s + cpu_s)
+        pair.window_cost.add(pair.prepared_s + cpu_s)
         pair.prepared_s = 0.0
         pair.debt.owed_s += cpu_s
 
@@ -147,10 +147,10 @@ class Turns:
         return self._cores
 
     @property
-    def wanted(self) -> float:
+    def demand(self) -> float:
         """What all checks and windows of the active pairs would need, in cores."""
         return sum(
-            self._look_s(pair) / pair.period_s + self._window_s(pair) / pair.debt.over_s
+            self._check_s(pair) / pair.period_s + self._window_s(pair) / pair.debt.over_s
             for pair in self._pairs.values()
             if self._active(pair)
         )
@@ -158,19 +158,19 @@ class Turns:
     @property
     def stretch(self) -> float:
         """Factor by which all periods and slices are longer than configured, at least 1."""
-        return max(math.ceil(STEPS * self.wanted / self._cores) / STEPS, 1.0)
+        return max(math.ceil(STRETCH_STEPS * self.demand / self._cores) / STRETCH_STEPS, 1.0)
 
     @property
     def in_store_s(self) -> float:
         """Processor time in store; negative: borrowed."""
-        return self._store.level_s
+        return self._bucket.level_s
 
     def shares(self) -> Mapping[str, Share]:
         """What each pair takes."""
         return {
             name: Share(
-                pair.look.cpu_s if pair.look.known else None,
-                pair.window.cpu_s if pair.window.known else None,
+                pair.check_cost.cpu_s if pair.check_cost.known else None,
+                pair.window_cost.cpu_s if pair.window_cost.known else None,
                 pair.suspected,
                 self._waits(name),
                 self._active(pair),
@@ -181,40 +181,40 @@ class Turns:
     def _earn(self, now_s: float) -> None:
         for pair in self._pairs.values():
             pair.debt.next_s = self._window_s(pair) if self._active(pair) else 0.0
-        self._store.earn(now_s, [pair.debt for pair in self._pairs.values()])
+        self._bucket.earn(now_s, [pair.debt for pair in self._pairs.values()])
 
-    def _look_s(self, pair: _Pair) -> float:
+    def _check_s(self, pair: _PairBudget) -> float:
         """Price of a check, processor time."""
-        if pair.look.known:
-            return pair.look.cpu_s
-        alike = [each.look for each in self._pairs.values() if each.has_windows is pair.has_windows]
+        if pair.check_cost.known:
+            return pair.check_cost.cpu_s
+        alike = [each.check_cost for each in self._pairs.values() if each.has_windows is pair.has_windows]
         return _expected_s(alike)
 
-    def _window_s(self, pair: _Pair) -> float:
+    def _window_s(self, pair: _PairBudget) -> float:
         """Price of a window, processor time."""
-        if pair.window.known or not pair.has_windows:
-            return pair.window.cpu_s
-        return _expected_s([each.window for each in self._pairs.values()])
+        if pair.window_cost.known or not pair.has_windows:
+            return pair.window_cost.cpu_s
+        return _expected_s([each.window_cost for each in self._pairs.values()])
 
     def _claim(self, name: str, now_s: float) -> tuple[bool, float, str]:
         """Sort key of a pair's claim; the greatest comes first. The name decides between equals, so that the order is
         always the same."""
         pair = self._pairs[name]
-        return pair.suspected, (now_s - pair.begun_s) / pair.period_s, name
+        return pair.suspected, (now_s - pair.started_s) / pair.period_s, name
 
     def _waits(self, name: str) -> bool:
         """Whether a check of a pair waits for its turn. After its stream has stopped it waits for one period more."""
         pair = self._pairs[name]
-        return pair.waits and self._clock.now_s - pair.asked_s <= pair.period_s
+        return pair.waits and self._clock.now_s - pair.requested_s <= pair.period_s
 
-    def _active(self, pair: _Pair) -> bool:
-        return self._clock.now_s - pair.asked_s <= SEEN_PERIODS * pair.period_s
+    def _active(self, pair: _PairBudget) -> bool:
+        return self._clock.now_s - pair.requested_s <= SEEN_PERIODS * pair.period_s
 
 
-def _expected_s(others: Sequence[Price]) -> float:
+def _expected_s(others: Sequence[CostModel]) -> float:
     """Expected price of a pair that has none yet, s: the median of the others' prices. It matters because with many
     pairs the first windows are most of the work of the first minutes."""
-    return middle_s([each.cpu_s for each in others if each.known])
+    return lower_median_s([each.cpu_s for each in others if each.known])
 
 
 def _phase(index: int) -> float:

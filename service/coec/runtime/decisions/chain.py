@@ -24,7 +24,7 @@ from pydantic import ValidationError
 
 from coec.adapters.files import durable
 from coec.adapters.files.conversions import matrix_of
-from coec.adapters.files.ledger import Ledger
+from coec.adapters.files.ledger import AppendLog
 from coec.adapters.files.state_file import BROKEN
 from coec.errors import DecodeError, StateError
 from coec.geometry.se3 import is_rigid
@@ -40,7 +40,7 @@ MAX_DIGITS = 19
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class HistoryRecord:
     """An entry with its hash, its line in the file, and the result if it is the entry of a window's result and this
     version can read it."""
 
@@ -55,7 +55,7 @@ class Kept:
         return ChainedEntry(sha256=self.sha256, entry=self.entry)
 
 
-class Chain:
+class HashChain:
     """The entries of one book, oldest first. Safe to use from several threads; only `flush` waits for the disk.
 
     Entries go to the disk in order, so the chain on the disk is sound at any time.
@@ -67,9 +67,9 @@ class Chain:
     def __init__(self, path: Path, limit: int, head: str | None = None) -> None:
         """`head` is the `durable_head` in the state file: a chain that does not reach it was cut off."""
         self._path = path
-        self._ledger: Ledger[Kept] = Ledger(path, limit, lambda kept: kept.line)
+        self._ledger: AppendLog[HistoryRecord] = AppendLog(path, limit, lambda record: record.line)
         self._writing = threading.Lock()
-        self._to_keep_aside = False
+        self._to_quarantine = False
         self.damage: str | None = None
         self._load(head)
 
@@ -80,19 +80,19 @@ class Chain:
         durable = self._ledger.durable
         return None if durable is None else f"{durable.entry.sequence} {durable.sha256}"
 
-    def entries(self) -> tuple[Kept, ...]:
+    def entries(self) -> tuple[HistoryRecord, ...]:
         """All entries that are kept."""
         return self._ledger.items()
 
-    def on_disk(self) -> tuple[Kept, ...]:
+    def on_disk(self) -> tuple[HistoryRecord, ...]:
         """All entries that are on the disk."""
         return self._ledger.on_disk()
 
-    def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
+    def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> HistoryRecord:
         """Appends an entry and fills in its place in the chain. Its number stays, or becomes the next one if it is
         taken. The next `flush` writes it."""
 
-        def placed_behind(last: Kept | None) -> Kept:
+        def placed_behind(last: HistoryRecord | None) -> HistoryRecord:
             placed = entry.model_copy(
                 update={
                     "sequence": max(entry.sequence, last.entry.sequence + 1 if last else 0),
@@ -103,7 +103,7 @@ class Chain:
             document = to_json(placed)
             sha256 = _sha256(document)
             body = document + b"\t" + (to_json(result) if result else b"null")
-            return Kept(sha256, placed, result, sha256.encode() + b" " + body)
+            return HistoryRecord(sha256, placed, result, sha256.encode() + b" " + body)
 
         return self._ledger.add(placed_behind)
 
@@ -115,27 +115,27 @@ class Chain:
         """
         with self._writing:
             try:
-                if self._to_keep_aside:
-                    durable.set_aside(self._path, BROKEN)
-                    self._to_keep_aside = False
+                if self._to_quarantine:
+                    durable.quarantine(self._path, BROKEN)
+                    self._to_quarantine = False
                 self._ledger.flush()
             except OSError as error:
                 raise StateError(f"cannot write {self._path}: {error.strerror}") from error
 
     def _load(self, head: str | None) -> None:
         lines = self._read()
-        chain: list[Kept] = []
+        chain: list[HistoryRecord] = []
         for number, line in enumerate(lines, start=1):
-            kept = _parsed(line)
-            if kept is None or (chain and kept.entry.previous_sha256 != chain[-1].sha256):
+            record = _parsed(line)
+            if record is None or (chain and record.entry.previous_sha256 != chain[-1].sha256):
                 self.damage = f"line {number} of {len(lines)} is not what its hash, or the one before it, says"
                 break
-            chain.append(kept)
-            self._ledger.found(kept)
+            chain.append(record)
+            self._ledger.restored(record)
         if self.damage is None and not _reaches(self._ledger.items(), head):
             self.damage = "its end was cut off: it lacks an entry that the state file knows of"
         if self.damage is not None:
-            self._to_keep_aside = True
+            self._to_quarantine = True
             self._ledger.renew()
             with contextlib.suppress(StateError):
                 self.flush()
@@ -148,7 +148,7 @@ class Chain:
             return []
 
 
-def _parsed(line: bytes) -> Kept | None:
+def _parsed(line: bytes) -> HistoryRecord | None:
     """The entry of a line; None if the line contradicts its hashes, or holds a matrix that is no pose."""
     sha256, _, body = line.partition(b" ")
     document, _, result = body.partition(b"\t")
@@ -173,7 +173,7 @@ def _parsed(line: bytes) -> Kept | None:
     result_sha256 = None if entry.result_sha256 is None else _sha256(result)
     if _sha256(document).encode() != sha256 or result_sha256 != entry.result_sha256:
         return None
-    return Kept(sha256.decode(), entry, reported, line)
+    return HistoryRecord(sha256.decode(), entry, reported, line)
 
 
 def _stand_in(document: bytes) -> HistoryEntry | None:
@@ -204,7 +204,7 @@ def _other_version(document: bytes) -> dict[str, Any] | None:
     return fields if isinstance(version, int) and version != SCHEMA_VERSION else None
 
 
-def _reaches(chain: Sequence[Kept], head: str | None) -> bool:
+def _reaches(chain: Sequence[HistoryRecord], head: str | None) -> bool:
     """Whether a sound chain holds the entry that `head` names, or only later ones because the oldest were dropped."""
     if head is None:
         return True
@@ -212,7 +212,7 @@ def _reaches(chain: Sequence[Kept], head: str | None) -> bool:
     if not (number.isdecimal() and len(number) <= MAX_DIGITS and chain):
         return False
     return int(number) < chain[0].entry.sequence or any(
-        kept.entry.sequence == int(number) and kept.sha256 == sha256 for kept in chain
+        record.entry.sequence == int(number) and record.sha256 == sha256 for record in chain
     )
 
 

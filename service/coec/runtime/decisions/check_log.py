@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from coec.adapters.files.ledger import Ledger
+from coec.adapters.files.ledger import AppendLog
 from coec.errors import StateError
 from coec.schemas.base import to_json
 from coec.schemas.replies import CheckReply
@@ -22,7 +22,7 @@ class CheckLog:
     def __init__(self, path: Path, limit: int) -> None:
         """`path` holds the checks of earlier runs; the newest `limit` are kept."""
         self._path = path
-        self._ledger: Ledger[CheckReply] = Ledger(path, limit, to_json)
+        self._ledger: AppendLog[CheckReply] = AppendLog(path, limit, to_json)
         self._load()
 
     def checks(self) -> tuple[CheckReply, ...]:
@@ -55,4 +55,4 @@ class CheckLog:
             return
         for line in lines:
             with contextlib.suppress(ValidationError):
-                self._ledger.found(CheckReply.model_validate_json(line))
+                self._ledger.restored(CheckReply.model_validate_json(line))

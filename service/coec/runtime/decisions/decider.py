@@ -21,53 +21,53 @@ from coec.adapters.files.conversions import check_of, estimate_of, matrix_of
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration import lifecycle
-from coec.calibration.commissioning.baseline import Drift
-from coec.calibration.frames.window import KeptPairs
-from coec.calibration.lifecycle import HealthState, PairState, Rules
-from coec.calibration.monitor.change_detector import Finding, holds_at_rest
+from coec.calibration.commissioning.baseline import BaselineDrift
+from coec.calibration.frames.window import CarriedOverPairs
+from coec.calibration.lifecycle import HealthState, PairRules, PairState
+from coec.calibration.monitor.change_detector import MonitorOutcome, holds_at_rest
 from coec.calibration.types import Decision, Matrix4, Reason
 from coec.config import CalibrationConfig, PairConfig
 from coec.geometry import se3
 from coec.reports.holds import hold_text
 from coec.runtime.decisions.incident_pictures import IncidentPictures
-from coec.runtime.decisions.mailbox import Mailbox
-from coec.runtime.decisions.pair_store import PairStore, Taken
-from coec.runtime.decisions.progress import Attempts, Progress
-from coec.runtime.decisions.queue import DecisionQueue, Effect, Question, Take
+from coec.runtime.decisions.mailbox import TaskQueue
+from coec.runtime.decisions.pair_store import PairStore, StateTransition
+from coec.runtime.decisions.progress import Attempts, CheckProgress
+from coec.runtime.decisions.queue import Effect, PendingRequest, ResultSchedule, TakeResult
 from coec.runtime.decisions.rig_baseline import RigBaseline
-from coec.runtime.ingest.chooser import Served
+from coec.runtime.ingest.chooser import ServedExtrinsic
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import start_ns_of
-from coec.runtime.rig.pair_side import Correction, PairOfRig
+from coec.runtime.rig.pair_side import PairCorrection, RigMember
 from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved, WrittenFile
 from coec.runtime.worker.queue import STOPPING
 from coec.schemas.replies import CalibrationResult, CheckReply
 
 _log = logging.getLogger(__name__)
 
-EVENTS = (HealthState.SUSPECT, HealthState.DEGRADED, HealthState.MISCALIBRATED)
+INCIDENT_STATES = (HealthState.SUSPECT, HealthState.DEGRADED, HealthState.MISCALIBRATED)
 """States whose beginning is an event. A snippet of the seconds around it is recorded, if snippets are wanted."""
 
-FINDINGS: Mapping[Finding, str] = MappingProxyType(
+FINDINGS: Mapping[MonitorOutcome, str] = MappingProxyType(
     {
-        Finding.UNKNOWN: "not enough to judge what is served",
-        Finding.CLEAR: "they agree with what is served",
-        Finding.AT_ODDS: "they contradict what is served, but not by one move of the mount",
-        Finding.SUSPECT: "the mount may have moved; a window is wanted soon",
-        Finding.CONFIRMED: "the mount has moved",
+        MonitorOutcome.UNKNOWN: "not enough to judge what is served",
+        MonitorOutcome.CLEAR: "they agree with what is served",
+        MonitorOutcome.AT_ODDS: "they contradict what is served, but not by one move of the mount",
+        MonitorOutcome.SUSPECT: "the mount may have moved; a window is wanted soon",
+        MonitorOutcome.CONFIRMED: "the mount has moved",
     }
 )
 """What the checks of a pair say, for the log."""
 
-UNTOLD_S = 0.02
+UNPUBLISHED_RETRY_S = 0.02
 """Time between two attempts to report a state that is about to reach the disk, s."""
 
 TICK_S = 1.0
 """Longest time between two looks at the clocks, s. While the thread lives, health is never older than that."""
 
 
-class StreamSide(Protocol):
+class StreamControl(Protocol):
     """The stream of the pair, as the decider uses it. `adopt`, `alarm`, `keep`, `calm` and `event` are called on the
     stream's thread."""
 
@@ -78,13 +78,13 @@ class StreamSide(Protocol):
     def call(self, effect: Effect) -> None:
         """Has an effect run on the stream's thread."""
 
-    def adopt(self, served: Served) -> None:
+    def adopt(self, served: ServedExtrinsic) -> None:
         """Another extrinsic is served."""
 
     def alarm(self, since_ns: int) -> None:
         """A window of pairs since this sensor time is wanted soon."""
 
-    def keep(self, kept: KeptPairs) -> None:
+    def carry_over(self, carried_over: CarriedOverPairs) -> None:
         """Pairs of a window belong to the next one."""
 
     def calm(self) -> None:
@@ -95,7 +95,7 @@ class StreamSide(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class PairSnapshot:
     """Everything that is known of a pair at one moment, from which its answers are made.
 
     Attributes:
@@ -112,11 +112,11 @@ class Known:
     """
 
     state: PairState
-    served: Served
+    served: ServedExtrinsic
     check: CheckReply | None
-    troubles: tuple[Reason, ...]
-    drift: Drift | None
-    result_drift: Drift | None
+    problems: tuple[Reason, ...]
+    drift: BaselineDrift | None
+    result_drift: BaselineDrift | None
     since_ns: int
     completed_stamp_ns: int | None
     age_s: float | None
@@ -125,7 +125,7 @@ class Known:
     transitions: tuple[tuple[str, int], ...]
 
 
-class Decider:
+class CalibrationManager:
     """Decides about one pair. `mailbox` is for any thread; everything else belongs to `thread`."""
 
     def __init__(
@@ -134,20 +134,20 @@ class Decider:
         stale_after_s: float,
         store: PairStore,
         baseline: RigBaseline,
-        queue: DecisionQueue,
+        queue: ResultSchedule,
         pictures: IncidentPictures,
-        stream: StreamSide,
-        rig: PairOfRig,
-        mailbox: Mailbox,
+        stream: StreamControl,
+        rig: RigMember,
+        mailbox: TaskQueue,
         losses: LossCounter,
         calibrate_with: Callable[[CalibrationConfig], None],
-        tell: Callable[[Known], None],
+        on_update: Callable[[PairSnapshot], None],
     ) -> None:
         """`calibrate_with` is called with the configuration for windows that begin from then on. `tell` is called with
         what is known, whenever something may have changed and once a second."""
         self.thread = ServiceThread(f"decisions-{pair.name}", self._run)
         self._name = pair.name
-        self._rules = Rules(pair.policy, pair.tracker, pair.monitor)
+        self._rules = PairRules(pair.policy, pair.tracker, pair.monitor)
         self._stale_after_s = stale_after_s
         self._store = store
         self._baseline = baseline
@@ -158,16 +158,16 @@ class Decider:
         self._mailbox = mailbox
         self._losses = losses
         self._calibrate_with = calibrate_with
-        self._tell = tell
-        self._progress = Progress(pair.monitor.period_s, time.monotonic(), stream.report)
-        self._looked_s = time.monotonic()
+        self._on_update = on_update
+        self._progress = CheckProgress(pair.monitor.period_s, time.monotonic(), stream.report)
+        self._clocks_checked_s = time.monotonic()
         self._latest_check: CheckReply | None = None
         self._checks = 0
         self._solved = 0
         self._check_attempts = Attempts("checks", "monitor_blind")
         self._window_attempts = Attempts("windows", "windows_in_vain")
         self._overdue: Reason | None = None
-        self._untold = False
+        self._unpublished = False
         self._health = store.state.health
 
     def request_stop(self) -> None:
@@ -175,15 +175,15 @@ class Decider:
         self.thread.request_stop()
         self._mailbox.wake()
 
-    def known(self) -> Known:
+    def snapshot(self) -> PairSnapshot:
         """What is known now."""
         state, latest = self._store.state, self._store.state.latest
         accepted = None if state.accepted is None else state.accepted.sigma
-        return Known(
+        return PairSnapshot(
             state=state,
             served=self._store.served,
             check=self._latest_check,
-            troubles=self._troubles(),
+            problems=self._problems(),
             drift=self._baseline.drift(state.T_camera_lidar, accepted),
             result_drift=None if latest is None else self._baseline.drift(latest.optimum.T_camera_lidar, latest.sigma),
             since_ns=self._store.since_ns,
@@ -211,12 +211,12 @@ class Decider:
     def work(self, timeout_s: float) -> bool:
         """Does the next piece of work, or looks at the clocks if none comes for `timeout_s`. Returns whether there was
         work."""
-        item = self._mailbox.take(UNTOLD_S if self._untold else timeout_s)
+        item = self._mailbox.take(UNPUBLISHED_RETRY_S if self._unpublished else timeout_s)
         if item is not None:
             item()
         now_s = time.monotonic()
-        if item is not None or self._untold or now_s - self._looked_s >= TICK_S:
-            self.look_at_clocks(now_s)
+        if item is not None or self._unpublished or now_s - self._clocks_checked_s >= TICK_S:
+            self.check_clocks(now_s)
         self._note_event()
         return item is not None
 
@@ -225,17 +225,17 @@ class Decider:
         decision."""
         before, state = self._health, self._store.state
         self._health = state.health
-        if state.health is not before and state.health in EVENTS:
+        if state.health is not before and state.health in INCIDENT_STATES:
             self._stream.call(partial(self._stream.event, state.health.value, state.T_camera_lidar))
 
-    def tell_now(self) -> None:
+    def publish(self) -> None:
         """Reports what is known, even if it is not on the disk yet."""
-        self._untold = False
-        self._tell(self.known())
+        self._unpublished = False
+        self._on_update(self.snapshot())
 
-    def look_at_clocks(self, monotonic_s: float) -> None:
+    def check_clocks(self, monotonic_s: float) -> None:
         """Gives up questions that have waited too long, ages the state, and reports it."""
-        self._looked_s = monotonic_s
+        self._clocks_checked_s = monotonic_s
         lost = self._queue.expire(monotonic_s, self._lost_question)
         if lost:
             self._losses.add("monitor", "unanswered", lost)
@@ -243,49 +243,49 @@ class Decider:
         self._overdue = self._progress.overdue(self._stream.report, monotonic_s, at_rest=at_rest)
         self._store.age(self._overdue, self._progress.silent_s(monotonic_s), self._stale_after_s)
         # As long as the disk is only busy, nothing is reported that a restart would not know.
-        self._untold = not self._store.may_be_told()
-        if not self._untold:
-            self.tell_now()
+        self._unpublished = not self._store.may_be_published()
+        if not self._unpublished:
+            self.publish()
 
-    def use(self, pair: PairConfig, stale_after_s: float, told: str) -> None:
+    def reconfigure(self, pair: PairConfig, stale_after_s: float, history_text: str) -> None:
         """Judges by other settings from now on; `told` is the entry for the history."""
-        self._rules = Rules(pair.policy, pair.tracker, pair.monitor)
+        self._rules = PairRules(pair.policy, pair.tracker, pair.monitor)
         self._stale_after_s = stale_after_s
-        self._baseline.use(pair)
+        self._baseline.reconfigure(pair)
         self._calibrate_with(self._baseline.calibration)
-        self._store.note_command("reload", "reloaded", told, "SIGHUP", accepted=True)
+        self._store.note_command("reload", "reloaded", history_text, "SIGHUP", accepted=True)
         self._store.save()
 
     # --- answers ----------------------------------------------------------------------------------------------------
 
-    def checked(self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
+    def checked(self, request: PendingRequest, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
         """A check of the extrinsic of `epoch` has ended. `standing_ns`: stamps of its pairs that were taken while the
         vehicle stood."""
-        self._queue.answer(question, partial(self._take_check, question, epoch, standing_ns, outcome))
+        self._queue.answer(request, partial(self._take_check, request, epoch, standing_ns, outcome))
 
     def solved(self, window_id: str, outcome: JobOutcome, *, live: bool) -> None:
         """The solve of a window has ended."""
-        question = self._queue.about(window_id) if live else None
-        take: Take = (
-            partial(self._take_result, question, outcome.answer, live)
+        request = self._queue.about(window_id) if live else None
+        take: TakeResult = (
+            partial(self._take_result, request, outcome.answer, live)
             if isinstance(outcome.answer, Solved)
             else partial(self._take_failure, outcome.reason or _NO_ANSWER, live)
         )
-        if question is not None:
-            self._queue.answer(question, take)
+        if request is not None:
+            self._queue.answer(request, take)
         elif (effect := take()) is not None:
             # No question waits for this window: it was solved by command, or is of an earlier run.
             self._stream.call(effect)
 
     def lost(self, window_id: str) -> None:
         """A window ended without being recorded."""
-        question = self._queue.about(window_id)
-        if question is not None:
-            self._queue.answer(question, partial(self._take_failure, _NOT_RECORDED, True))
+        request = self._queue.about(window_id)
+        if request is not None:
+            self._queue.answer(request, partial(self._take_failure, _NOT_RECORDED, True))
 
-    def corrected(self, question: Question, correction: Correction) -> None:
+    def corrected(self, request: PendingRequest, correction: PairCorrection) -> None:
         """The rig has a correction for the pair."""
-        self._queue.answer(question, partial(self._take_correction, question, correction))
+        self._queue.answer(request, partial(self._take_correction, request, correction))
 
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
@@ -332,11 +332,11 @@ class Decider:
     # --- taking them, in order --------------------------------------------------------------------------------------
 
     def _take_check(
-        self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome
+        self, request: PendingRequest, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome
     ) -> Effect | None:
         answer = outcome.answer
         if not isinstance(answer, Checked):
-            self._check_in_vain(outcome.reason or _NO_ANSWER)
+            self._check_failed(outcome.reason or _NO_ANSWER)
             return None
         refused = answer.baseline_not_used is not None and self._baseline.refuse(answer.baseline_not_used)
         observation = replace(answer.observation, standing_stamps_ns=standing_ns)
@@ -345,27 +345,27 @@ class Decider:
             lambda state: lifecycle.after_observation(state, observation, self._rules),
             observation.stamp_ns,
             completed=True,
-            question=question,
+            request=request,
             epoch=epoch,
             by_check=True,
         )
         if effect is None:
             self._losses.add("monitor", "check_overtaken")
         else:
-            self._rig.looked(question.due_ns, before, self._store.state, observation)
+            self._rig.on_check(request.due_ns, before, self._store.state, observation)
             self._check_attempts.succeeded()
             self._checks += 1
             self._latest_check = check_of(observation, self._store.state)
             self._store.note_check(self._latest_check)
             self._log_finding(before.monitor.outcome, self._store.state.monitor.outcome)
-        return self._calibrating_anew(effect) if refused else effect
+        return self._with_new_configuration(effect) if refused else effect
 
-    def _check_in_vain(self, reason: Reason) -> None:
+    def _check_failed(self, reason: Reason) -> None:
         self._losses.add("monitor", f"check_{reason.code}", detail=reason.text)
         self._progress.failed(reason)
         self._check_attempts.failed(reason)
 
-    def _take_result(self, question: Question | None, answer: Solved, live: bool) -> Effect | None:
+    def _take_result(self, request: PendingRequest | None, answer: Solved, live: bool) -> Effect | None:
         result = answer.result
         self._log_result(result)
         if answer.written is not None:
@@ -382,10 +382,10 @@ class Decider:
         # A window of an earlier run is old news when a newer one has been evaluated.
         effect = None
         if live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
-            effect = self._judge(question, result)
+            effect = self._judge(request, result)
         else:
             self._store.save()
-        return effect if fits else self._calibrating_anew(effect)
+        return effect if fits else self._with_new_configuration(effect)
 
     def _log_result(self, result: CalibrationResult) -> None:
         """Logs the verdict of a window, how far its estimate is from what is served, and why it is refused."""
@@ -408,7 +408,7 @@ class Decider:
         }
         _log.info(text, extra={"fields": fields})
 
-    def _log_finding(self, before: Finding, after: Finding) -> None:
+    def _log_finding(self, before: MonitorOutcome, after: MonitorOutcome) -> None:
         """Logs what the checks say if that has changed, or is said for the first time."""
         if after is not before or self._checks == 1:
             fields = {"pair": self._name, "from": before.value, "to": after.value, "checks": self._checks}
@@ -424,30 +424,34 @@ class Decider:
         )
         self._store.note_window(result.window_id, version)
 
-    def _judge(self, question: Question | None, result: CalibrationResult) -> Effect | None:
+    def _judge(self, request: PendingRequest | None, result: CalibrationResult) -> Effect | None:
         estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)
         # When the answer counts, whenever it came: a replay decides alike.
-        now_ns = self._stream.report.chosen.last_ns if question is None else question.due_ns
-        told = estimate.verdict.decision is not Decision.FAILED
-        if told:
-            self._rig.accepted(_due_ns(question), estimate)
+        now_ns = self._stream.report.selection.last_ns if request is None else request.due_ns
+        has_estimate = estimate.verdict.decision is not Decision.FAILED
+        if has_estimate:
+            self._rig.accepted(_due_ns(request), estimate)
         self._step(
             lambda state: lifecycle.before_estimate(state, estimate, start_ns, self._rules),
             result.data_stamp_ns,
             completed=False,
-            question=question,
+            request=request,
         )
         self._add_window_after(result)
         effect = self._step(
             lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules, now_ns),
             result.data_stamp_ns,
-            completed=told,
-            question=question,
+            completed=has_estimate,
+            request=request,
         )
-        kept = lifecycle.kept_for_next(estimate)
-        return effect if kept is None or effect is None else partial(self._keep_and_go_on, kept, effect)
+        carried_over = lifecycle.carried_over_pairs(estimate)
+        return (
+            effect
+            if carried_over is None or effect is None
+            else partial(self._carry_over_and_apply, carried_over, effect)
+        )
 
-    def _calibrating_anew(self, effect: Effect | None) -> Effect:
+    def _with_new_configuration(self, effect: Effect | None) -> Effect:
         """The effect, and with it another configuration for the windows that begin once this answer counts."""
         configuration = self._baseline.calibration
 
@@ -458,7 +462,7 @@ class Decider:
 
         return both
 
-    def _take_correction(self, question: Question, correction: Correction) -> Effect | None:
+    def _take_correction(self, request: PendingRequest, correction: PairCorrection) -> Effect | None:
         """Serves the correction that the rig found for all pairs of a moved sensor together, as far as the policy
         allows it."""
         state = self._store.state
@@ -467,13 +471,15 @@ class Decider:
         if estimate is None:
             self._losses.add("monitor", "correction_of_nothing")
             return None
-        joint = lifecycle.told_by_rig(self._baseline.moved(estimate, correction.told.T_a_b), correction.told.covariance)
+        joint = lifecycle.with_rig_covariance(
+            self._baseline.moved(estimate, correction.joint_pose.T_a_b), correction.joint_pose.covariance
+        )
         self._store.note_command("rig", "corrected", correction.text, "service", accepted=True)
         return self._step(
             lambda state: lifecycle.after_joint(state, joint, correction.stamp_ns, self._rules),
             correction.stamp_ns,
             completed=False,
-            question=question,
+            request=request,
         )
 
     def _take_failure(self, reason: Reason, live: bool) -> Effect | None:
@@ -485,12 +491,12 @@ class Decider:
         self._window_attempts.failed(reason)
         return self._step(lambda state: lifecycle.after_failure(state, reason), None, completed=False)
 
-    def _lost_question(self, question: Question) -> Take:
-        if question.name:
+    def _lost_question(self, request: PendingRequest) -> TakeResult:
+        if request.name:
             return partial(self._take_failure, _NO_ANSWER, True)
 
         def take() -> None:
-            self._check_in_vain(_NO_ANSWER)
+            self._check_failed(_NO_ANSWER)
 
         return take
 
@@ -500,7 +506,7 @@ class Decider:
         stamp_ns: int | None,
         *,
         completed: bool,
-        question: Question | None = None,
+        request: PendingRequest | None = None,
         epoch: int | None = None,
         by_check: bool = False,
     ) -> Effect | None:
@@ -515,11 +521,11 @@ class Decider:
             self._progress.completed(stamp_ns, time.monotonic(), self._stream.report, acquits=acquits)
         if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
             self._latest_check = None
-            self._rig.serves(_due_ns(question), after)
+            self._rig.serves(_due_ns(request), after)
         red, event = HealthState.MISCALIBRATED, self._store.incidents.newest
         if after.health is red and before.health is not red and event is not None:
-            self._pictures.draw(event)
-        return partial(self._go_on_with, taken, by_check)
+            self._pictures.request_overlay(event)
+        return partial(self._apply_to_stream, taken, by_check)
 
     def _add_window_after(self, result: CalibrationResult) -> None:
         """Adds a result to the evidence of a red event if it is the first window that began after the event began."""
@@ -529,21 +535,21 @@ class Decider:
         event = self._store.incidents.add_window_after(result.window_id)
         self._store.protect()
         if event is not None:
-            self._pictures.compare(event, matrix_of(result.camera_from_lidar), result.verdict.decision)
+            self._pictures.request_comparison(event, matrix_of(result.camera_from_lidar), result.verdict.decision)
 
     # --- on the stream's thread -------------------------------------------------------------------------------------
 
-    def _keep_and_go_on(self, kept: KeptPairs, effect: Effect) -> None:
-        self._stream.keep(kept)
+    def _carry_over_and_apply(self, carried_over: CarriedOverPairs, effect: Effect) -> None:
+        self._stream.carry_over(carried_over)
         effect()
 
-    def _go_on_with(self, taken: Taken, by_check: bool) -> None:
+    def _apply_to_stream(self, taken: StateTransition, by_check: bool) -> None:
         """The effect of a step on the pairs to come: the extrinsic at which they are looked at, and whether a window is
         wanted soon. It is if the monitor's outcome or health has changed, if a window did not settle the suspicion, or
         if a window saw a step."""
         self._stream.adopt(taken.served)
         before, after = taken.before, taken.after
-        since_ns = lifecycle.window_wanted_since(after)
+        since_ns = lifecycle.urgent_window_since(after)
         if since_ns is None:
             self._stream.calm()
             return
@@ -554,26 +560,26 @@ class Decider:
 
     # --- what ails --------------------------------------------------------------------------------------------------
 
-    def _troubles(self) -> tuple[Reason, ...]:
+    def _problems(self) -> tuple[Reason, ...]:
         own = (
             self._store.damage,
-            self._baseline.trouble,
-            self._check_attempts.trouble,
-            self._window_attempts.trouble,
+            self._baseline.problem,
+            self._check_attempts.problem,
+            self._window_attempts.problem,
             self._overdue,
         )
-        said = {reason.code for reason in self._store.state.reasons}
+        reported = {reason.code for reason in self._store.state.reasons}
         hold = self._store.state.hold
         held = None
         if hold is not None:
-            told = hold_text(hold.sender, hold.since_ns, hold.reason)
-            held = Reason(HELD, f"The extrinsic is {told}.")
-        return tuple(reason for reason in (*own, held) if reason is not None and reason.code not in said)
+            text = hold_text(hold.sender, hold.since_ns, hold.reason)
+            held = Reason(HELD, f"The extrinsic is {text}.")
+        return tuple(reason for reason in (*own, held) if reason is not None and reason.code not in reported)
 
 
-def _due_ns(question: Question | None) -> int | None:
+def _due_ns(request: PendingRequest | None) -> int | None:
     """Sensor time from which the answer to a question counts; None: from now on, because no stream asked for it."""
-    return None if question is None else question.due_ns
+    return None if request is None else request.due_ns
 
 
 HELD = "held"

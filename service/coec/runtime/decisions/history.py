@@ -19,14 +19,14 @@ from typing import Final
 
 from coec.calibration.lifecycle import Provenance
 from coec.errors import StateError
-from coec.runtime.decisions.chain import Chain, Kept
+from coec.runtime.decisions.chain import HashChain, HistoryRecord
 from coec.schemas.replies import Book, CalibrationResult, HistoryEntry
 
 FILES: Final[Mapping[Book, str]] = {"results": "history", "states": "states", "commands": "commands"}
 """First part of the file name of each book."""
 
 
-class History:
+class PairHistory:
     """The three books of one pair. Safe to use from several threads.
 
     Only `flush` waits for the disk, and no other call waits for `flush`. Entries of a book are written in order, so the
@@ -44,11 +44,11 @@ class History:
         """
         self._lock = threading.Lock()
         self._books = {
-            book: Chain(folder / f"{name}-{pair}.jsonl", limit, heads.get(book)) for book, name in FILES.items()
+            book: HashChain(folder / f"{name}-{pair}.jsonl", limit, heads.get(book)) for book, name in FILES.items()
         }
-        found = [f"{book}: {chain.damage}" for book, chain in self._books.items() if chain.damage is not None]
-        self.damage = "; ".join(found) or None
-        self._next = 1 + max((kept.entry.sequence for kept in self.entries()), default=-1)
+        damages = [f"{book}: {chain.damage}" for book, chain in self._books.items() if chain.damage is not None]
+        self.damage = "; ".join(damages) or None
+        self._next = 1 + max((record.entry.sequence for record in self.entries()), default=-1)
 
     @property
     def durable_heads(self) -> dict[str, str]:
@@ -57,19 +57,19 @@ class History:
         heads = ((book, chain.durable_head) for book, chain in self._books.items())
         return {book: head for book, head in heads if head is not None}
 
-    def entries(self) -> tuple[Kept, ...]:
+    def entries(self) -> tuple[HistoryRecord, ...]:
         """All entries that are kept, oldest first."""
         return _in_order(chain.entries() for chain in self._books.values())
 
-    def on_disk(self) -> tuple[Kept, ...]:
+    def on_disk(self) -> tuple[HistoryRecord, ...]:
         """All entries that are on the disk, oldest first."""
         return _in_order(chain.on_disk() for chain in self._books.values())
 
     def results(self) -> tuple[CalibrationResult, ...]:
         """Results of windows, oldest first."""
-        return tuple(kept.result for kept in self.entries() if kept.result is not None)
+        return tuple(record.result for record in self.entries() if record.result is not None)
 
-    def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
+    def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> HistoryRecord:
         """Appends an entry to its book and fills in its place. The next `flush` writes it."""
         with self._lock:
             book = self._book_of(entry)
@@ -104,9 +104,9 @@ class History:
 
     def _is_in_results(self, entry: HistoryEntry) -> bool:
         """Whether the book `results` already holds an entry of this kind for the same window."""
-        kept = (kept.entry for kept in self._books["results"].entries())
-        return any((one.kind, one.window_id) == (entry.kind, entry.window_id) for one in kept)
+        record = (record.entry for record in self._books["results"].entries())
+        return any((one.kind, one.window_id) == (entry.kind, entry.window_id) for one in record)
 
 
-def _in_order(books: Iterable[Sequence[Kept]]) -> tuple[Kept, ...]:
-    return tuple(sorted((kept for book in books for kept in book), key=lambda kept: kept.entry.sequence))
+def _in_order(books: Iterable[Sequence[HistoryRecord]]) -> tuple[HistoryRecord, ...]:
+    return tuple(sorted((record for book in books for record in book), key=lambda record: record.entry.sequence))

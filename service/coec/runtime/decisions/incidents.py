@@ -18,7 +18,7 @@ from coec.errors import DecodeError, NotFoundError, StateError
 from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import EvidenceEvent, MetricsPoint
 
-POINTS_KEPT = 240
+POINTS_BEFORE = 240
 """How many checks' figures are remembered: 20 minutes at one check in 5 s."""
 
 POINTS_AFTER = 60
@@ -42,7 +42,7 @@ class Incidents:
         self._limit = limit
         self._lock = threading.RLock()
         self._writing = threading.Lock()
-        self._points: deque[MetricsPoint] = deque(maxlen=POINTS_KEPT)
+        self._points: deque[MetricsPoint] = deque(maxlen=POINTS_BEFORE)
         self._events: dict[str, EvidenceEvent] = {}
         # Events as they are on the disk; events and pictures not yet written; dropped events not yet removed.
         self._on_disk: dict[str, EvidenceEvent] = {}
@@ -85,11 +85,11 @@ class Incidents:
     def begin(self, event: EvidenceEvent) -> EvidenceEvent:
         """A red event begins; the figures so far are added to it."""
         with self._lock:
-            begun = event.model_copy(update={"metrics": tuple(self._points)})
+            opened = event.model_copy(update={"metrics": tuple(self._points)})
             self._after = POINTS_AFTER
-            self._keep(begun)
+            self._keep(opened)
             self._drop_oldest()
-            return begun
+            return opened
 
     def add_window_after(self, window_id: str) -> EvidenceEvent | None:
         """Adds the first window after the newest event, and returns the event; None if no event waits for one."""

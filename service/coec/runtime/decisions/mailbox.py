@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TypeVar
 
-from coec.runtime.handover import BusyError, Handover
+from coec.runtime.handover import BusyError, DeferredCall
 
 T = TypeVar("T")
 
@@ -16,7 +16,7 @@ COMMANDS_WAITING = 16
 because the worker's queue bounds the questions."""
 
 
-class Mailbox:
+class TaskQueue:
     """A queue, first in, first out. Any thread posts and asks, one takes."""
 
     def __init__(self) -> None:
@@ -30,22 +30,22 @@ class Mailbox:
             self._items.append(work)
             self._condition.notify()
 
-    def ask(self, work: Callable[[], T], timeout_s: float) -> T:
+    def call_and_wait(self, work: Callable[[], T], timeout_s: float) -> T:
         """Has `work` done and waits for what it returns; an exception of the work is raised here.
 
         Raises:
             BusyError: too many commands wait, or the work was not begun within `timeout_s`, and nothing was done; or it
                 has not ended.
         """
-        handed = Handover(work)
+        call = DeferredCall(work)
         with self._condition:
             if self._commands >= COMMANDS_WAITING:
                 raise BusyError("Too many commands wait; nothing was done. Ask again.")
             self._commands += 1
-            self._items.append(handed.run)
+            self._items.append(call.run)
             self._condition.notify()
         try:
-            return handed.result(timeout_s)
+            return call.result(timeout_s)
         finally:
             with self._condition:
                 self._commands -= 1

@@ -17,26 +17,26 @@ from coec.adapters.files.conversions import estimate_of
 from coec.adapters.files.rig import identity_sha256, is_same_rig, rig_identity
 from coec.calibration.lifecycle import (
     AlarmRecord,
-    Candidate,
-    Change,
+    AppliedChange,
+    CalibrationStatus,
+    ExtrinsicHold,
     Health,
     HealthState,
-    Hold,
     PairState,
+    PendingEstimate,
     Provenance,
-    Status,
 )
 from coec.calibration.lifecycle.pair_state import LAST_KNOWN
-from coec.calibration.monitor.change_detector import ACCUSING, Finding, MonitorState
+from coec.calibration.monitor.change_detector import ACCUSING, MonitorOutcome, MonitorState
 from coec.calibration.tracker import Track, track_from_dict
 from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
 from coec.errors import CoecError, StateError
 from coec.geometry import se3
-from coec.runtime.decisions.stored_pair import PARTS, Clocks, Lost, Remembered, Rows, StoredPair, rows_of
+from coec.runtime.decisions.stored_pair import PARTS, Clocks, LostPart, RestoredPair, Rows, StoredPair, rows_of
 from coec.schemas import replies
 from coec.schemas.replies import CalibrationResult
 
-LARGEST = 1e9
+LARGEST_CORRECTION = 1e9
 """Largest correction, and standard deviation of it, that a state file may hold, radians or metres. No window gives
 more, and values below it stay finite in degrees and squared."""
 
@@ -47,7 +47,7 @@ class AnotherRigError(StateError):
     """The state belongs to another rig."""
 
 
-def pair_from_json(document: Mapping[str, Any], rig: Rig | None, nominal: PairState) -> tuple[StoredPair, Remembered]:
+def pair_from_json(document: Mapping[str, Any], rig: Rig | None, nominal: PairState) -> tuple[StoredPair, RestoredPair]:
     """The state that this version or another one wrote, as far as it can be read.
 
     Args:
@@ -70,7 +70,7 @@ class _Reader:
         self._nominal = nominal
         versions = document.get("versions")
         self._versions: Mapping[str, Any] = versions if isinstance(versions, dict) else {}
-        self._lost: dict[str, Lost] = {}
+        self._lost: dict[str, LostPart] = {}
         self.stored, self._unreadable = self._validated()
         for name, part in PARTS.items():
             # Of the rig one of two fields suffices, and an older version writes only one of them.
@@ -107,7 +107,7 @@ class _Reader:
             why = f"written by a newer version, in form {self._versions[part]}; this one reads {PARTS[part].version}"
         elif by == "older":
             why = "written by an older version, in a form that this one does not read"
-        self._lost.setdefault(part, Lost(part, why, by))
+        self._lost.setdefault(part, LostPart(part, why, by))
 
     def _converted(self, part: str, convert: Callable[[], T], fallback: T) -> T:
         try:
@@ -134,13 +134,13 @@ class _Reader:
             if not same and not (identity is not None and is_same_rig(rig, identity)):
                 raise AnotherRigError("the state belongs to another rig")
 
-    def remembered(self) -> Remembered:
+    def remembered(self) -> RestoredPair:
         """The state, as far as it can be read."""
         stored = self.stored
         state = replace(
             self._calibration(),
             hold=self._hold(),
-            changes=tuple(Change(change.stamp_ns, change.step) for change in stored.changes),
+            changes=tuple(AppliedChange(change.stamp_ns, change.step) for change in stored.changes),
             record=AlarmRecord(**stored.record.model_dump()),
         )
         state = self._with_health(self._with_latest(state))
@@ -148,7 +148,7 @@ class _Reader:
             # A monitor that has forgotten what it had against the extrinsic may not acquit it: only a window may.
             state = replace(state, proven=False)
         clocks = Clocks(stored.completed_wall_ns, stored.completed_stamp_ns, stored.since_wall_ns)
-        return Remembered(state, clocks, self._heads(), stored.commissioned_from, tuple(self._lost.values()))
+        return RestoredPair(state, clocks, self._heads(), stored.commissioned_from, tuple(self._lost.values()))
 
     def _calibration(self) -> PairState:
         """What is served, and all that refers to it."""
@@ -168,7 +168,7 @@ class _Reader:
         return PairState(
             T_camera_lidar=pose,
             provenance=Provenance(stored.provenance),
-            status=Status.NOT_ACCEPTED,
+            status=CalibrationStatus.NOT_ACCEPTED,
             valid_from_ns=stored.valid_from_ns if known or accepted is None else accepted.data_stamp_ns,
             accepted=accepted,
             pending=self._candidate(),
@@ -177,13 +177,13 @@ class _Reader:
             monitor=monitor,
         )
 
-    def _candidate(self) -> Candidate | None:
+    def _candidate(self) -> PendingEstimate | None:
         pending = self.stored.pending
         if pending is None:
             return None
         return self._converted(
             "candidate",
-            lambda: Candidate(
+            lambda: PendingEstimate(
                 _pose(pending.T_camera_lidar),
                 _estimate(pending.result),
                 Reason(pending.waits.code, pending.waits.text),
@@ -209,23 +209,25 @@ class _Reader:
             except (ValidationError, LookupError):
                 continue
             left = replace(left, **{name: getattr(read, name)})
-        return left if left.outcome in ACCUSING else replace(left, outcome=Finding.UNKNOWN)
+        return left if left.outcome in ACCUSING else replace(left, outcome=MonitorOutcome.UNKNOWN)
 
-    def _hold(self) -> Hold | None:
+    def _hold(self) -> ExtrinsicHold | None:
         """The hold on the extrinsic; None if there is none. The earliest versions do not say who holds it. Who releases
         what somebody may have held cannot take it back."""
         stored, unreadable = self.stored, self._unreadable
         is_held = stored.frozen if "frozen" not in unreadable else self._document.get("frozen") is not False
         if not is_held:
             return None
-        return Hold() if stored.hold is None else Hold(**stored.hold.model_dump())
+        return ExtrinsicHold() if stored.hold is None else ExtrinsicHold(**stored.hold.model_dump())
 
     def _with_latest(self, state: PairState) -> PairState:
         stored = self.stored
         latest = self._converted("latest estimate", lambda: _estimate_or_none(stored.latest), None)
-        status = Status(stored.status)
+        status = CalibrationStatus(stored.status)
         if "status" in self._unreadable and latest is not None:
-            status = Status.ACCEPTED if latest.verdict.decision is Decision.ACCEPTED else Status.FAILED
+            status = (
+                CalibrationStatus.ACCEPTED if latest.verdict.decision is Decision.ACCEPTED else CalibrationStatus.FAILED
+            )
         return replace(state, status=status, latest=latest, failures=_reasons(stored.failures))
 
     def _with_health(self, state: PairState) -> PairState:
@@ -258,7 +260,7 @@ class _Reader:
 
     def _at_best(self, state: PairState, health: HealthState) -> HealthState:
         """The health that the other parts of the state allow at best, where the health itself is lost."""
-        if state.monitor.outcome is Finding.CONFIRMED:
+        if state.monitor.outcome is MonitorOutcome.CONFIRMED:
             return HealthState.MISCALIBRATED
         contradicted = state.pending is not None and state.pending.contradicts
         if state.record.accused or contradicted or state.monitor.outcome in ACCUSING:
@@ -310,7 +312,7 @@ def _estimate(stored: CalibrationResult) -> Estimate:
     if (estimate.uncertainty.noise.diagonal() < 0.0).any():
         raise _BeyondMeasureError("a variance is negative")
     shifts = np.abs([estimate.correction, *estimate.uncertainty.systematic.values()])
-    if (shifts > LARGEST).any() or (np.abs(estimate.uncertainty.noise) > LARGEST**2).any():
+    if (shifts > LARGEST_CORRECTION).any() or (np.abs(estimate.uncertainty.noise) > LARGEST_CORRECTION**2).any():
         raise _BeyondMeasureError("a correction or its uncertainty is larger than any that is estimated")
     return estimate
 

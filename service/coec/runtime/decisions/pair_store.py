@@ -18,34 +18,41 @@ from typing import Literal
 import numpy as np
 
 from coec.adapters.files.conversions import transform_of
-from coec.adapters.files.scribe import Scribe
+from coec.adapters.files.scribe import DiskWriter
 from coec.adapters.system.logs import LossCounter
-from coec.calibration.frames.window import KeptPairs
+from coec.calibration.frames.window import CarriedOverPairs
 from coec.calibration.lifecycle import (
     HealthState,
     PairState,
     Provenance,
     aged,
+    carried_over_pairs,
     initial_state,
-    kept_for_next,
     overdue,
     restored,
 )
 from coec.calibration.types import Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
-from coec.runtime.decisions.chain import GENESIS, Kept
+from coec.runtime.decisions.chain import GENESIS, HistoryRecord
 from coec.runtime.decisions.check_log import CheckLog
-from coec.runtime.decisions.history import History
+from coec.runtime.decisions.history import PairHistory
 from coec.runtime.decisions.incidents import Incidents, Side
 from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.decisions.stored_pair import Clocks, Lost
-from coec.runtime.ingest.chooser import Served
+from coec.runtime.decisions.stored_pair import Clocks, LostPart
+from coec.runtime.ingest.chooser import ServedExtrinsic
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
-from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, KeptFor, MetricsPoint
+from coec.schemas.replies import (
+    CalibrationResult,
+    CheckReply,
+    EvidenceEvent,
+    HistoryEntry,
+    MetricsPoint,
+    RetentionReason,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -54,7 +61,7 @@ EntryKind = Literal["estimate", "extrinsic", "state", "command", "commissioned",
 MIN_HASH = 8
 """At least so many characters of a hash name a line of the history."""
 
-WORDS = {
+DEFAULT_TEXTS = {
     HealthState.HEALTHY: "What is served has been looked at and agrees with the data.",
     HealthState.UNKNOWN: "What is served has not been looked at.",
 }
@@ -62,26 +69,26 @@ WORDS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Taken:
+class StateTransition:
     """A step that was taken: the states before and after it, and what is served after it."""
 
     before: PairState
     after: PairState
-    served: Served
+    served: ServedExtrinsic
 
 
 @dataclass(frozen=True, slots=True)
-class Books:
+class PairRecords:
     """The books as others see them, oldest first."""
 
-    entries: tuple[Kept, ...]
+    entries: tuple[HistoryRecord, ...]
     checks: tuple[CheckReply, ...]
     events: tuple[EvidenceEvent, ...]
 
     @property
     def results(self) -> tuple[CalibrationResult, ...]:
         """Results of windows."""
-        return tuple(kept.result for kept in self.entries if kept.result is not None)
+        return tuple(record.result for record in self.entries if record.result is not None)
 
 
 class PairStore:
@@ -99,12 +106,12 @@ class PairStore:
         vehicle: str,
         config: StateConfig,
         store: StateStore,
-        scribe: Scribe,
+        disk_writer: DiskWriter,
         folder: WindowStore,
         losses: LossCounter,
     ) -> None:
         self._rig = rig
-        self._scribe = scribe
+        self._disk_writer = disk_writer
         self._vehicle = vehicle
         self._store = store
         self._folder = folder
@@ -116,14 +123,14 @@ class PairStore:
         self.transitions: Counter[str] = Counter()
         self._epoch = 0
         self._commissioned_from: tuple[str, ...] = ()
-        remembered, heads = self._recall()
+        remembered, heads = self._restore()
         self._state = restored(remembered)
-        self.history = History(config.directory, rig.pair, config.history, heads)
+        self.history = PairHistory(config.directory, rig.pair, config.history, heads)
         self.incidents = Incidents(config.directory / "evidence", rig.pair, config.evidence)
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
         self.protect()
-        scribe.keep(self.history, self.incidents, self._checks, store)
-        scribe.on_replaced(lambda text: self.history.append(_entry("chain", "rewritten", text)))
+        disk_writer.register(self.history, self.incidents, self._checks, store)
+        disk_writer.on_replaced(lambda text: self.history.append(_entry("chain", "rewritten", text)))
         if self.damage is not None:
             self.history.append(_entry("chain", self.damage.code, self.damage.text))
         if self.history.damage is not None:
@@ -143,19 +150,19 @@ class PairStore:
         return self._state
 
     @property
-    def served(self) -> Served:
+    def served(self) -> ServedExtrinsic:
         """What is served now."""
-        return Served(self._epoch, self._state.T_camera_lidar)
+        return ServedExtrinsic(self._epoch, self._state.T_camera_lidar)
 
     @property
-    def kept(self) -> KeptPairs | None:
+    def carried_over(self) -> CarriedOverPairs | None:
         """Pairs of the latest window that belong to the next one, because the camera moved before they were taken. None
         if there are none, or a window has been recorded since."""
         latest = self._state.latest
         recorded = self._folder.windows(self._rig.pair)
         if latest is None or not recorded or recorded[-1].stem != latest.window_id:
             return None
-        return kept_for_next(latest)
+        return carried_over_pairs(latest)
 
     @property
     def since_ns(self) -> int:
@@ -179,7 +186,7 @@ class PairStore:
         *,
         completed: bool,
         epoch: int | None = None,
-    ) -> Taken | None:
+    ) -> StateTransition | None:
         """Takes a step. Returns None, and does nothing, if the extrinsic has changed since `epoch`.
 
         Args:
@@ -201,7 +208,7 @@ class PairStore:
             self.damage = None if self.history.damage is None else self.damage
         self._note(before, after, stamp_ns, replaced=replaced)
         self.save()
-        return Taken(before, after, self.served)
+        return StateTransition(before, after, self.served)
 
     def note_result(self, result: CalibrationResult) -> None:
         """A window was solved."""
@@ -215,14 +222,14 @@ class PairStore:
         values = {name: metric.value for name, metric in check.metrics.items()}
         self.incidents.note(MetricsPoint(stamp_ns=check.stamp_ns, state=check.state, metrics=values))
         self._checks.append(check)
-        self._scribe.write(self._checks, self.incidents)
+        self._disk_writer.write(self._checks, self.incidents)
 
-    def told(self) -> Books:
+    def publishable_records(self) -> PairRecords:
         """The books that may be reported: only what is on the disk, so that a restart would know it, too. If the disk
         has refused for so long that `health` reports it, everything."""
-        if self._scribe.trouble is None:
-            return Books(self.history.on_disk(), self._checks.on_disk(), self.incidents.on_disk())
-        return Books(self.history.entries(), self._checks.checks(), self.incidents.events())
+        if self._disk_writer.problem is None:
+            return PairRecords(self.history.on_disk(), self._checks.on_disk(), self.incidents.on_disk())
+        return PairRecords(self.history.entries(), self._checks.checks(), self.incidents.events())
 
     def note_command(
         self, name: str, code: str, text: str, sender: str, *, accepted: bool, reason: str | None = None
@@ -230,12 +237,12 @@ class PairStore:
         """Writes down that a command was carried out or refused, with the `reason` that its sender gave, if any. If
         equal refusals follow each other, only the first is written down."""
         last = next(reversed(self.history.entries()), None)
-        told = f"{name}: {text}"
+        entry_text = f"{name}: {text}"
         if not accepted and last is not None:
             entry = last.entry
-            if (entry.kind, entry.code, entry.text) == ("command", code, told):
+            if (entry.kind, entry.code, entry.text) == ("command", code, entry_text):
                 return
-        self.history.append(_entry("command", code, told).model_copy(update={"sender": sender, "reason": reason}))
+        self.history.append(_entry("command", code, entry_text).model_copy(update={"sender": sender, "reason": reason}))
 
     def note_commissioned(self, text: str, window_ids: tuple[str, ...]) -> None:
         """The rig has a baseline, learned from these windows."""
@@ -243,7 +250,7 @@ class PairStore:
         self._commissioned_from = window_ids
         self.protect()
 
-    def served_before(self, name: str | None) -> tuple[Kept, CalibrationResult]:
+    def served_before(self, name: str | None) -> tuple[HistoryRecord, CalibrationResult]:
         """A calibration that was served, as the history holds it, and the accepted result on which it rested.
 
         Args:
@@ -256,29 +263,29 @@ class PairStore:
         """
         served = transform_of(self._state.T_camera_lidar).matrix
         results: dict[str, CalibrationResult] = {}
-        found: dict[str, Kept] = {}
-        in_force: Kept | None = None
-        asked_by_window: str | None = None
-        for kept in self.history.entries():
-            entry = kept.entry
-            if kept.result is not None and kept.result.status == "accepted":
-                results[kept.result.window_id] = kept.result
-                asked_by_window = kept.result.window_id if _is_named(kept, name) else asked_by_window
-                if in_force is not None and _is_named(kept, name):
-                    found[kept.result.window_id] = in_force
+        matches: dict[str, HistoryRecord] = {}
+        in_force: HistoryRecord | None = None
+        requested_by_window: str | None = None
+        for record in self.history.entries():
+            entry = record.entry
+            if record.result is not None and record.result.status == "accepted":
+                results[record.result.window_id] = record.result
+                requested_by_window = record.result.window_id if _is_named(record, name) else requested_by_window
+                if in_force is not None and _is_named(record, name):
+                    matches[record.result.window_id] = in_force
             if entry.kind != "extrinsic" or entry.camera_from_lidar is None or entry.window_id not in results:
                 continue
-            in_force = kept
+            in_force = record
             if name is None:
                 if entry.camera_from_lidar.matrix != served:
-                    found = {entry.window_id: kept}
-            elif _is_named(kept, name) or entry.window_id == asked_by_window:
-                found[entry.window_id] = kept
-        if not found:
+                    matches = {entry.window_id: record}
+            elif _is_named(record, name) or entry.window_id == requested_by_window:
+                matches[entry.window_id] = record
+        if not matches:
             raise NotFoundError("no such served calibration in `history`; `reset` returns to nominal")
-        if len(found) > 1:
+        if len(matches) > 1:
             raise NotFoundError("the beginning of the hash is ambiguous: give more of it")
-        (line,) = found.values()
+        (line,) = matches.values()
         return line, results[str(line.entry.window_id)]
 
     def save(self) -> None:
@@ -287,16 +294,16 @@ class PairStore:
         completed_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
         clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
         heads, windows = (lambda: self.history.durable_heads), self._commissioned_from
-        self._store.remember(self._rig, self._state, clocks, heads, windows)
-        self._scribe.write(self.history, self.incidents, self._store)
+        self._store.update(self._rig, self._state, clocks, heads, windows)
+        self._disk_writer.write(self.history, self.incidents, self._store)
 
     def is_on_disk(self) -> bool:
         """Whether all that was noted and saved before this call is on the disk; see `Scribe.has_written`."""
-        return self._scribe.has_written()
+        return self._disk_writer.has_written()
 
-    def may_be_told(self) -> bool:
+    def may_be_published(self) -> bool:
         """Whether the state is on the disk, or `health` says why not."""
-        return self._scribe.has_written() or self._scribe.trouble is not None
+        return self._disk_writer.has_written() or self._disk_writer.problem is not None
 
     def age(self, why_overdue: Reason | None, silent_s: float, stale_after_s: float) -> None:
         """Time has passed: ages the state. `why_overdue` says why no check was completed in time (None: one was);
@@ -311,10 +318,10 @@ class PairStore:
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
-    def _recall(self) -> tuple[PairState, Mapping[str, str]]:
+    def _restore(self) -> tuple[PairState, Mapping[str, str]]:
         damage = self._store.damage
         try:
-            remembered = self._store.recall(self._rig)
+            remembered = self._store.load(self._rig)
         except StateError as error:
             damage, remembered = (*damage, str(error)), None
         lost = () if remembered is None else remembered.lost
@@ -356,7 +363,7 @@ class PairStore:
 
     def _note_health(self, before: PairState, after: PairState, stamp_ns: int | None) -> None:
         self.transitions[after.health.value] += 1
-        text = "; ".join(reason.text for reason in after.reasons) or WORDS.get(after.health, "")
+        text = "; ".join(reason.text for reason in after.reasons) or DEFAULT_TEXTS.get(after.health, "")
         self.history.append(_entry("state", after.health.value, text, stamp_ns))
         fields = {"pair": self._rig.pair, "from": before.health.value, "to": after.health.value, "why": text}
         _log.info(f"health: {after.health.value}, before {before.health.value}", extra={"fields": fields})
@@ -397,22 +404,22 @@ class PairStore:
     def add_picture(self, event_id: str, side: Side, jpeg: bytes) -> None:
         """Add a picture to an event."""
         self.incidents.add_overlay(event_id, side, jpeg)
-        self._scribe.write(self.incidents)
+        self._disk_writer.write(self.incidents)
 
     def note_window(self, window_id: str, version: WindowVersion) -> None:
         """Notes the new version of a window's file after it was written again."""
         self._folder.note(window_id, version)
-        self._scribe.write(self._folder)
+        self._disk_writer.write(self._folder)
 
     def protect(self) -> None:
         """Protects in the window folder the windows that are evidence, and those from which the rig was
         commissioned."""
-        kept: dict[str, KeptFor] = dict.fromkeys(self._commissioned_from, "commissioning")
-        kept |= dict.fromkeys(self.incidents.window_ids, "red_event")
-        self._folder.protect(self._rig.pair, kept)
+        protected: dict[str, RetentionReason] = dict.fromkeys(self._commissioned_from, "commissioning")
+        protected |= dict.fromkeys(self.incidents.window_ids, "red_event")
+        self._folder.protect(self._rig.pair, protected)
 
 
-def _damage_of(lost: tuple[Lost, ...], before: Reason | None) -> Reason:
+def _damage_of(lost: tuple[LostPart, ...], before: Reason | None) -> Reason:
     """The reason that names the parts of the state that were lost, after the damage `before`."""
     texts = "; ".join(part.text for part in lost)
     text = (
@@ -425,10 +432,10 @@ def _damage_of(lost: tuple[Lost, ...], before: Reason | None) -> Reason:
     return Reason("state_other_version", text)
 
 
-def _is_named(kept: Kept, name: str | None) -> bool:
+def _is_named(record: HistoryRecord, name: str | None) -> bool:
     if name is None:
         return False
-    return name == kept.entry.window_id or (len(name) >= MIN_HASH and kept.sha256.startswith(name))
+    return name == record.entry.window_id or (len(name) >= MIN_HASH and record.sha256.startswith(name))
 
 
 _ORIGIN = {

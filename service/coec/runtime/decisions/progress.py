@@ -13,7 +13,7 @@ from coec.calibration.lifecycle import NOT_ACQUITTED
 from coec.calibration.monitor.change_detector import ACQUITTAL_PERIODS
 from coec.calibration.types import Reason
 from coec.errors import ModelError
-from coec.runtime.decisions.questions import ANSWER_PERIODS
+from coec.runtime.decisions.questions import RESULT_PERIODS
 from coec.runtime.ingest.decoder import CAMERA, LIDAR
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
@@ -24,7 +24,7 @@ from coec.runtime.worker.queue import BUSY, SUPERSEDED, WORKER_FAILED
 SLOWEST_PACE = 0.1
 """Slowest replay, in seconds of sensor time per second. A slower one counts as standing still."""
 
-IN_VAIN = 3
+REPORTED_FAILURES = 3
 """After so many failed checks, or failed windows, in a row health reports it."""
 
 DEPTH_CODES = frozenset({ModelError.reply_code})
@@ -57,21 +57,21 @@ class Attempts:
         """`what`: name of the attempts, in the plural. `code`: code of the trouble."""
         self._what = what
         self._code = code
-        self._in_vain = 0
-        self.trouble: Reason | None = None
+        self._failures = 0
+        self.problem: Reason | None = None
 
     def failed(self, reason: Reason) -> None:
         """An attempt has failed."""
         if reason.code in NOT_TRIED:
             return
-        self._in_vain += 1
-        if self._in_vain >= IN_VAIN:
-            text = f"The last {self._in_vain} {self._what} came to nothing. {reason.text}"
-            self.trouble = Reason(self._code, text)
+        self._failures += 1
+        if self._failures >= REPORTED_FAILURES:
+            text = f"The last {self._failures} {self._what} came to nothing. {reason.text}"
+            self.problem = Reason(self._code, text)
 
     def succeeded(self) -> None:
         """An attempt has succeeded."""
-        self._in_vain, self.trouble = 0, None
+        self._failures, self.problem = 0, None
 
 
 @dataclass(slots=True)
@@ -89,7 +89,7 @@ def _later(before: _Last, last: _Last) -> _Last:
     return _Last(last.monotonic_s, max(stamps_ns, default=None), last.report)
 
 
-class Progress:
+class CheckProgress:
     """Progress of the checks of one pair. Belongs to the thread that decides."""
 
     def __init__(self, period_s: float, monotonic_s: float, report: StreamStatistics) -> None:
@@ -134,11 +134,11 @@ class Progress:
         """Time since `last`, s, if it is longer than allowed."""
         pace = 1.0 if report.pace is None else min(max(report.pace, SLOWEST_PACE), 1.0)
         silent_s, unseen_s = monotonic_s - last.monotonic_s, 0.0
-        if last.stamp_ns is not None and report.chosen.last_ns is not None:
-            unseen_s = (report.chosen.last_ns - last.stamp_ns) / NS_PER_S
+        if last.stamp_ns is not None and report.selection.last_ns is not None:
+            unseen_s = (report.selection.last_ns - last.stamp_ns) / NS_PER_S
         late = silent_s > ACQUITTAL_PERIODS * self._period_s / pace
         # The stream may run ahead of an answer by `ANSWER_PERIODS`.
-        late |= unseen_s > (ACQUITTAL_PERIODS + ANSWER_PERIODS) * self._period_s
+        late |= unseen_s > (ACQUITTAL_PERIODS + RESULT_PERIODS) * self._period_s
         return max(silent_s, unseen_s) if late else None
 
     def _cause(self, now: StreamStatistics) -> tuple[str, str]:
@@ -156,11 +156,11 @@ class Progress:
             return "pairing", "camera and LiDAR frames come, but none belong together in time."
         if self._failure is not None:
             return self._kind_of(self._failure), self._failure.text
-        if now.chosen.checks == then.chosen.checks and now.chosen.not_afforded > then.chosen.not_afforded:
+        if now.selection.checks == then.selection.checks and now.selection.not_afforded > then.selection.not_afforded:
             return "budget", "`budget.cores` does not suffice; `budget` of status says for what."
-        if now.chosen.checks == then.chosen.checks and now.chosen.unanswered > 0:
+        if now.selection.checks == then.selection.checks and now.selection.unanswered > 0:
             return "worker", "a window is being solved, and checks wait for its result."
-        if now.chosen.checks == then.chosen.checks:
+        if now.selection.checks == then.selection.checks:
             return "data", "too few pairs come, or they are too far apart, for a check."
         return "worker", "the worker has not answered."
 

@@ -13,19 +13,19 @@ from coec.calibration.frames.sampling import stands
 from coec.calibration.types import FramePair, Matrix4
 from coec.config import PairConfig
 from coec.runtime.budget.budget import Budget
-from coec.runtime.decisions.mailbox import Mailbox
-from coec.runtime.decisions.queue import DecisionQueue, Question
-from coec.runtime.ingest.chooser import Served
+from coec.runtime.decisions.mailbox import TaskQueue
+from coec.runtime.decisions.queue import PendingRequest, ResultSchedule
+from coec.runtime.ingest.chooser import ServedExtrinsic
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_store import WindowStore, start_ns_of
-from coec.runtime.rig.pair_side import Correction, PairOfRig
+from coec.runtime.rig.pair_side import PairCorrection, RigMember
 from coec.runtime.worker import jobs
 from coec.runtime.worker.jobs import JobOutcome
 from coec.runtime.worker.supervisor import Worker
 
 _log = logging.getLogger(__name__)
 
-ANSWER_PERIODS = 1
+RESULT_PERIODS = 1
 """After so many periods of the monitor the answer to a check or a window counts in the choice of further pairs. At 5 s
 this is longer than either takes. If an answer takes longer, the stream waits, and its pairs are held."""
 
@@ -34,10 +34,10 @@ GRACE_S = 30.0
 After that it is given up as lost."""
 
 
-class Decides(Protocol):
+class ResultSink(Protocol):
     """Who takes the answers, on the thread that decides about the pair; see `runtime.decisions.decider`."""
 
-    def checked(self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
+    def checked(self, request: PendingRequest, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
         """A check of the extrinsic of `epoch` has ended. `standing_ns`: stamps of its pairs that were taken while the
         vehicle stood."""
 
@@ -47,25 +47,25 @@ class Decides(Protocol):
     def lost(self, window_id: str) -> None:
         """A window ended without being recorded."""
 
-    def corrected(self, question: Question, correction: Correction) -> None:
+    def corrected(self, request: PendingRequest, correction: PairCorrection) -> None:
         """The rig has a correction for the pair."""
 
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
 
 
-class Questions:
+class JobClient:
     """Asks questions about one pair, for its stream (`ingest.chooser.Asks`) and its recorder. For any thread."""
 
     def __init__(
         self,
         pair: PairConfig,
-        queue: DecisionQueue,
+        queue: ResultSchedule,
         worker: Worker,
         budget: Budget,
-        mailbox: Mailbox,
+        mailbox: TaskQueue,
         windows: WindowStore,
-        rig: PairOfRig,
+        rig: RigMember,
         show: Callable[[PairConfig, FramePair, Matrix4], None],
     ) -> None:
         """`show(pair, drawn, pose)` is called for every check with one of its pairs of frames, and with the extrinsic
@@ -80,33 +80,33 @@ class Questions:
         self._mailbox = mailbox
         self._period_ns = round(pair.monitor.period_s * NS_PER_S)
         self._latest_window_ns = 0
-        self._decides: Decides
+        self._sink: ResultSink
 
-    def answer_to(self, decides: Decides) -> None:
+    def connect(self, sink: ResultSink) -> None:
         """Sets who takes the answers; called once, before anything is asked."""
-        self._decides = decides
+        self._sink = sink
 
-    def use(self, pair: PairConfig) -> None:
+    def reconfigure(self, pair: PairConfig) -> None:
         """Asks by these settings from now on. The period of the monitor stays that of the start, because the due times
         of waiting questions were set by it."""
         self._pair = pair
 
     # --- for the stream ---------------------------------------------------------------------------------------------
 
-    def affords(self, stamp_ns: int, *, suspected: bool) -> bool:
+    def try_acquire(self, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether the budget allows a check at a sensor time. If it does, the caller must ask for that check. Checks of
         `suspected` pairs come first."""
-        return self._budget.affords(self._pair.name, stamp_ns, suspected=suspected)
+        return self._budget.try_acquire(self._pair.name, stamp_ns, suspected=suspected)
 
     @property
     def stretch(self) -> float:
         """Factor by which slices are to be longer than configured, at least 1."""
         return self._budget.stretch
 
-    def window_wanted(self, stamp_ns: int) -> int | None:
+    def pop_window_request(self, stamp_ns: int) -> int | None:
         """Sensor time since which the rig wants pairs for a window, asked before a pair of this stamp; returned once.
         None: it wants no window, or one that began after that time is on its way or known."""
-        since_ns = self._rig.window_wanted(stamp_ns)
+        since_ns = self._rig.pop_window_request(stamp_ns)
         return None if since_ns is None or since_ns <= self._latest_window_ns else since_ns
 
     def window_turn_s(self, stamp_ns: int) -> float:
@@ -114,25 +114,25 @@ class Questions:
         windows before it. The window then counts as being on its way."""
         return self._budget.window_turn_s(self._pair.name, stamp_ns)
 
-    def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
+    def check(self, pairs: tuple[FramePair, ...], served: ServedExtrinsic, stamp_ns: int) -> None:
         """Asks at a sensor time whether `served` is right according to these pairs. Only after `affords`."""
         standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
-        question = self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.CHECK))
-        post = self._post(partial(self._decides.checked, question, served.epoch, standing))
+        request = self._queue.submit(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.CHECK))
+        post = self._post(partial(self._sink.checked, request, served.epoch, standing))
         pair = self._pair
 
         def done(outcome: JobOutcome) -> None:
-            self._budget.ended(pair.name)
+            self._budget.release(pair.name)
             post(outcome)
 
-        self._worker.ask(jobs.check(pair.name, pair.calibration, served.T_camera_lidar, pairs, done))
+        self._worker.submit(jobs.check(pair.name, pair.calibration, served.T_camera_lidar, pairs, done))
         self._show(pair, pairs[-1], served.T_camera_lidar)
 
     def window(self, window_id: str, stamp_ns: int) -> int:
         """Asks for the result of a window that ends at a sensor time and is on its way to the disk. Returns from which
         sensor time the answer counts."""
         self._latest_window_ns = start_ns_of(window_id)
-        return self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.SOLVE), window_id).due_ns
+        return self._queue.submit(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.SOLVE), window_id).due_ns
 
     def prefetch(self, frame: bytes) -> None:
         """Announces that the depth of a camera frame (native msgpack) will be needed."""
@@ -151,8 +151,8 @@ class Questions:
             return True
         corrections = self._rig.corrections(stamp_ns)
         for correction in corrections:
-            question = self._queue.ask(correction.from_ns, time.monotonic() + GRACE_S)
-            self._mailbox.post(partial(self._decides.corrected, question, correction))
+            request = self._queue.submit(correction.from_ns, time.monotonic() + GRACE_S)
+            self._mailbox.post(partial(self._sink.corrected, request, correction))
         return bool(corrections) and self._queue.waits(stamp_ns) and not self._worker.warms_up
 
     def settle(self, stamp_ns: int) -> None:
@@ -168,36 +168,36 @@ class Questions:
         """The clock of the sensors has stepped back, to this stamp."""
         self._latest_window_ns = 0
         self._rig.time_stepped_back(stamp_ns)
-        self._mailbox.post(partial(self._decides.time_stepped_back, stamp_ns))
+        self._mailbox.post(partial(self._sink.time_stepped_back, stamp_ns))
 
     # --- for the recorder, and for whoever wants a window solved again -----------------------------------------------
 
     def solve(self, window_id: str, path: Path, live: bool) -> None:
         """Has a window on the disk solved. `live` is False for a window of an earlier run."""
-        post = self._post(partial(self._decides.solved, window_id, live=live))
+        post = self._post(partial(self._sink.solved, window_id, live=live))
 
         def done(outcome: JobOutcome) -> None:
             self._windows.release(window_id)
             post(outcome)
 
         self._windows.hold(window_id)
-        self._worker.ask(jobs.solve(self._pair.name, path, window_id, done, live))
+        self._worker.submit(jobs.solve(self._pair.name, path, window_id, done, live))
 
     def lost(self, window_id: str) -> None:
         """A window ended without being recorded."""
-        self._mailbox.post(partial(self._decides.lost, window_id))
+        self._mailbox.post(partial(self._sink.lost, window_id))
 
     # --- for the decider --------------------------------------------------------------------------------------------
 
     def overlay(self, path: Path, pose: Matrix4, title: str, done: Callable[[JobOutcome], None]) -> None:
         """Has a window drawn at an extrinsic (4, 4)."""
-        self._worker.ask(jobs.overlay(self._pair.name, path, pose, title, self._post(done)))
+        self._worker.submit(jobs.overlay(self._pair.name, path, pose, title, self._post(done)))
 
     def comparison(
         self, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Callable[[JobOutcome], None]
     ) -> None:
         """Has a window drawn at two extrinsics (4, 4); `names` are their captions."""
-        self._worker.ask(jobs.comparison(self._pair.name, path, poses, names, self._post(done)))
+        self._worker.submit(jobs.comparison(self._pair.name, path, poses, names, self._post(done)))
 
     def commission(self, pose: Matrix4, paths: list[Path], done: Callable[[JobOutcome], None]) -> None:
         """Has the baseline of the rig learned at an extrinsic (4, 4) from windows, which stay on the disk until that is
@@ -211,18 +211,18 @@ class Questions:
 
         for path in paths:
             self._windows.hold(path.stem)
-        self._worker.ask(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, finished))
+        self._worker.submit(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, finished))
 
     @property
     def commissioning(self) -> str | None:
         """How far the commissioning of the pair is, in words; None: it has none."""
         return self._worker.commissioning(self._pair.name)
 
-    def _post(self, ended: Callable[[JobOutcome], None]) -> Callable[[JobOutcome], None]:
-        return lambda outcome: self._mailbox.post(partial(ended, outcome))
+    def _post(self, on_outcome: Callable[[JobOutcome], None]) -> Callable[[JobOutcome], None]:
+        return lambda outcome: self._mailbox.post(partial(on_outcome, outcome))
 
     def _due_ns(self, stamp_ns: int) -> int:
-        return stamp_ns + ANSWER_PERIODS * self._period_ns
+        return stamp_ns + RESULT_PERIODS * self._period_ns
 
     def _expires_s(self, kind: jobs.Kind) -> float:
         return time.monotonic() + jobs.DEADLINE_S[kind] + GRACE_S

@@ -19,12 +19,12 @@ from dataclasses import dataclass
 Effect = Callable[[], None]
 """Applies what an answer changes in the choice of further pairs; run by the thread that chooses them."""
 
-Take = Callable[[], Effect | None]
+TakeResult = Callable[[], Effect | None]
 """Takes an answer and returns its effect; run by the thread that decides."""
 
 
 @dataclass(slots=True, eq=False)
-class Question:
+class PendingRequest:
     """One question.
 
     Attributes:
@@ -38,50 +38,50 @@ class Question:
     due_ns: int
     expires_s: float
     name: str = ""
-    take: Take | None = None
+    take: TakeResult | None = None
     effect: Effect | None = None
     taken: bool = False
 
 
-class DecisionQueue:
+class ResultSchedule:
     """The questions of one pair. One thread asks and lets answers take effect, one thread answers."""
 
     def __init__(self, paused_s: Callable[[], float] = lambda: 0.0) -> None:
         """`paused_s()`: time so far that does not count as waiting, s: that in which the worker compiled kernels."""
         self._paused_s = paused_s
         self._lock = threading.Lock()
-        self._questions: deque[Question] = deque()
-        self._untaken: deque[Question] = deque()
+        self._pending: deque[PendingRequest] = deque()
+        self._untaken: deque[PendingRequest] = deque()
 
-    def ask(self, due_ns: int, expires_s: float, name: str = "") -> Question:
+    def submit(self, due_ns: int, expires_s: float, name: str = "") -> PendingRequest:
         """Asks a question. It is due no earlier than those before it, because its answer has to wait for theirs."""
         with self._lock:
-            before_ns = self._questions[-1].due_ns if self._questions else due_ns
-            question = Question(max(due_ns, before_ns), expires_s - self._paused_s(), name)
-            self._questions.append(question)
-            self._untaken.append(question)
-            return question
+            before_ns = self._pending[-1].due_ns if self._pending else due_ns
+            request = PendingRequest(max(due_ns, before_ns), expires_s - self._paused_s(), name)
+            self._pending.append(request)
+            self._untaken.append(request)
+            return request
 
-    def about(self, name: str) -> Question | None:
+    def about(self, name: str) -> PendingRequest | None:
         """The unanswered question about a window; None if there is none."""
         with self._lock:
             return next((one for one in self._untaken if one.name == name and one.take is None), None)
 
-    def answer(self, question: Question, take: Take) -> None:
+    def answer(self, request: PendingRequest, take: TakeResult) -> None:
         """The answer to a question has come. It is taken as soon as all those in front are. A second answer to the same
         question is ignored."""
-        if question.take is None:
-            question.take = take
+        if request.take is None:
+            request.take = take
         self._take_answered()
 
-    def expire(self, monotonic_s: float, lost: Callable[[Question], Take]) -> int:
+    def expire(self, monotonic_s: float, lost: Callable[[PendingRequest], TakeResult]) -> int:
         """Gives up questions that have waited too long; `lost(question)` stands in for the answer. Returns how many
         there were."""
         counted_s = monotonic_s - self._paused_s()
         with self._lock:
             late = [one for one in self._untaken if one.take is None and one.expires_s <= counted_s]
-        for question in late:
-            question.take = lost(question)
+        for request in late:
+            request.take = lost(request)
         if late:
             self._take_answered()
         return len(late)
@@ -100,18 +100,18 @@ class DecisionQueue:
         """A pair of this sensor time is about to be looked at: the answers that are due take effect."""
         with self._lock:
             due = []
-            while self._questions and self._questions[0].taken and self._questions[0].due_ns <= stamp_ns:
-                due.append(self._questions.popleft())
-        for question in due:
-            if question.effect is not None:
-                question.effect()
+            while self._pending and self._pending[0].taken and self._pending[0].due_ns <= stamp_ns:
+                due.append(self._pending.popleft())
+        for request in due:
+            if request.effect is not None:
+                request.effect()
 
     def bring_forward(self, stamp_ns: int) -> None:
         """Sensor time has stepped back to this stamp: makes all outstanding answers due with the first pair of the new
         time."""
         with self._lock:
-            for question in self._questions:
-                question.due_ns = min(question.due_ns, stamp_ns)
+            for request in self._pending:
+                request.due_ns = min(request.due_ns, stamp_ns)
 
     def _take_answered(self) -> None:
         while True:

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.baseline_file import BASELINES, baseline_of, load_baseline, save_baseline
+from coec.adapters.files.baseline_file import BASELINES, baseline_of_rig, load_baseline, save_baseline
 from coec.calibration import lifecycle
-from coec.calibration.commissioning.baseline import Baseline, Drift, drift, learned_hash, mismatch
+from coec.calibration.commissioning.baseline import Baseline, BaselineDrift, drift, learned_hash, mismatch
 from coec.calibration.types import Estimate, Matrix4, Reason, Rig
 from coec.config import CalibrationConfig, PairConfig, StateConfig
 from coec.errors import StateError
@@ -28,17 +28,17 @@ class RigBaseline:
         self._state = state
         self._baseline: Baseline | None = None
         self._own: Baseline | None = None
-        self.trouble: Reason | None = None
+        self.problem: Reason | None = None
         self.load()
 
     def load(self) -> None:
         """Reads the baseline from the disk, where the worker writes it."""
-        self._baseline, self.trouble = None, None
+        self._baseline, self.problem = None, None
         try:
             self._own = load_baseline(self._state.directory / BASELINES, self._rig.pair)
-            baseline = baseline_of(self._rig, self._state)
+            baseline = baseline_of_rig(self._rig, self._state)
         except StateError as error:
-            self.trouble = Reason("baseline_damaged", f"The baseline of the rig cannot be used: {error}")
+            self.problem = Reason("baseline_damaged", f"The baseline of the rig cannot be used: {error}")
             return
         if baseline is None:
             return
@@ -46,7 +46,7 @@ class RigBaseline:
         if wrong is None:
             self._baseline = baseline
         else:
-            self.trouble = _mismatched(wrong)
+            self.problem = _mismatched(wrong)
 
     def flush(self) -> None:
         """Writes the rig's own baseline again if somebody has removed it.
@@ -62,7 +62,7 @@ class RigBaseline:
         if own is not None and there is None:
             save_baseline(path, own)
 
-    def use(self, pair: PairConfig) -> None:
+    def reconfigure(self, pair: PairConfig) -> None:
         """Goes on with other settings, which the baseline may not fit."""
         self._pair = pair
         self.load()
@@ -71,7 +71,7 @@ class RigBaseline:
         """Stops using the baseline because it does not fit after all. Returns whether it was in use."""
         if self._baseline is None:
             return False
-        self._baseline, self.trouble = None, _mismatched(why)
+        self._baseline, self.problem = None, _mismatched(why)
         return True
 
     def fits_network(self, depth_identity: str) -> bool:
@@ -96,7 +96,7 @@ class RigBaseline:
         """The estimate with another pose (4, 4), from which the estimator's bias has been taken out."""
         return lifecycle.moved(estimate, pose, self._rig)
 
-    def drift(self, T_camera_lidar: Matrix4, sigma: NDArray[np.float64] | None) -> Drift | None:
+    def drift(self, T_camera_lidar: Matrix4, sigma: NDArray[np.float64] | None) -> BaselineDrift | None:
         """Drift from the commissioned calibration to a pose (4, 4) without bias, whose standard deviations are `sigma`
         (6,) (None: unknown). None before commissioning."""
         if self._baseline is None:

@@ -11,11 +11,11 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from coec.adapters.files.state_file import BROKEN, NEWER, OLDER, StateFile
-from coec.calibration.lifecycle import PairState, Provenance, Status, initial_state
+from coec.calibration.lifecycle import CalibrationStatus, PairState, Provenance, initial_state
 from coec.calibration.types import Rig
 from coec.errors import NotFoundError, StateError
 from coec.runtime.decisions.pair_reader import AnotherRigError, pair_from_json
-from coec.runtime.decisions.stored_pair import OF_FIRST_VERSIONS, Clocks, Remembered, StoredPair, pair_to_json
+from coec.runtime.decisions.stored_pair import OF_FIRST_VERSIONS, Clocks, RestoredPair, StoredPair, pair_to_json
 
 _log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class StateStore:
         pairs = loaded.body.get("pairs") if loaded.body else None
         self._pairs: dict[str, Any] = pairs if isinstance(pairs, dict) else {}
 
-    def recall(self, rig: Rig) -> Remembered | None:
+    def load(self, rig: Rig) -> RestoredPair | None:
         """What is known of the pair, as far as it can be read; None if nothing is, or if it belongs to another rig,
         which is logged. If a part cannot be read, the file is kept aside when the state is next put on the disk.
 
@@ -55,7 +55,7 @@ class StateStore:
         if document is None:
             return None
         if not isinstance(document, dict):
-            self._file.distrust()
+            self._file.reject()
             raise StateError(f"the state of pair {rig.pair} is no JSON object")
         try:
             _, remembered = pair_from_json(document, rig, initial_state(rig))
@@ -66,16 +66,16 @@ class StateStore:
             )
             return None
         for lost in remembered.lost:
-            self._file.distrust(_SUFFIX[lost.written_by])
+            self._file.reject(_SUFFIX[lost.written_by])
             fields = {"pair": rig.pair, "part": lost.part, "why": lost.why}
             _log.warning("a part of the state on the disk cannot be read", extra={"fields": fields})
         if document.keys() - StoredPair.model_fields - OF_FIRST_VERSIONS:
-            self._file.distrust(NEWER)
+            self._file.reject(NEWER)
             text = "a newer version wrote fields of the state that this one does not know: the file is kept aside"
             _log.info(text, extra={"fields": {"pair": rig.pair}})
         return remembered
 
-    def remember(
+    def update(
         self,
         rig: Rig,
         state: PairState,
@@ -100,8 +100,8 @@ class StateStore:
             with self._lock:
                 pairs, heads = dict(self._pairs), dict(self._heads)
             # Entries of pairs that this service does not know may have any form, and stay as they are.
-            told = {pair: {**pairs[pair], "history_heads": dict(of_pair())} for pair, of_pair in heads.items()}
-            self._file.save({"pairs": {**pairs, **told}})
+            updated = {pair: {**pairs[pair], "history_heads": dict(of_pair())} for pair, of_pair in heads.items()}
+            self._file.save({"pairs": {**pairs, **updated}})
 
 
 def read_pairs(folder: Path) -> dict[str, tuple[StoredPair, PairState]]:
@@ -124,7 +124,7 @@ def read_pairs(folder: Path) -> dict[str, tuple[StoredPair, PairState]]:
         if not isinstance(document, dict):
             refused.append(f"pair {name} is no JSON object")
             continue
-        unknown = PairState(np.eye(4), Provenance.NOMINAL, Status.NOT_ACCEPTED, 0)
+        unknown = PairState(np.eye(4), Provenance.NOMINAL, CalibrationStatus.NOT_ACCEPTED, 0)
         stored, remembered = pair_from_json(document, None, unknown)
         extrinsic = [lost.why for lost in remembered.lost if lost.part == "extrinsic"]
         if extrinsic:

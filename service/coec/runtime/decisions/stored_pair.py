@@ -155,7 +155,7 @@ PARTS: Final[Mapping[str, PartForm]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
+class LostPart:
     """A part of the state that could not be read.
 
     Attributes:
@@ -186,14 +186,14 @@ class Clocks:
 
 
 @dataclass(frozen=True, slots=True)
-class Remembered:
+class RestoredPair:
     """A pair as it was before the restart, the windows that it was commissioned from, and the parts that were lost."""
 
     state: PairState
     clocks: Clocks
     history_heads: Mapping[str, str]
     commissioned_from: tuple[str, ...]
-    lost: tuple[Lost, ...] = ()
+    lost: tuple[LostPart, ...] = ()
 
 
 def pair_to_json(

@@ -7,15 +7,15 @@ from collections.abc import Iterable
 from coec.calibration.types import Reason
 from coec.config import LidarEdgesConfig, PairConfig
 from coec.runtime.budget.budget import Budget
-from coec.runtime.edges.plan import NOT_INSTALLED, planned
-from coec.runtime.edges.stream import LidarEdgeStream
+from coec.runtime.edges.plan import NOT_INSTALLED, plan_lidar_pairs
+from coec.runtime.edges.stream import LidarPairStream
 from coec.runtime.ingest.intake import Intake
-from coec.runtime.rig.keeper import RigKeeper
-from coec.runtime.rig.lidar_side import LidarsKnown, LidarState
+from coec.runtime.rig.keeper import RigEstimatorThread
+from coec.runtime.rig.lidar_side import LidarPairStatus, LidarState
 from coec.runtime.worker.supervisor import Worker
 
 
-class LidarEdges:
+class LidarPairs:
     """The edges between all LiDARs of a vehicle. For the main thread.
 
     Attributes:
@@ -23,7 +23,7 @@ class LidarEdges:
     """
 
     def __init__(
-        self, config: LidarEdgesConfig, intake: Intake, worker: Worker, budget: Budget, rig: RigKeeper
+        self, config: LidarEdgesConfig, intake: Intake, worker: Worker, budget: Budget, rig: RigEstimatorThread
     ) -> None:
         self._period_s = config.period_s
         self._intake = intake
@@ -31,7 +31,7 @@ class LidarEdges:
         self._budget = budget
         self._rig = rig
         self._names: set[str] = set()
-        self.trouble: Reason | None = None
+        self.problem: Reason | None = None
 
     def grow(self, pairs: Iterable[PairConfig]) -> None:
         """Takes all present pairs, which the rig knows already, and begins to look at every two of their LiDARs that
@@ -40,14 +40,14 @@ class LidarEdges:
         Raises:
             ConfigError: the rig of a pair cannot be built.
         """
-        for lidars in planned(pairs, self._period_s):
+        for lidars in plan_lidar_pairs(pairs, self._period_s):
             if lidars.edge.name in self._names:
                 continue
             self._names.add(lidars.edge.name)
             why_not = lidars.why_not
             if why_not is None:
-                LidarEdgeStream(lidars, self._period_s, self._intake, self._worker, self._budget, self._rig)
+                LidarPairStream(lidars, self._period_s, self._intake, self._worker, self._budget, self._rig)
                 continue
-            self._rig.join_lidars(LidarsKnown(lidars.edge, LidarState.NOT_MEASURED, (why_not,)), lambda: True)
+            self._rig.join_lidars(LidarPairStatus(lidars.edge, LidarState.NOT_MEASURED, (why_not,)), lambda: True)
             if why_not is NOT_INSTALLED:
-                self.trouble = why_not
+                self.problem = why_not

@@ -16,7 +16,7 @@ from coec.calibration.types import Matrix4, Reason, Rig
 from coec.config import PairConfig
 from coec.runtime.rig.graph import graph_of, sensors_of
 
-MOST = 6
+MAX_LIDAR_PAIRS = 6
 """How many combinations of two LiDARs are looked at, in the order of the configuration: all those of four LiDARs. Each
 holds some twenty sweeps."""
 
@@ -34,11 +34,11 @@ NO_EGO = Reason(
 NOT_JOINED = Reason(
     "no_nominal_pose", "Not measured: no cameras and links join the two, so nothing tells where they were built."
 )
-TOO_MANY = Reason("too_many", f"Not measured: {MOST} pairs of LiDARs are looked at, and this is one more.")
+TOO_MANY = Reason("too_many", f"Not measured: {MAX_LIDAR_PAIRS} pairs of LiDARs are looked at, and this is one more.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mounted:
+class LidarOfPair:
     """A LiDAR of a vehicle: its name, a pair that has it, and the rig of that pair."""
 
     name: str
@@ -47,7 +47,7 @@ class Mounted:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Planned:
+class LidarPairPlan:
     """Two LiDARs.
 
     Attributes:
@@ -56,8 +56,8 @@ class Planned:
     """
 
     edge: Edge
-    a: Mounted
-    b: Mounted
+    a: LidarOfPair
+    b: LidarOfPair
     why_not: Reason | None
 
     @property
@@ -67,7 +67,7 @@ class Planned:
         return LidarRig(a.name, b.name, self.edge.T_a_b, a.rig.T_lidar_ego, a.rig.sweep, b.rig.sweep)
 
 
-def planned(pairs: Iterable[PairConfig], period_s: float) -> tuple[Planned, ...]:
+def plan_lidar_pairs(pairs: Iterable[PairConfig], period_s: float) -> tuple[LidarPairPlan, ...]:
     """Every two LiDARs of the pairs. The one that comes first in the configuration is a; if one LiDAR is larger, people
     name it first.
 
@@ -75,22 +75,22 @@ def planned(pairs: Iterable[PairConfig], period_s: float) -> tuple[Planned, ...]
         ConfigError: the rig of a pair cannot be built.
     """
     rigs = {pair.name: (pair, rig_of(pair)) for pair in pairs}
-    mounted: dict[str, Mounted] = {}
+    lidars: dict[str, LidarOfPair] = {}
     for pair, rig in rigs.values():
         name = sensors_of(pair)[1]
-        mounted.setdefault(name, Mounted(name, pair, rig))
-    if len(mounted) < 2:
+        lidars.setdefault(name, LidarOfPair(name, pair, rig))
+    if len(lidars) < 2:
         return ()
     places = _places({name: (pair, rig.T_camera_lidar_nominal) for name, (pair, rig) in rigs.items()})
-    found: list[Planned] = []
-    for a, b in combinations(mounted.values(), 2):
+    plans: list[LidarPairPlan] = []
+    for a, b in combinations(lidars.values(), 2):
         T_a_b = places.get(b.name, {}).get(a.name)
         edge = Edge(f"{a.name} to {b.name}", a.name, b.name, np.eye(4) if T_a_b is None else T_a_b)
         why_not = NOT_JOINED if T_a_b is None else _why_not(a, period_s)
-        if why_not is None and sum(one.why_not is None for one in found) >= MOST:
+        if why_not is None and sum(one.why_not is None for one in plans) >= MAX_LIDAR_PAIRS:
             why_not = TOO_MANY
-        found.append(Planned(edge, a, b, why_not))
-    return tuple(found)
+        plans.append(LidarPairPlan(edge, a, b, why_not))
+    return tuple(plans)
 
 
 def _places(pairs: Mapping[str, tuple[PairConfig, Matrix4]]) -> dict[str, Mapping[str, Matrix4]]:
@@ -103,7 +103,7 @@ def _places(pairs: Mapping[str, tuple[PairConfig, Matrix4]]) -> dict[str, Mappin
     return {sensor.name: graph.joined_to(sensor.name) for sensor in graph.sensors}
 
 
-def _why_not(a: Mounted, period_s: float) -> Reason | None:
+def _why_not(a: LidarOfPair, period_s: float) -> Reason | None:
     if period_s == 0.0:
         return SWITCHED_OFF
     if not nearest.installed():

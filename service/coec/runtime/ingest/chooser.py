@@ -14,11 +14,11 @@ from typing import Protocol
 
 from coec.adapters.depth.maps import STEREO
 from coec.adapters.frames.msgpack_frames import encode_camera
-from coec.adapters.images.codec import Compressed, Inspector
+from coec.adapters.images.codec import CompressingReducer, Inspector
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.sampling import CheckSampler
-from coec.calibration.frames.window import KeptPairs, PairBetween, PairSelected, SliceEnded, WindowCutter
-from coec.calibration.monitor.urgency import Urgency
+from coec.calibration.frames.window import CarriedOverPairs, PairBetween, PairSelected, SliceClosed, WindowCutter
+from coec.calibration.monitor.urgency import UrgentWindow
 from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
 from coec.config import MAX_SLICE_S, LimitsConfig, PairConfig, WindowConfig
 from coec.runtime.ingest.sensor_clock import SensorClock
@@ -35,25 +35,25 @@ PROGRESS_S = 15.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Served:
+class ServedExtrinsic:
     """An extrinsic (4, 4) that is or was served; `epoch` counts the extrinsics that were served."""
 
     epoch: int
     T_camera_lidar: Matrix4
 
 
-class Asks(Protocol):
+class JobRequester(Protocol):
     """What the chooser asks of the rest of the service; see `runtime.decisions.questions`."""
 
     @property
     def stretch(self) -> float:
         """Factor by which slices are to be longer than configured, at least 1."""
 
-    def affords(self, stamp_ns: int, *, suspected: bool) -> bool:
+    def try_acquire(self, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether the budget allows a check at a sensor time. If it does, the caller must ask for that check. Checks of
         `suspected` pairs come first."""
 
-    def window_wanted(self, stamp_ns: int) -> int | None:
+    def pop_window_request(self, stamp_ns: int) -> int | None:
         """Sensor time since which the rig wants pairs for a window, asked before a pair of this stamp; returned once.
         None: it wants no window."""
 
@@ -61,7 +61,7 @@ class Asks(Protocol):
         """By how much the end of a window that the rig wants may be delayed, s, so that the budget can pay for the
         windows before it. The window then counts as being on its way."""
 
-    def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
+    def check(self, pairs: tuple[FramePair, ...], served: ServedExtrinsic, stamp_ns: int) -> None:
         """Asks at a sensor time whether `served` is right according to these pairs. Only after `affords`."""
 
     def window(self, window_id: str, stamp_ns: int) -> int:
@@ -89,7 +89,7 @@ class Asks(Protocol):
         """The clock of the sensors has stepped back, to this stamp."""
 
 
-class Writes(Protocol):
+class WindowSink(Protocol):
     """What the chooser hands to the recorder."""
 
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
@@ -98,12 +98,12 @@ class Writes(Protocol):
     def add_between(self, window_id: str, pair: FramePair) -> None:
         """A thinned pair is to be recorded beside the chosen ones."""
 
-    def end(self, ended: SliceEnded) -> None:
+    def end(self, closed: SliceClosed) -> None:
         """A slice ended."""
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class SelectionStatistics:
     """What was chosen so far.
 
     Attributes:
@@ -129,7 +129,7 @@ class Chosen:
     unanswered: int = 0
 
 
-class Chooser:
+class FrameSelector:
     """Belongs to the ingest thread of a pair."""
 
     def __init__(
@@ -137,33 +137,33 @@ class Chooser:
         pair: PairConfig,
         limits: LimitsConfig,
         rig: Rig,
-        served: Served,
-        asks: Asks,
-        recorder: Writes,
+        served: ServedExtrinsic,
+        requester: JobRequester,
+        recorder: WindowSink,
         losses: LossCounter,
         first_slice_s: float,
-        kept: KeptPairs | None = None,
+        carried_over: CarriedOverPairs | None = None,
     ) -> None:
         """`served` is the extrinsic at which pairs are looked at until another is adopted. `kept` are pairs of an
         earlier run that belong to the first window."""
         self._name = pair.name
         self._logged_s = -PROGRESS_S
-        self._asks = asks
+        self._requester = requester
         self._recorder = recorder
         self._losses = losses
         self._served = served
         self._infers = pair.calibration.depth.model != STEREO
         self._window, self._stretch = pair.window, 1.0
-        self._cutter = WindowCutter(pair.window, rig, Inspector(limits), Compressed(limits))
+        self._cutter = WindowCutter(pair.window, rig, Inspector(limits), CompressingReducer(limits))
         if first_slice_s < pair.window.slice_s:
             self._cutter.hurry(first_slice_s)
-        if kept is not None:
-            self._cutter.keep(kept)
+        if carried_over is not None:
+            self._cutter.carry_over(carried_over)
         self._sampler = CheckSampler(pair.monitor)
-        self._urgency = Urgency(pair.monitor)
+        self._urgency = UrgentWindow(pair.monitor)
         self._pace = SensorClock()
         self._last_ns: int | None = None
-        self._unasked: deque[tuple[FramePair, ...]] = deque(maxlen=CHECKS_WAITING)
+        self._waiting_checks: deque[tuple[FramePair, ...]] = deque(maxlen=CHECKS_WAITING)
         self._window_due_ns = 0
         self._frozen = False
         self._suspected = False
@@ -173,9 +173,9 @@ class Chooser:
         self._steps_back = 0
 
     @property
-    def chosen(self) -> Chosen:
+    def statistics(self) -> SelectionStatistics:
         """What was chosen so far."""
-        return Chosen(
+        return SelectionStatistics(
             self._cutter.selected,
             tuple((cause, count) for cause, count in self._cutter.rejections.items() if count),
             self._cutter.last_quality,
@@ -184,7 +184,7 @@ class Chooser:
             self._not_afforded,
             self._last_ns,
             self._steps_back,
-            self._asks.unanswered,
+            self._requester.unanswered,
         )
 
     @property
@@ -197,21 +197,21 @@ class Chooser:
         step back of sensor time makes all outstanding answers due. A slice that is over by this stamp is ended
         first."""
         if self._has_stepped_back(stamp_ns):
-            self._asks.bring_forward(stamp_ns)
+            self._requester.bring_forward(stamp_ns)
         elif not self.end_slice_by(stamp_ns):
             return True
-        return self._asks.waits(stamp_ns)
+        return self._requester.waits(stamp_ns)
 
     def choose(self, pair: FramePair) -> None:
         """Looks at the next pair and uses it for the window, for a check, or not at all."""
         stepped_back = self._has_stepped_back(pair.stamp_ns)
         if stepped_back:
-            self._asks.bring_forward(pair.stamp_ns)
+            self._requester.bring_forward(pair.stamp_ns)
         elif self._slice_is_over(pair.stamp_ns):
             self._end_slice()
-        if self._asks.waits(pair.stamp_ns):
+        if self._requester.waits(pair.stamp_ns):
             self._losses.add("monitor", "not_awaited")
-        self._asks.settle(pair.stamp_ns)
+        self._requester.settle(pair.stamp_ns)
         if stepped_back:
             self._begin_new_time(pair.stamp_ns)
         self._last_ns = pair.stamp_ns
@@ -219,8 +219,8 @@ class Chooser:
         self._pace.observe(pair.stamp_ns, 0.0)
         self._follow_stretch()
         self._follow_rig(pair.stamp_ns)
-        for ended in self._urgency.heed(self._cutter, self._pace.rate_hz):
-            self._end(ended, pair.stamp_ns)
+        for closed in self._urgency.apply(self._cutter, self._pace.rate_hz):
+            self._end(closed, pair.stamp_ns)
         frozen_before = self._cutter.rejections["frozen"]
         T_camera_lidar = self._served.T_camera_lidar
         for event in self._cutter.offer(pair, T_camera_lidar):
@@ -229,18 +229,18 @@ class Chooser:
                 self._select(event, T_camera_lidar)
             elif isinstance(event, PairBetween):
                 self._recorder.add_between(event.window_id, event.pair)
-            elif isinstance(event, SliceEnded):
+            elif isinstance(event, SliceClosed):
                 self._end(event, pair.stamp_ns)
-                self._urgency.ended(event, self._cutter, self._pace.rate_hz)
+                self._urgency.on_slice_closed(event, self._cutter, self._pace.rate_hz)
             else:
-                told = f"pairs of {event.kept.window_id} since {event.kept.since_ns} ns are in no other window"
-                self._losses.add("window", "kept_pairs_forgotten", event.kept.pairs, detail=told)
+                detail = f"pairs of {event.carried_over.window_id} since {event.carried_over.since_ns} ns are in no other window"
+                self._losses.add("window", "kept_pairs_forgotten", event.carried_over.pairs, detail=detail)
         self._frozen |= self._cutter.rejections["frozen"] > frozen_before
         check = self._sampler.offer(pair)
         if check is not None:
             self._await_turn(check)
         if pair.stamp_ns >= self._window_due_ns:
-            self._ask_checks(pair.stamp_ns)
+            self._submit_checks(pair.stamp_ns)
 
     def end_slice_by(self, now_ns: int) -> bool:
         """Ends the open slice if it is over at this sensor time. Returns False while an answer that counts by the end
@@ -251,26 +251,26 @@ class Chooser:
         if not self._slice_is_over(now_ns):
             return True
         end_ns = self._cutter.slice_end_ns
-        if end_ns is not None and self._asks.waits(end_ns):
+        if end_ns is not None and self._requester.waits(end_ns):
             return False
         self._end_slice()
         return True
 
-    def finish(self) -> SliceEnded | None:
+    def finish(self) -> SliceClosed | None:
         """Ends the open slice at once."""
         for event in self._cutter.finish():
             self._end(event, self._last_ns or 0)
             return event
         return None
 
-    def use(self, window: WindowConfig) -> None:
+    def reconfigure(self, window: WindowConfig) -> None:
         """Cuts the next slice by these settings."""
         self._window, self._stretch = window, 1.0
-        self._cutter.use(window)
+        self._cutter.reconfigure(window)
 
     # --- effects of answers -----------------------------------------------------------------------------------------
 
-    def adopt(self, served: Served) -> None:
+    def adopt(self, served: ServedExtrinsic) -> None:
         """Looks at pairs with another extrinsic from now on."""
         if served.epoch > self._served.epoch:
             self._served = served
@@ -280,9 +280,9 @@ class Chooser:
         self._suspected = True
         self._urgency.alarm(since_ns)
 
-    def keep(self, kept: KeptPairs) -> None:
+    def carry_over(self, carried_over: CarriedOverPairs) -> None:
         """The camera moved within a window; the pairs after the move belong to the next window."""
-        self._cutter.keep(kept)
+        self._cutter.carry_over(carried_over)
 
     def calm(self) -> None:
         """There is no suspicion any more."""
@@ -297,7 +297,7 @@ class Chooser:
         self.calm()
         self._urgency.forget()
         self._window_due_ns = stamp_ns
-        self._asks.time_stepped_back(stamp_ns)
+        self._requester.time_stepped_back(stamp_ns)
 
     def _has_stepped_back(self, stamp_ns: int) -> bool:
         return self._last_ns is not None and stamp_ns < self._last_ns
@@ -311,55 +311,55 @@ class Chooser:
         end_ns = self._cutter.slice_end_ns
         if end_ns is None:
             return
-        self._asks.settle(end_ns)
-        for ended in self._urgency.heed(self._cutter, self._pace.rate_hz):
-            self._end(ended, end_ns)
-        for ended in self._cutter.advance(end_ns):
-            self._end(ended, end_ns)
-            self._urgency.ended(ended, self._cutter, self._pace.rate_hz)
+        self._requester.settle(end_ns)
+        for closed in self._urgency.apply(self._cutter, self._pace.rate_hz):
+            self._end(closed, end_ns)
+        for closed in self._cutter.advance(end_ns):
+            self._end(closed, end_ns)
+            self._urgency.on_slice_closed(closed, self._cutter, self._pace.rate_hz)
 
     def _follow_stretch(self) -> None:
         """Makes slices longer if the budget does not suffice for all windows, just as periods of checks get longer."""
-        stretch = self._asks.stretch
+        stretch = self._requester.stretch
         if stretch != self._stretch:
             self._stretch = stretch
             slice_s = min(stretch * self._window.slice_s, MAX_SLICE_S)
-            self._cutter.use(self._window.model_copy(update={"slice_s": slice_s}))
+            self._cutter.reconfigure(self._window.model_copy(update={"slice_s": slice_s}))
 
     def _follow_rig(self, stamp_ns: int) -> None:
         """If the rig has named a sensor of this pair as moved, hurries a window: the repair waits for a window of each
         pair of that sensor."""
-        since_ns = self._asks.window_wanted(stamp_ns)
+        since_ns = self._requester.pop_window_request(stamp_ns)
         if since_ns is not None and not self._urgency.is_waiting:
-            self._urgency.wanted(since_ns, self._asks.window_turn_s(stamp_ns))
+            self._urgency.request(since_ns, self._requester.window_turn_s(stamp_ns))
 
     def _await_turn(self, check: tuple[FramePair, ...]) -> None:
         """Queues pairs for a check. Pairs of an earlier period that still wait for their turn are dropped as too
         old."""
         if self._waits_its_turn:
-            self._not_afforded += len(self._unasked)
-            self._losses.add("monitor", "check_not_afforded", len(self._unasked))
-            self._unasked.clear()
-        if len(self._unasked) == CHECKS_WAITING:
+            self._not_afforded += len(self._waiting_checks)
+            self._losses.add("monitor", "check_not_afforded", len(self._waiting_checks))
+            self._waiting_checks.clear()
+        if len(self._waiting_checks) == CHECKS_WAITING:
             self._losses.add("monitor", "check_superseded")
-        self._unasked.append(check)
+        self._waiting_checks.append(check)
 
-    def _ask_checks(self, stamp_ns: int) -> None:
+    def _submit_checks(self, stamp_ns: int) -> None:
         """Has the latest pairs checked at the served extrinsic when it is their turn. Not called while a window is to
         change that extrinsic, because the check would judge one that is no longer served."""
         self._waits_its_turn = False
-        while self._unasked:
-            if not self._asks.affords(stamp_ns, suspected=self._suspected):
+        while self._waiting_checks:
+            if not self._requester.try_acquire(stamp_ns, suspected=self._suspected):
                 self._waits_its_turn = True
                 return
             self._checks += 1
-            self._asks.check(self._unasked.popleft(), self._served, stamp_ns)
+            self._requester.check(self._waiting_checks.popleft(), self._served, stamp_ns)
 
     def _select(self, event: PairSelected, T_camera_lidar: Matrix4) -> None:
         self._log_progress(event.window_id)
         self._recorder.add(event.window_id, event.pair, T_camera_lidar)
         if self._infers:
-            self._asks.prefetch(encode_camera(event.pair.camera))
+            self._requester.prefetch(encode_camera(event.pair.camera))
 
     def _log_progress(self, window_id: str) -> None:
         """Logs how many pairs the open window has, at a bounded rate."""
@@ -370,10 +370,10 @@ class Chooser:
         fields = {"pair": self._name, "window": window_id}
         _log.info(f"window: {self._cutter.selected} of {self._window.pairs} pairs", extra={"fields": fields})
 
-    def _end(self, event: SliceEnded, stamp_ns: int) -> None:
+    def _end(self, event: SliceClosed, stamp_ns: int) -> None:
         """A slice ended at this sensor time: its pairs go to the disk, and from there to the worker."""
         if event.complete:
-            self._window_due_ns = self._asks.window(event.window_id, stamp_ns)
+            self._window_due_ns = self._requester.window(event.window_id, stamp_ns)
         fields = {"pair": self._name, "window": event.window_id, "pairs": event.pairs, "complete": event.complete}
         enough = "it is recorded" if event.complete else f"too few, {self._window.min_pairs} are needed"
         _log.info(f"window ended with {event.pairs} pairs: {enough}", extra={"fields": fields})

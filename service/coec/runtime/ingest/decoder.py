@@ -12,9 +12,9 @@ from coec.adapters.frames import msgpack_frames
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.ros import incoming, messages
 from coec.adapters.ros.moving_frames import MovingFrame
-from coec.adapters.ros.wire.rmw_zenoh import Attachment
+from coec.adapters.ros.wire.rmw_zenoh import MessageAttachment
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import CDR, Sample
+from coec.adapters.zenoh.inputs import CDR, InputSample
 from coec.calibration.frames.concatenation import SeveralOrigins
 from coec.calibration.frames.origin import ApparentOrigin, OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
@@ -29,7 +29,7 @@ from coec.config import (
     OpenLidarConfig,
 )
 from coec.errors import DecodeError
-from coec.geometry.edges.scan_lines import telling
+from coec.geometry.edges.scan_lines import distinct_rings
 from coec.runtime.ingest.senders import RECENT, Senders
 
 _log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ NUMBERED = b"\xa8sequence"
 """Name of the field by which a native frame with a number is recognised without decoding; the search takes some 10 ms
 in the largest message. A frame that is not recognised is also counted as lost on its way."""
 
-NOBODY = b""
+UNNAMED_SENDER = b""
 """Id of a sender that does not name itself."""
 
 TWO_SENDERS = "two_senders"
@@ -102,7 +102,7 @@ class SampleReader:
         self._limits = limits
         self._moving = MovingFrame(stream.parent, stream.child) if isinstance(stream, OpenEgoConfig) else None
 
-    def frame(self, sample: Sample) -> Frame | None:
+    def frame(self, sample: InputSample) -> Frame | None:
         """The frame in a sample; None if it holds only transforms of other frames than the vehicle's, or the first
         transforms.
 
@@ -117,8 +117,8 @@ class SampleReader:
             type_name = schema or configured.assumed_type
             if type_name not in configured.types:
                 expected = " or ".join(configured.types)
-                told = incoming.REFUSED.get(type_name, "a message of another type")
-                raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
+                refusal = incoming.REFUSED.get(type_name, "a message of another type")
+                raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {refusal}")
             if type_name == messages.TF and self._moving is not None:
                 return self._moving.motion(sample.payload)
             time, source = None, None
@@ -157,8 +157,8 @@ class Decoder:
         lidar = stream if isinstance(stream, LidarConfig) else None
         self._T_cloud_lidar = np.array(IDENTITY if lidar is None else lidar.T_cloud_lidar, dtype=np.float64)
         self._origin = OriginCheck()
-        self._looked_in: int | None = None
-        self._contradicted = self._ring_told = False
+        self._checked_period: int | None = None
+        self._contradicted = self._ring_reported = False
         self.timed_by = ""
 
     def counts(self) -> StreamCounts:
@@ -178,22 +178,22 @@ class Decoder:
         """Whether several senders send at the same time."""
         return bool(self._senders.taking_turns)
 
-    def overrun(self, sample: Sample) -> None:
+    def overrun(self, sample: InputSample) -> None:
         """A sample was dropped before it was decoded. For any thread."""
         self._losses.add(self._kind, "overrun")
-        told = Attachment.parse(sample.attachment)
-        if told is not None:
-            self._overruns.append(told.gid)
+        attachment = MessageAttachment.parse(sample.attachment)
+        if attachment is not None:
+            self._overruns.append(attachment.gid)
         elif sample.attachment is None and NUMBERED in sample.payload:
-            self._overruns.append(NOBODY)
+            self._overruns.append(UNNAMED_SENDER)
 
-    def frame(self, sample: Sample) -> Frame | None:
+    def frame(self, sample: InputSample) -> Frame | None:
         """The frame in a sample. None if it was refused (and counted), or holds only transforms of other frames than
         the vehicle's. Never raises, whatever a sender sent."""
         self._received += 1
         while self._overruns:
             self._senders.counted(self._overruns.popleft())
-        told = self._told(sample)
+        attachment = self._attachment_of(sample)
         try:
             if len(sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
@@ -201,8 +201,8 @@ class Decoder:
             if frame is None:
                 return None
             self._check_times(frame)
-            sender = self._sender(sample, frame) if told is None else told.gid
-            frame = self._checked(self._stamped(frame, told))
+            sender = self._sender(sample, frame) if attachment is None else attachment.gid
+            frame = self._checked(self._stamped(frame, attachment))
             self._own.append(True)
             if sender is not None:
                 self._senders.took(sender)
@@ -223,22 +223,22 @@ class Decoder:
             self.timed_by = frame.timed_by
         return frame
 
-    def _told(self, sample: Sample) -> Attachment | None:
+    def _attachment_of(self, sample: InputSample) -> MessageAttachment | None:
         """The attachment of the sender; its number is counted. A message with an unreadable attachment is still
         taken."""
-        told = Attachment.parse(sample.attachment)
-        if told is not None:
-            self._number(told.gid, told.sequence)
+        attachment = MessageAttachment.parse(sample.attachment)
+        if attachment is not None:
+            self._number(attachment.gid, attachment.sequence)
         elif sample.attachment is not None:
             self._losses.add(self._kind, "attachment_malformed")
-        return told
+        return attachment
 
     def _number(self, sender: bytes, number: int) -> None:
         lost = self._senders.lost_by(sender, number)
         if lost:
             self._losses.add(self._kind, "sequence_gap", lost)
 
-    def _sender(self, sample: Sample, frame: Frame) -> bytes | None:
+    def _sender(self, sample: InputSample, frame: Frame) -> bytes | None:
         """The id that stands for the sender of a message without a readable attachment; its number is counted. None: an
         attachment should name the sender, but cannot be read."""
         if sample.attachment is not None:
@@ -248,11 +248,11 @@ class Decoder:
             self._losses.add(self._kind, "sequence_gap", lost)
         return sender
 
-    def _stamped(self, frame: Frame, told: Attachment | None) -> Frame:
+    def _stamped(self, frame: Frame, attachment: MessageAttachment | None) -> Frame:
         """A frame without a stamp gets the time at which it was sent, instead of that of the measurement."""
-        without = frame.stamp_ns == 0 and told is not None and told.source_ns > 0
+        without = frame.stamp_ns == 0 and attachment is not None and attachment.source_ns > 0
         self._stamped_by_sender = without
-        return replace(frame, stamp_ns=told.source_ns) if told is not None and without else frame
+        return replace(frame, stamp_ns=attachment.source_ns) if attachment is not None and without else frame
 
     def _checked(self, frame: Frame) -> Frame:
         stream = self._stream
@@ -290,19 +290,19 @@ class Decoder:
         sensor time, and at every sweep while there is a contradiction: the frame in which a driver sends changes with
         its configuration, not from sweep to sweep."""
         period = sweep.stamp_ns // ORIGIN_PERIOD_NS
-        if period == self._looked_in and not self._contradicted:
+        if period == self._checked_period and not self._contradicted:
             return None
-        self._looked_in = period
-        if sweep.ring is not None and telling(sweep.ring) is None and not self._ring_told:
-            self._ring_told = True
+        self._checked_period = period
+        if sweep.ring is not None and distinct_rings(sweep.ring) is None and not self._ring_reported:
+            self._ring_reported = True
             _log.warning(
                 "the field `ring` of the clouds holds one number: it is ignored, beams are told apart by their "
                 "elevation; check the driver of the LiDAR",
                 extra={"fields": {"sensor": self._stream.sensor}},
             )
-        found = self._origin.look(sweep)
-        self._contradicted = found is not None
-        return found
+        contradiction = self._origin.inspect(sweep)
+        self._contradicted = contradiction is not None
+        return contradiction
 
     def _check_times(self, frame: Frame) -> None:
         time = self._stream.time if isinstance(self._stream, LidarConfig) else None

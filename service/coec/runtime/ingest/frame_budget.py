@@ -19,13 +19,13 @@ class FrameBudget:
         self._max_bytes = max_bytes
         self._bytes = 0
         # The garbage collector may free a frame in the middle of `admit`, where no lock could be taken.
-        self._ended: deque[int] = deque()
+        self._freed: deque[int] = deque()
 
     @property
     def bytes(self) -> int:
         """Bytes of all frames that are held."""
-        while self._ended:
-            self._bytes -= self._ended.popleft()
+        while self._freed:
+            self._bytes -= self._freed.popleft()
         return self._bytes
 
     def admit(self, frame: CameraFrame | LidarFrame | EgoMotion) -> bool:
@@ -34,7 +34,7 @@ class FrameBudget:
         if self.bytes + size > self._max_bytes:
             return False
         self._bytes += size
-        weakref.finalize(frame, self._ended.append, size).atexit = False
+        weakref.finalize(frame, self._freed.append, size).atexit = False
         return True
 
 

@@ -34,7 +34,7 @@ class Snippet:
 
 
 @dataclass(slots=True)
-class _Open:
+class _OpenEvent:
     """An event whose frames are still coming."""
 
     event: str
@@ -53,8 +53,8 @@ class FrameRing:
         self._deliver = deliver
         self._frames: deque[tuple[Frame, int]] = deque()
         self._bytes = 0
-        self._came_s = 0.0
-        self._open: _Open | None = None
+        self._received_s = 0.0
+        self._open: _OpenEvent | None = None
 
     @property
     def bytes(self) -> int:
@@ -63,7 +63,7 @@ class FrameRing:
 
     def push(self, frame: Frame, monotonic_s: float) -> None:
         """A frame came."""
-        size, self._came_s = frame_bytes(frame), monotonic_s
+        size, self._received_s = frame_bytes(frame), monotonic_s
         opened = self._open
         if opened is not None:
             later_ns = frame.stamp_ns - opened.stamp_ns  # far below zero after sensor time has stepped back
@@ -78,11 +78,11 @@ class FrameRing:
         """An event happened while this extrinsic (4, 4) is served. A further event before the end of the first belongs
         to the same snippet."""
         if self._open is None and self._frames:
-            self._open = _Open(name, self._frames[-1][0].stamp_ns, T_camera_lidar)
+            self._open = _OpenEvent(name, self._frames[-1][0].stamp_ns, T_camera_lidar)
 
-    def look(self, monotonic_s: float) -> None:
+    def tick(self, monotonic_s: float) -> None:
         """Time has passed: ends an open snippet if no frame has come for `SILENT_S`."""
-        if self._open is not None and monotonic_s - self._came_s > SILENT_S:
+        if self._open is not None and monotonic_s - self._received_s > SILENT_S:
             self.finish()
 
     def finish(self) -> None:

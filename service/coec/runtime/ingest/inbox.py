@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.inputs import InputSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class Parcel:
 
     order: int
     stream: str
-    sample: Sample
+    sample: InputSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,23 +73,23 @@ class Inbox:
         """
         self._waiting = {stream: _Waiting(depth) for stream, depth in depths.items()}
         self._max_bytes = max_bytes
-        self._came_s: dict[str, float] = {}
+        self._received_s: dict[str, float] = {}
         self._calls: deque[Call] = deque()
         self._on_overrun = on_overrun
         self._order = itertools.count()
         self._condition = threading.Condition()
 
-    def put(self, stream: str, sample: Sample) -> None:
+    def put(self, stream: str, sample: InputSample) -> None:
         """A sample came."""
         with self._condition:
             gone = self._make_room(stream, len(sample.payload))
             self._waiting[stream].add(Parcel(next(self._order), stream, sample))
-            self._came_s[stream] = time.monotonic()
+            self._received_s[stream] = time.monotonic()
             self._condition.notify()
         for overrun in gone:
             self._on_overrun(overrun)
 
-    def receiver(self, stream: str) -> Callable[[Sample], None]:
+    def receiver(self, stream: str) -> Callable[[InputSample], None]:
         """`put` for one stream."""
         return partial(self.put, stream)
 
@@ -108,9 +108,11 @@ class Inbox:
         """What came, by stream; ages are counted at this time of the steady clock."""
         with self._condition:
             return {
-                stream: Arrivals(len(waiting.parcels), None if came_s is None else max(monotonic_s - came_s, 0.0))
+                stream: Arrivals(
+                    len(waiting.parcels), None if received_s is None else max(monotonic_s - received_s, 0.0)
+                )
                 for stream, waiting in self._waiting.items()
-                for came_s in (self._came_s.get(stream),)
+                for received_s in (self._received_s.get(stream),)
             }
 
     def waiting(self) -> set[str]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from coec.adapters.system.threads import ServiceThread
-from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.inputs import InputSample
 from coec.config import KnownStreamConfig, LimitsConfig, PairConfig
 from coec.runtime.ingest.decoder import Frame
 from coec.runtime.ingest.frame_budget import FrameBudget
@@ -37,7 +37,7 @@ IDLE_S = 0.25
 """Longest wait for a sample, s: so soon silence is noticed."""
 
 
-class Takes(Protocol):
+class FrameConsumer(Protocol):
     """What the intake needs of a camera-LiDAR pair (see `pair_stream`), or of an edge between two LiDARs."""
 
     @property
@@ -64,18 +64,18 @@ class Intake:
         waiting_frames: frames of the pairs that have come and wait to be looked at.
     """
 
-    def __init__(self, limits: LimitsConfig, kept_bytes: int = 0) -> None:
+    def __init__(self, limits: LimitsConfig, reserved_bytes: int = 0) -> None:
         """`kept_bytes`: memory for frames that are kept in any case (for snippets), in addition to the limits."""
         self._limits = limits
         self._sensors: dict[tuple[str, str], SensorStream] = {}
         self._by_number: dict[str, SensorStream] = {}
-        self._unheard: list[SensorStream] = []
+        self._unsubscribed: list[SensorStream] = []
         self.inbox = Inbox({}, limits.max_waiting_bytes, self._overrun)
         self.thread = ServiceThread("ingest", self._run)
-        budget = self._budget = FrameBudget(kept_bytes + round(ALL_FRAMES * limits.max_held_bytes))
-        tight = kept_bytes + round(TIGHT * limits.max_held_bytes)
+        budget = self._budget = FrameBudget(reserved_bytes + round(ALL_FRAMES * limits.max_held_bytes))
+        tight = reserved_bytes + round(TIGHT * limits.max_held_bytes)
         self.waiting_frames = WaitingFrames(limits.max_held_bytes, lambda: budget.bytes > tight)
-        self._pairs: list[Takes] = []
+        self._pairs: list[FrameConsumer] = []
         self._ticked_s = 0.0
 
     def request_stop(self) -> None:
@@ -101,33 +101,33 @@ class Intake:
             sensor = SensorStream(kind, f"{kind}-{len(self._sensors)}", stream, self._limits)
             self._by_number[sensor.number] = sensor
             self.inbox.open(sensor.number, sensor.depth)
-            self._unheard.append(sensor)
+            self._unsubscribed.append(sensor)
             self._sensors[alike] = sensor
         return self._sensors[alike]
 
-    def join(self, pair: Takes) -> None:
+    def join(self, pair: FrameConsumer) -> None:
         """A pair takes part from now on."""
         self.inbox.call(lambda: self._join(pair))
 
-    def listen(self, subscribe: Callable[[KnownStreamConfig, Callable[[Sample], None]], object]) -> None:
+    def listen(self, subscribe: Callable[[KnownStreamConfig, Callable[[InputSample], None]], object]) -> None:
         """Subscribe to each stream that nobody has subscribed to yet."""
-        unheard, self._unheard = self._unheard, []
-        for sensor in unheard:
+        unsubscribed, self._unsubscribed = self._unsubscribed, []
+        for sensor in unsubscribed:
             subscribe(sensor.config, self.inbox.receiver(sensor.number))
 
     # --- on any -----------------------------------------------------------------------------------------------------
 
     def arrivals(self, sensors: Mapping[str, SensorStream]) -> dict[str, Arrivals]:
         """What came on these streams, by the names that the caller gives them."""
-        came = self.inbox.arrivals(time.monotonic())
-        return {name: came[sensor.number] for name, sensor in sensors.items()}
+        arrivals = self.inbox.arrivals(time.monotonic())
+        return {name: arrivals[sensor.number] for name, sensor in sensors.items()}
 
     def _overrun(self, parcel: Parcel) -> None:
         self._by_number[parcel.stream].decoder.overrun(parcel.sample)
 
     # --- on the ingest thread ---------------------------------------------------------------------------------------
 
-    def _join(self, pair: Takes) -> None:
+    def _join(self, pair: FrameConsumer) -> None:
         self._pairs.append(pair)
         for name, sensor in pair.sensors.items():
             sensor.takers = (*sensor.takers, pair.taker(name))
@@ -141,10 +141,10 @@ class Intake:
             item.run()
         elif item is not None:
             self._by_number[item.stream].take(item.sample, self._budget)
-        chosen = [pair.choose_next() for pair in self._pairs]
+        processed = [pair.choose_next() for pair in self._pairs]
         if time.monotonic() - self._ticked_s >= TICK_S:
             self._tick()
-        return item is not None or any(chosen)
+        return item is not None or any(processed)
 
     def _run(self, thread: ServiceThread) -> None:
         while not thread.stopping:

@@ -39,7 +39,7 @@ class WaitingFrames:
             del self._holders[id(frame)]
             self._bytes -= frame_bytes(frame)
 
-    def has_to_go(self, buffer: PairBuffer) -> bool:
+    def must_evict(self, buffer: PairBuffer) -> bool:
         """Whether a buffer must let a pair go: there are too many bytes of frames, or so many elsewhere in memory that
         new ones would be refused, and no other buffer holds more pairs. So a pair that waits for long does not push on
         the others."""
@@ -81,8 +81,8 @@ class PairBuffer:
     def has_waited(self, monotonic_s: float) -> bool:
         """The oldest pair has to wait. Whether it has waited too long by now, or too many frames wait."""
         self._since_s = monotonic_s if self._since_s is None else self._since_s
-        return self._frames.has_to_go(self) or monotonic_s - self._since_s > self._max_wait_s
+        return self._frames.must_evict(self) or monotonic_s - self._since_s > self._max_wait_s
 
-    def may_go(self) -> None:
+    def stop_waiting(self) -> None:
         """The oldest pair need not wait."""
         self._since_s = None

@@ -9,11 +9,11 @@ from typing import TypeVar
 
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.frames.window import KeptPairs
+from coec.calibration.frames.window import CarriedOverPairs
 from coec.calibration.types import FramePair, Matrix4
 from coec.config import Config, PairConfig
-from coec.runtime.handover import Handover
-from coec.runtime.ingest.chooser import Chooser, Served
+from coec.runtime.handover import DeferredCall
+from coec.runtime.ingest.chooser import FrameSelector, ServedExtrinsic
 from coec.runtime.ingest.decoder import LIDAR, Frame
 from coec.runtime.ingest.frame_ring import FrameRing
 from coec.runtime.ingest.inbox import Arrivals
@@ -49,7 +49,7 @@ class PairStream:
         pair: PairConfig,
         config: Config,
         intake: Intake,
-        chooser: Chooser,
+        selector: FrameSelector,
         has_room: Callable[[], bool],
         losses: LossCounter,
         ring: FrameRing | None = None,
@@ -60,12 +60,12 @@ class PairStream:
         self.sensors: Mapping[str, SensorStream] = intake.sensors_of(pair)
         self.report = StreamStatistics()
         self.waiting_took = Histogram(QUICK_S)
-        self._chooser = chooser
+        self._selector = selector
         self._has_room = has_room
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._clock = SensorClock()
         self._held = PairBuffer(intake.waiting_frames, config.worker.timeout_s)
-        self._came_s: deque[float] = deque()
+        self._received_s: deque[float] = deque()
         self._losses = losses
         self._ring = ring
         self._pairs = 0
@@ -85,7 +85,7 @@ class PairStream:
         """What came on its streams, by kind."""
         return self._intake.arrivals(self.sensors)
 
-    def ask(self, work: Callable[[], T], timeout_s: float) -> T:
+    def call_and_wait(self, work: Callable[[], T], timeout_s: float) -> T:
         """Has `work` done between two samples, after every pair that has come was looked at, and waits for its result.
 
         Raises:
@@ -96,7 +96,7 @@ class PairStream:
             self.finish_pairs()
             return work()
 
-        handed = Handover(everything_first)
+        handed = DeferredCall(everything_first)
         self._intake.inbox.call(handed.run)
         return handed.result(timeout_s)
 
@@ -104,21 +104,21 @@ class PairStream:
         """Has the effect of a decision run on the intake's thread, between two samples."""
         self._intake.inbox.call(effect)
 
-    def adopt(self, served: Served) -> None:
+    def adopt(self, served: ServedExtrinsic) -> None:
         """See `Chooser`; on this thread."""
-        self._chooser.adopt(served)
+        self._selector.adopt(served)
 
     def alarm(self, since_ns: int) -> None:
         """See `Chooser`; on this thread."""
-        self._chooser.alarm(since_ns)
+        self._selector.alarm(since_ns)
 
-    def keep(self, kept: KeptPairs) -> None:
+    def carry_over(self, carried_over: CarriedOverPairs) -> None:
         """See `Chooser`; on this thread."""
-        self._chooser.keep(kept)
+        self._selector.carry_over(carried_over)
 
     def calm(self) -> None:
         """See `Chooser`; on this thread."""
-        self._chooser.calm()
+        self._selector.calm()
 
     def event(self, name: str, T_camera_lidar: Matrix4) -> None:
         """See `FrameRing`; on this thread."""
@@ -147,7 +147,7 @@ class PairStream:
         self._quiet_ticks = 0
         if self._ring is not None:
             self._ring.push(frame, time.monotonic())
-        self._look_back(frame.stamp_ns)
+        self._check_silence(frame.stamp_ns)
         self.take(self._pairer.push(frame))
 
     def take(self, pairs: list[FramePair]) -> None:
@@ -157,12 +157,12 @@ class PairStream:
         self._hold(pairs)
 
     def _choose(self) -> None:
-        self.waiting_took.add(time.monotonic() - self._came_s.popleft())
-        self._chooser.choose(self._held.take())
+        self.waiting_took.add(time.monotonic() - self._received_s.popleft())
+        self._selector.choose(self._held.take())
 
     def _hold(self, pairs: list[FramePair]) -> None:
         for pair in pairs:
-            self._came_s.append(time.monotonic())
+            self._received_s.append(time.monotonic())
             self._pairs += 1
             self._sync_error_s = (pair.camera.stamp_ns - pair.lidar.stamp_ns) / NS_PER_S
             self._held.add(pair)
@@ -179,8 +179,8 @@ class PairStream:
         waited too long, or too many frames wait."""
         if not self._held:
             return False
-        if self._has_room() and not self._chooser.must_wait(self._held.next_ns):
-            self._held.may_go()
+        if self._has_room() and not self._selector.must_wait(self._held.next_ns):
+            self._held.stop_waiting()
             return True
         return self._held.has_waited(time.monotonic())
 
@@ -191,12 +191,12 @@ class PairStream:
         if self._quiet_ticks > QUIET_TICKS:
             self._end_in_silence()
         if self._ring is not None:
-            self._ring.look(time.monotonic())
-        self.tell()
+            self._ring.tick(time.monotonic())
+        self.renew_report()
 
     def _end_in_silence(self) -> None:
         """Ends the slice by extrapolated time if the streams have stopped."""
-        end_ns = self._chooser.slice_end_ns
+        end_ns = self._selector.slice_end_ns
         if end_ns is None or self._held:
             return
         now_ns = self._clock.silent_now_ns(time.monotonic())
@@ -205,12 +205,12 @@ class PairStream:
         # The flushed pairs came earlier and are certain only by the silence, so they do not set the clock.
         pairs = self._pairer.flush()
         self._hold(pairs)
-        last_ns = pairs[-1].stamp_ns if pairs else self._chooser.chosen.last_ns
+        last_ns = pairs[-1].stamp_ns if pairs else self._selector.statistics.last_ns
         self._silence = last_ns or 0, end_ns
         if not self._held:
-            self._chooser.end_slice_by(end_ns)
+            self._selector.end_slice_by(end_ns)
 
-    def _look_back(self, stamp_ns: int) -> None:
+    def _check_silence(self, stamp_ns: int) -> None:
         """Checks, when a frame comes, whether a slice that ended in silence ended too early. If the frame belongs to
         that slice, the streams were not silent but held up. The window then differs from that of a replay, and that is
         counted."""
@@ -221,7 +221,7 @@ class PairStream:
         if last_ns < stamp_ns < end_ns:
             self._losses.add("window", "ended_too_early", detail="frames that were held up came after the slice ended")
 
-    def tell(self) -> None:
+    def renew_report(self) -> None:
         """Renews the report."""
         silent = self._clock.is_silent(time.monotonic())
         rate_hz = self._clock.rate_hz
@@ -230,7 +230,7 @@ class PairStream:
             unpaired=dict(self._pairer.losses),
             pairs=self._pairs,
             held=len(self._held),
-            chosen=self._chooser.chosen,
+            selection=self._selector.statistics,
             rate_hz=0.0 if silent and rate_hz is not None else rate_hz,
             pace=self._clock.pace,
             sync_error_s=self._sync_error_s,

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.inputs import InputSample
 from coec.config import KnownStreamConfig, LimitsConfig
 from coec.runtime.ingest.decoder import EGO, TWO_SENDERS, Decoder, Frame
 from coec.runtime.ingest.frame_budget import FrameBudget
@@ -58,13 +58,13 @@ class SensorStream:
         """How many samples may wait."""
         return MOTIONS_WAITING if self.kind == EGO else FRAMES_WAITING
 
-    def take(self, sample: Sample, budget: FrameBudget) -> None:
+    def take(self, sample: InputSample, budget: FrameBudget) -> None:
         """Decodes a sample and hands the same frame to every taker. The first frames of a new sender are kept back
         until it has sent some in a row: if the sender before comes back, two are sending, and the frames of neither may
         be used."""
-        begun_s = time.monotonic()
+        started_s = time.monotonic()
         frame = self.decoder.frame(sample)
-        self.took.add(time.monotonic() - begun_s, self.kind)
+        self.took.add(time.monotonic() - started_s, self.kind)
         if self.decoder.contested:
             if self._on_trial:
                 self.losses.add(self.kind, TWO_SENDERS, len(self._on_trial))

@@ -18,7 +18,7 @@ class SequenceNumbers:
 
     def __init__(self) -> None:
         self._newest: int | None = None
-        self._awaited: set[int] = set()
+        self._missing: set[int] = set()
         self._counted = 0
         self._since_counted = 0
 
@@ -39,16 +39,16 @@ class SequenceNumbers:
     def _left_out_by(self, number: int) -> int:
         newest = self._newest
         if newest is not None and newest - LATE_FRAMES <= number <= newest:  # late, or for the second time
-            self._awaited.discard(number)
+            self._missing.discard(number)
             return 0
         self._newest = number
         if newest is None or not newest < number <= newest + MAX_GAP:
             # The sender counts anew: numbers that are missing from the old count do not come any more.
-            lost = len(self._awaited)
-            self._awaited.clear()
+            lost = len(self._missing)
+            self._missing.clear()
             return lost
         oldest = number - LATE_FRAMES
-        self._awaited.update(range(max(newest + 1, oldest), number))
-        late = {awaited for awaited in self._awaited if awaited < oldest}
-        self._awaited -= late
+        self._missing.update(range(max(newest + 1, oldest), number))
+        late = {missing for missing in self._missing if missing < oldest}
+        self._missing -= late
         return max(0, oldest - newest - 1) + len(late)

@@ -11,7 +11,7 @@ from coec.runtime.ingest.sensor_clock import NS_PER_S
 
 _log = logging.getLogger(__name__)
 
-Frame = CameraFrame | LidarFrame | EgoMotion
+LoggedFrame = CameraFrame | LidarFrame | EgoMotion
 
 RATE_FRAMES = 30
 """The rate is measured over the first so many frames."""
@@ -34,10 +34,10 @@ class StreamLog:
         self._frames = 0
         self._first_ns = 0
         self._latest_s = 0.0
-        self._told_s = -QUIET_S
+        self._reported_s = -QUIET_S
         self._silent_since_s: float | None = None
 
-    def push(self, frame: Frame) -> None:
+    def push(self, frame: LoggedFrame) -> None:
         """A frame was accepted."""
         self._latest_s = self._clock()
         self._frames += 1
@@ -57,13 +57,13 @@ class StreamLog:
         now_s = self._clock()
         if not self._frames or self._silent_since_s is not None or now_s - self._latest_s < SILENT_S:
             return
-        if now_s - self._told_s >= QUIET_S:
-            self._told_s, self._silent_since_s = now_s, self._latest_s
+        if now_s - self._reported_s >= QUIET_S:
+            self._reported_s, self._silent_since_s = now_s, self._latest_s
             text = f"no {self._kind} frames for {now_s - self._latest_s:.0f} s: check the sensor and the network"
             _log.warning(text, extra={"fields": self._fields})
 
 
-def _shape(frame: Frame) -> str:
+def _shape(frame: LoggedFrame) -> str:
     match frame:
         case CameraFrame():
             return f"{frame.image.width}×{frame.image.height}, frame {frame.frame_id!r}"

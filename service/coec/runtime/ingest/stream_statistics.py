@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from coec.runtime.ingest.chooser import Chosen
+from coec.runtime.ingest.chooser import SelectionStatistics
 from coec.runtime.ingest.decoder import StreamCounts
 
 
@@ -28,7 +28,7 @@ class StreamStatistics:
     unpaired: dict[str, int] = field(default_factory=dict)
     pairs: int = 0
     held: int = 0
-    chosen: Chosen = field(default_factory=Chosen)
+    selection: SelectionStatistics = field(default_factory=SelectionStatistics)
     rate_hz: float | None = None
     pace: float | None = None
     sync_error_s: float | None = None

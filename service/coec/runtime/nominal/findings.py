@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from coec.adapters.files.rig import matrix_rows
-from coec.adapters.ros.camera_info import Info, info_topic, is_rectified, lens_of
+from coec.adapters.ros.camera_info import CameraInfoContent, info_topic, intrinsics_of_info, is_rectified
 from coec.adapters.ros.static_transforms import StaticTransforms
 from coec.adapters.ros.transforms import bare
 from coec.calibration.types import Matrix4, Reason
@@ -52,7 +52,7 @@ INTRINSICS, EXTRINSIC, CAMERA_FRAME, LIDAR_FRAME, CLOUD, EGO = (
 
 
 @dataclass(frozen=True, slots=True)
-class Image:
+class ReceivedImage:
     """The latest image: the frame in its header and its size, px."""
 
     frame_id: str
@@ -61,19 +61,19 @@ class Image:
 
 
 @dataclass(slots=True)
-class Heard:
+class ReceivedMetadata:
     """What was heard of one pair so far. `cloud` and `ego` are the frame names in the latest cloud and motion.
     `refused` says for a source (`camera`, `lidar`, `ego`, `info`) why its latest message could not be used."""
 
-    image: Image | None = None
+    image: ReceivedImage | None = None
     cloud: str | None = None
     ego: str | None = None
-    info: Info | None = None
+    info: CameraInfoContent | None = None
     refused: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class DiscoveredPair:
     """A complete pair, and where each found value comes from, by its place in the configuration."""
 
     pair: PairConfig
@@ -101,15 +101,17 @@ def needs_transforms(pair: OpenPairConfig) -> bool:
     )
 
 
-def found_of(pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> Found | tuple[Reason, ...]:
+def discover(
+    pair: OpenPairConfig, received: ReceivedMetadata, transforms: StaticTransforms
+) -> DiscoveredPair | tuple[Reason, ...]:
     """The complete pair; or a reason for each thing that it waits for."""
-    search = _Search(pair, heard, transforms)
-    intrinsics = search.ask(search.intrinsics)
-    camera_frame, cloud_frame = search.ask(search.camera_frame), search.ask(search.cloud_frame)
+    search = _Search(pair, received, transforms)
+    intrinsics = search.resolve(search.intrinsics)
+    camera_frame, cloud_frame = search.resolve(search.camera_frame), search.resolve(search.cloud_frame)
     lidar_frame = pair.lidar.frame_id or cloud_frame
-    T_cloud_lidar = search.ask(search.T_cloud_lidar, cloud_frame, lidar_frame)
-    T_camera_lidar = search.ask(search.T_camera_lidar, camera_frame, lidar_frame)
-    T_lidar_ego = search.ask(search.T_lidar_ego, lidar_frame)
+    T_cloud_lidar = search.resolve(search.T_cloud_lidar, cloud_frame, lidar_frame)
+    T_camera_lidar = search.resolve(search.T_camera_lidar, camera_frame, lidar_frame)
+    T_lidar_ego = search.resolve(search.T_lidar_ego, lidar_frame)
     if search.missing:
         return tuple(search.missing)
     document = pair.model_dump()
@@ -121,7 +123,7 @@ def found_of(pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -
     if pair.ego is not None:
         document["ego"]["T_lidar_ego"] = T_lidar_ego
     try:
-        return Found(PairConfig.model_validate(document), search.origins)
+        return DiscoveredPair(PairConfig.model_validate(document), search.origins)
     except ValidationError as error:
         return (Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {describe(error)}."),)
 
@@ -138,14 +140,14 @@ class _Search:
     """One search for everything that is left out. Each method returns what the configuration gives, else what was
     found. It returns None if it depends on another value that is missing, and raises if its own value is."""
 
-    def __init__(self, pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> None:
+    def __init__(self, pair: OpenPairConfig, received: ReceivedMetadata, transforms: StaticTransforms) -> None:
         self._pair = pair
-        self._heard = heard
+        self._received = received
         self._transforms = transforms
         self.origins: dict[str, str] = {}
         self.missing: list[Reason] = []
 
-    def ask(self, question: Callable[..., T | None], *known: str | None) -> T | None:
+    def resolve(self, question: Callable[..., T | None], *known: str | None) -> T | None:
         """The value of a question; None, and a reason in `missing`, if it is missing."""
         try:
             return question(*known)
@@ -154,32 +156,32 @@ class _Search:
             return None
 
     def intrinsics(self) -> CameraIntrinsics | None:
-        pair, heard = self._pair, self._heard
+        pair, received = self._pair, self._received
         if pair.camera.intrinsics is not None:
             return pair.camera.intrinsics
         topic = info_topic_of(pair)
         if topic is None:
             raise _MissingError(Reason("no_camera_info", "Images on a key have no CameraInfo: set camera.info_topic."))
-        if "info" in heard.refused:
-            text = f"The CameraInfo on {topic} is refused: {heard.refused['info']}."
+        if "info" in received.refused:
+            text = f"The CameraInfo on {topic} is refused: {received.refused['info']}."
             raise _MissingError(Reason("camera_info_refused", text))
-        if heard.info is None:
+        if received.info is None:
             raise _MissingError(Reason("no_camera_info", f"No CameraInfo on {topic} yet."))
         try:
-            lens = lens_of(heard.info, rectified=is_rectified(pair.camera.place))
+            lens = intrinsics_of_info(received.info, rectified=is_rectified(pair.camera.place))
         except SourceError as error:
             raise _MissingError(
                 Reason("camera_info_refused", f"The CameraInfo on {topic} cannot be used: {error}.")
             ) from error
-        size, image = lens.intrinsics, heard.image
+        size, image = lens.intrinsics, received.image
         if image is not None and (image.width, image.height) != (size.width, size.height):
             sizes = f"{image.width} x {image.height} px, the CameraInfo on {topic} is for {size.width} x {size.height}"
             raise _MissingError(Reason("camera_info_size", f"Images on {pair.camera.place} are {sizes} px."))
-        self.origins[INTRINSICS] = f"CameraInfo on {topic}: {lens.told}"
+        self.origins[INTRINSICS] = f"CameraInfo on {topic}: {lens.source}"
         return lens.intrinsics
 
     def camera_frame(self) -> str | None:
-        pair, image = self._pair, self._heard.image
+        pair, image = self._pair, self._received.image
         if image is None and (pair.camera.frame_id is None or pair.camera.intrinsics is None):
             raise _MissingError(Reason("no_image", self._silent("camera", "image", pair.camera.place)))
         if pair.camera.frame_id is not None:
@@ -191,7 +193,7 @@ class _Search:
         return image.frame_id
 
     def cloud_frame(self) -> str | None:
-        lidar, cloud = self._pair.lidar, self._heard.cloud
+        lidar, cloud = self._pair.lidar, self._received.cloud
         if lidar.cloud_frame_id is not None:
             return lidar.cloud_frame_id
         if cloud is None:
@@ -213,14 +215,14 @@ class _Search:
         return given if given is not None or camera is None or lidar is None else self._rows(EXTRINSIC, camera, lidar)
 
     def T_lidar_ego(self, lidar: str | None) -> Matrix4x4 | None:
-        ego, heard = self._pair.ego, self._heard.ego
+        ego, frame = self._pair.ego, self._received.ego
         if ego is None or ego.T_lidar_ego is not None or lidar is None:
             return None if ego is None else ego.T_lidar_ego
-        if heard is None:
+        if frame is None:
             raise _MissingError(Reason("no_motion", self._silent("ego", "motion", ego.place)))
-        if not heard:
+        if not frame:
             raise _MissingError(Reason("no_frame_id", _frameless("Motions", ego, "ego.T_lidar_ego")))
-        return IDENTITY if bare(heard) == bare(lidar) else self._rows(EGO, lidar, heard)
+        return IDENTITY if bare(frame) == bare(lidar) else self._rows(EGO, lidar, frame)
 
     def _rows(self, place: str, target: str, source: str) -> Matrix4x4 | None:
         T_target_source = self._transforms.transform(target, source)
@@ -238,35 +240,37 @@ class _Search:
         return matrix_rows(T_target_source)
 
     def _silent(self, stream: str, what: str, place: str) -> str:
-        refused = self._heard.refused.get(stream)
+        refused = self._received.refused.get(stream)
         return f"No {what} on {place} yet." if refused is None else f"No {what} on {place} can be used: {refused}."
 
 
-def changed(found: Found, pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> Reason | None:
+def change_since(
+    discovered: DiscoveredPair, pair: OpenPairConfig, received: ReceivedMetadata, transforms: StaticTransforms
+) -> Reason | None:
     """In what the bus now contradicts the values with which the pair was built; None if in nothing."""
-    built = found.pair
-    told = []
-    if INTRINSICS in found.origins and heard.info is not None:
+    built = discovered.pair
+    changes = []
+    if INTRINSICS in discovered.origins and received.info is not None:
         try:
-            now: object = lens_of(heard.info, rectified=is_rectified(pair.camera.place)).intrinsics
+            now: object = intrinsics_of_info(received.info, rectified=is_rectified(pair.camera.place)).intrinsics
         except SourceError as error:
             now = str(error)
         if now != built.camera.intrinsics:
-            told.append(f"CameraInfo on {info_topic_of(pair)}")
+            changes.append(f"CameraInfo on {info_topic_of(pair)}")
     ego = None if built.ego is None else built.ego.T_lidar_ego
     for place, rows, target, source in (
         (EXTRINSIC, built.T_camera_lidar, built.camera.frame_id, built.lidar.frame_id),
         (CLOUD, built.lidar.T_cloud_lidar, built.lidar.cloud_frame_id, built.lidar.frame_id),
-        (EGO, ego, built.lidar.frame_id, heard.ego),
+        (EGO, ego, built.lidar.frame_id, received.ego),
     ):
-        if place in found.origins and rows is not None and target is not None and source is not None:
+        if place in discovered.origins and rows is not None and target is not None and source is not None:
             T_now = transforms.transform(target, source)
             if T_now is not None and _differ(np.array(rows), T_now):
-                told.append(f"{TF_STATIC}, for {place}")
-    if not told:
+                changes.append(f"{TF_STATIC}, for {place}")
+    if not changes:
         return None
     text = (
-        f"The bus has changed since this pair was built: {' and '.join(told)}. What it was built with remains the "
+        f"The bus has changed since this pair was built: {' and '.join(changes)}. What it was built with remains the "
         "nominal calibration: to take the new one, stop the service, remove nominal.json from its state "
         "directory, and start it."
     )

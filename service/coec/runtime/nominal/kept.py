@@ -17,7 +17,7 @@ from coec.adapters.files.rig import rig_of
 from coec.adapters.files.state_file import StateFile
 from coec.config import CameraIntrinsics, Config, Matrix4x4, OpenPairConfig, PairConfig, config_hash
 from coec.errors import ConfigError
-from coec.runtime.nominal.findings import Found
+from coec.runtime.nominal.findings import DiscoveredPair
 from coec.schemas.base import Part
 
 _log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class StoredNominal(Part):
     ego: StoredEgo | None = None
 
 
-class KeptPair(Part):
+class StoredDiscovery(Part):
     """`Found` on the disk. `asked` is the hash of what the configuration left out and where it was looked for.
     `found_ns` is the wall clock when it was found."""
 
@@ -66,7 +66,7 @@ class KeptPair(Part):
     origins: dict[str, str]
 
 
-class KeptNominals:
+class DiscoveryStore:
     """The nominal calibrations of a vehicle, as a book that the scribe writes. Safe to use from several threads."""
 
     def __init__(self, folder: Path) -> None:
@@ -75,29 +75,29 @@ class KeptNominals:
         loaded = self._file.load()
         for damage in loaded.damage:
             _log.warning(f"nominal calibrations that were kept cannot be used: {damage}")
-        self._pairs: dict[str, KeptPair] = {}
+        self._pairs: dict[str, StoredDiscovery] = {}
         self._documents: dict[str, dict[str, Any]] = {}
         pairs = (loaded.body or {}).get("pairs")
         for name, document in (pairs if isinstance(pairs, dict) else {}).items():
             try:
-                self._pairs[name] = KeptPair.model_validate(document)
+                self._pairs[name] = StoredDiscovery.model_validate(document)
                 self._documents[name] = document
             except ValidationError:
-                self._file.distrust()
+                self._file.reject()
                 _log.warning("a nominal calibration that was kept has another form", extra={"fields": {"pair": name}})
 
-    def found(self, config: Config) -> dict[str, Found]:
+    def load(self, config: Config) -> dict[str, DiscoveredPair]:
         """What was found earlier, by pair, for the pairs that this configuration awaits and for which it still asks the
         same."""
-        found = {pair.name: self._found(pair, config) for pair in config.awaited}
-        return {name: one for name, one in found.items() if one is not None}
+        pairs = {pair.name: self._restored(pair, config) for pair in config.awaited}
+        return {name: one for name, one in pairs.items() if one is not None}
 
-    def _found(self, pair: OpenPairConfig, config: Config) -> Found | None:
+    def _restored(self, pair: OpenPairConfig, config: Config) -> DiscoveredPair | None:
         with self._lock:
-            kept = self._pairs.get(pair.name)
-        if kept is None or kept.asked != _asked(pair, config):
+            stored = self._pairs.get(pair.name)
+        if stored is None or stored.asked != _request_hash(pair, config):
             return None
-        document, earlier = pair.model_dump(), kept.pair
+        document, earlier = pair.model_dump(), stored.pair
         document["T_camera_lidar"] = earlier.T_camera_lidar
         document["camera"] |= earlier.camera.model_dump()
         document["lidar"] |= earlier.lidar.model_dump()
@@ -109,21 +109,23 @@ class KeptNominals:
         except (ConfigError, ValidationError) as error:
             _log.warning(f"a nominal calibration that was kept cannot be used: {error}")
             return None
-        since = datetime.fromtimestamp(kept.found_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-        return Found(complete, {place: f"{origin}; kept since {since}" for place, origin in kept.origins.items()})
+        since = datetime.fromtimestamp(stored.found_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return DiscoveredPair(
+            complete, {place: f"{origin}; kept since {since}" for place, origin in stored.origins.items()}
+        )
 
-    def keep(self, found: Found, asked: OpenPairConfig, config: Config, now_ns: int) -> None:
+    def update(self, discovered: DiscoveredPair, requested: OpenPairConfig, config: Config, now_ns: int) -> None:
         """Keeps what was found; the next `flush` writes it."""
         document = {
-            "asked": _asked(asked, config),
+            "asked": _request_hash(requested, config),
             "found_ns": now_ns,
-            "pair": found.pair.model_dump(mode="json"),
-            "origins": dict(found.origins),
+            "pair": discovered.pair.model_dump(mode="json"),
+            "origins": dict(discovered.origins),
         }
-        kept = KeptPair.model_validate(document)
+        stored = StoredDiscovery.model_validate(document)
         with self._lock:
-            self._pairs = {**self._pairs, asked.name: kept}
-            self._documents = {**self._documents, asked.name: document}
+            self._pairs = {**self._pairs, requested.name: stored}
+            self._documents = {**self._documents, requested.name: document}
 
     def flush(self) -> None:
         """Writes to the disk what is kept.
@@ -136,7 +138,7 @@ class KeptNominals:
         self._file.save({"pairs": documents})
 
 
-def _asked(pair: OpenPairConfig, config: Config) -> str:
+def _request_hash(pair: OpenPairConfig, config: Config) -> str:
     """Hash of what the configuration gives and where the rest is looked for. Other settings may change."""
     question = pair.model_dump(
         mode="json",
@@ -151,17 +153,17 @@ def _asked(pair: OpenPairConfig, config: Config) -> str:
     return config_hash(json.dumps([question, where], sort_keys=True))
 
 
-def completed(config: Config, found: Mapping[str, PairConfig]) -> Config:
+def completed(config: Config, discovered: Mapping[str, PairConfig]) -> Config:
     """The configuration in which these pairs, by their names, are moved from the awaited ones to the complete ones."""
-    joined = tuple(found[pair.name] for pair in config.awaited if pair.name in found)
-    still = tuple(pair for pair in config.awaited if pair.name not in found)
+    joined = tuple(discovered[pair.name] for pair in config.awaited if pair.name in discovered)
+    still = tuple(pair for pair in config.awaited if pair.name not in discovered)
     return config.model_copy(update={"pairs": (*config.pairs, *joined), "awaited": still})
 
 
-def with_kept(config: Config) -> Config:
+def with_discovered(config: Config) -> Config:
     """The configuration completed by what a service has found for its awaited pairs and keeps in its state
     directory."""
     if not config.awaited:
         return config
-    kept = KeptNominals(config.state.directory).found(config)
-    return completed(config, {name: found.pair for name, found in kept.items()})
+    stored = DiscoveryStore(config.state.directory).load(config)
+    return completed(config, {name: discovered.pair for name, discovered in stored.items()})

@@ -17,16 +17,16 @@ from types import MappingProxyType
 
 from coec.adapters.ros import messages
 from coec.adapters.ros.camera_info import MAX_INFO_BYTES, decode_info
-from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
+from coec.adapters.ros.static_transforms import StaticTransforms, decode_static_transforms
 from coec.adapters.ros.transforms import MAX_MESSAGE_BYTES
 from coec.adapters.system.logs import loss_text
 from coec.adapters.system.threads import ServiceThread
-from coec.adapters.zenoh.inputs import CDR, Sample
+from coec.adapters.zenoh.inputs import CDR, InputSample
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Reason
 from coec.config import Config, OpenPairConfig
 from coec.errors import DecodeError
 from coec.runtime.ingest.decoder import SampleReader
-from coec.runtime.nominal.findings import Found, Heard, Image, changed, found_of
+from coec.runtime.nominal.findings import DiscoveredPair, ReceivedImage, ReceivedMetadata, change_since, discover
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ TRANSFORMS_WAITING = 512
 MAX_WAITING_BYTES = 8 * 2**20
 """Limit for all these messages together, bytes: several thousand transforms."""
 
-TOO_LARGE = Sample(bytes(MAX_INFO_BYTES + 1), CDR)
+TOO_LARGE = InputSample(bytes(MAX_INFO_BYTES + 1), CDR)
 """Waits in place of a `CameraInfo` that is too large."""
 
 TRANSFORMS_A_TURN = 64
@@ -54,7 +54,7 @@ TRANSFORMS = "tf_static"
 
 
 @dataclass(frozen=True, slots=True)
-class Nominal:
+class NominalStatus:
     """What is known of a pair's nominal calibration.
 
     Attributes:
@@ -71,56 +71,61 @@ class Nominal:
     losses: Mapping[str, int] = field(default_factory=dict)
 
 
-NOT_HEARD = Nominal(awaits=(Reason("no_look_yet", "Nobody has looked yet for what the configuration leaves out."),))
+NOTHING_RECEIVED = NominalStatus(
+    awaits=(Reason("no_look_yet", "Nobody has looked yet for what the configuration leaves out."),)
+)
 
 
 BEING_BUILT = Reason("being_built", "Everything that the configuration leaves out is found; the pair is being built.")
 
 
 @dataclass(slots=True)
-class _Pair:
+class _PendingPair:
     """An awaited pair and what was heard of it."""
 
     pair: OpenPairConfig
     samples: Mapping[str, SampleReader]
-    heard: Heard = field(default_factory=Heard)
-    found: Found | None = None
+    received: ReceivedMetadata = field(default_factory=ReceivedMetadata)
+    discovered: DiscoveredPair | None = None
     built: bool = False
     refused: Reason | None = None
     news: bool = True
     lost: Counter[str] = field(default_factory=Counter)
 
 
-class NominalWatch:
+class DiscoveryListener:
     """Listens for the awaited pairs of a vehicle. `take_*` are for the network's threads, `look` for this thread, all
     else for any."""
 
-    def __init__(self, config: Config, earlier: Mapping[str, Found]) -> None:
+    def __init__(self, config: Config, earlier: Mapping[str, DiscoveredPair]) -> None:
         """`config` is the configuration as it was read. `earlier` holds those of its awaited pairs that are built with
         values from before the start."""
         self.thread = ServiceThread("nominal", self._run)
         self._config = config
-        asked = {pair.name: pair for pair in config.awaited}
+        requested = {pair.name: pair for pair in config.awaited}
         self._pairs = {
-            name: _Pair(pair, _readers(pair, config), found=earlier.get(name), built=name in earlier)
-            for name, pair in asked.items()
+            name: _PendingPair(pair, _readers(pair, config), discovered=earlier.get(name), built=name in earlier)
+            for name, pair in requested.items()
         }
         self._transforms = StaticTransforms()
         self._condition = threading.Condition()
         # Under the condition.
-        self._waiting: deque[Sample] = deque()
+        self._waiting: deque[InputSample] = deque()
         self._waiting_bytes = 0
-        self._latest: dict[tuple[str, str], Sample] = {}
+        self._latest: dict[tuple[str, str], InputSample] = {}
         self._transforms_lost: Counter[str] = Counter()
-        self._ready: dict[str, Found] = {}
-        self._outcomes: dict[str, Found | Reason] = {}
-        self._nominals: Mapping[str, Nominal] = MappingProxyType(
-            {name: _of_built(earlier[name], None) if each.built else NOT_HEARD for name, each in self._pairs.items()}
+        self._ready: dict[str, DiscoveredPair] = {}
+        self._outcomes: dict[str, DiscoveredPair | Reason] = {}
+        self._nominals: Mapping[str, NominalStatus] = MappingProxyType(
+            {
+                name: _of_built(earlier[name], None) if each.built else NOTHING_RECEIVED
+                for name, each in self._pairs.items()
+            }
         )
 
     # --- on the network's threads -----------------------------------------------------------------------------------
 
-    def take_transforms(self, sample: Sample) -> None:
+    def take_transforms(self, sample: InputSample) -> None:
         """A message on `/tf_static` came."""
         with self._condition:
             if len(sample.payload) > MAX_MESSAGE_BYTES:
@@ -132,30 +137,30 @@ class NominalWatch:
                 self._waiting_bytes -= len(self._waiting.popleft().payload)
                 self._transforms_lost["overrun"] += 1
 
-    def take_info(self, pair: str, sample: Sample) -> None:
+    def take_info(self, pair: str, sample: InputSample) -> None:
         """A `CameraInfo` of a pair came; the newest counts."""
-        kept = sample if len(sample.payload) <= MAX_INFO_BYTES else TOO_LARGE
+        bounded = sample if len(sample.payload) <= MAX_INFO_BYTES else TOO_LARGE
         with self._condition:
-            self._latest[pair, INFO] = kept
+            self._latest[pair, INFO] = bounded
 
-    def take_frame(self, pair: str, stream: str, sample: Sample) -> None:
+    def take_frame(self, pair: str, stream: str, sample: InputSample) -> None:
         """A frame of a pair that is awaited came; the newest counts."""
         with self._condition:
             self._latest[pair, stream] = sample
 
     # --- on any -----------------------------------------------------------------------------------------------------
 
-    def nominal(self, pair: str) -> Nominal:
+    def nominal(self, pair: str) -> NominalStatus:
         """The nominal calibration of a pair; empty for a pair whose configuration gives everything."""
-        return self._nominals.get(pair, Nominal())
+        return self._nominals.get(pair, NominalStatus())
 
-    def ready(self) -> dict[str, Found]:
+    def ready(self) -> dict[str, DiscoveredPair]:
         """Takes out the pairs that were completed since the last call."""
         with self._condition:
             ready, self._ready = self._ready, {}
         return ready
 
-    def end(self, pair: str, outcome: Found | Reason) -> None:
+    def end(self, pair: str, outcome: DiscoveredPair | Reason) -> None:
         """Reports what became of a pair that was ready: it is built; or it cannot be built, for a reason, and is
         awaited until something else is heard."""
         with self._condition:
@@ -166,10 +171,10 @@ class NominalWatch:
     def _run(self, thread: ServiceThread) -> None:
         while not thread.stopping:
             thread.beat()
-            self.look()
+            self.update()
             time.sleep(IDLE_S)
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Takes what has come, and judges each pair anew."""
         with self._condition:
             count = min(len(self._waiting), TRANSFORMS_A_TURN)
@@ -187,74 +192,74 @@ class NominalWatch:
         if fresh:
             self._nominals = MappingProxyType({**self._nominals, **fresh})
 
-    def _take_outcome(self, each: _Pair, outcome: Found | Reason) -> None:
+    def _take_outcome(self, each: _PendingPair, outcome: DiscoveredPair | Reason) -> None:
         each.news = True
-        if isinstance(outcome, Found):
-            each.built, each.found = True, outcome
+        if isinstance(outcome, DiscoveredPair):
+            each.built, each.discovered = True, outcome
             for place, origin in outcome.origins.items():
                 fields = {"pair": each.pair.name, "place": place, "from": origin}
                 _log.info("found what the configuration leaves out", extra={"fields": fields})
         else:
             each.refused = outcome
 
-    def _take_transforms(self, sample: Sample) -> None:
-        cause = _attempt(lambda: self._transforms.take(decode_joints(_payload(sample, messages.TF))))
+    def _take_transforms(self, sample: InputSample) -> None:
+        cause = _attempt(lambda: self._transforms.add(decode_static_transforms(_payload(sample, messages.TF))))
         if cause is not None:
             with self._condition:
                 self._transforms_lost[cause] += 1
                 count = self._transforms_lost[cause]
-            _tell_lost(TRANSFORMS, cause, count)
+            _log_loss(TRANSFORMS, cause, count)
 
-    def _take_latest(self, each: _Pair, stream: str, sample: Sample) -> None:
+    def _take_latest(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         if each.built and stream != INFO:
             return
         take = self._take_info if stream == INFO else self._take_frame
         cause = _attempt(lambda: take(each, stream, sample))
-        refused = each.heard.refused
+        refused = each.received.refused
         each.news |= cause is not None or stream in refused
         if cause is None:
             refused.pop(stream, None)
             return
         refused[stream] = cause
         each.lost[f"{stream}_{cause}"] += 1
-        _tell_lost(stream, cause, each.lost[f"{stream}_{cause}"])
+        _log_loss(stream, cause, each.lost[f"{stream}_{cause}"])
 
-    def _take_info(self, each: _Pair, stream: str, sample: Sample) -> None:
+    def _take_info(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         del stream
         info = decode_info(_payload(sample, messages.CAMERA_INFO))
-        each.news |= info != each.heard.info
-        each.heard.info = info
+        each.news |= info != each.received.info
+        each.received.info = info
 
-    def _take_frame(self, each: _Pair, stream: str, sample: Sample) -> None:
-        heard = each.heard
-        before = (heard.image, heard.cloud, heard.ego)
+    def _take_frame(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
+        received = each.received
+        before = (received.image, received.cloud, received.ego)
         match each.samples[stream].frame(sample):
             case CameraFrame() as frame:
-                heard.image = Image(frame.frame_id, frame.image.width, frame.image.height)
+                received.image = ReceivedImage(frame.frame_id, frame.image.width, frame.image.height)
             case LidarFrame() as frame:
-                heard.cloud = frame.frame_id
+                received.cloud = frame.frame_id
             case EgoMotion() as frame:
-                heard.ego = frame.frame_id
-        each.news |= before != (heard.image, heard.cloud, heard.ego)
+                received.ego = frame.frame_id
+        each.news |= before != (received.image, received.cloud, received.ego)
 
-    def _nominal(self, each: _Pair) -> Nominal:
+    def _nominal(self, each: _PendingPair) -> NominalStatus:
         each.news = False
         return replace(self._judged(each), losses=self._lost(each))
 
-    def _judged(self, each: _Pair) -> Nominal:
-        if each.built and each.found is not None:
-            return _of_built(each.found, changed(each.found, each.pair, each.heard, self._transforms))
-        found = found_of(each.pair, each.heard, self._transforms)
-        if not isinstance(found, Found):
-            each.found = each.refused = None
-            return Nominal(awaits=found)
-        if each.found is None or each.found.pair != found.pair:
-            each.found, each.refused = found, None
+    def _judged(self, each: _PendingPair) -> NominalStatus:
+        if each.built and each.discovered is not None:
+            return _of_built(each.discovered, change_since(each.discovered, each.pair, each.received, self._transforms))
+        result = discover(each.pair, each.received, self._transforms)
+        if not isinstance(result, DiscoveredPair):
+            each.discovered = each.refused = None
+            return NominalStatus(awaits=result)
+        if each.discovered is None or each.discovered.pair != result.pair:
+            each.discovered, each.refused = result, None
             with self._condition:
-                self._ready[each.pair.name] = found
-        return Nominal(awaits=(each.refused or BEING_BUILT,), origins=found.origins)
+                self._ready[each.pair.name] = result
+        return NominalStatus(awaits=(each.refused or BEING_BUILT,), origins=result.origins)
 
-    def _lost(self, each: _Pair) -> dict[str, int]:
+    def _lost(self, each: _PendingPair) -> dict[str, int]:
         with self._condition:
             of_transforms = {f"{TRANSFORMS}_{cause}": count for cause, count in self._transforms_lost.items()}
         return {**of_transforms, **each.lost}
@@ -272,18 +277,18 @@ def _attempt(take: Callable[[], None]) -> str | None:
     return None
 
 
-def _tell_lost(place: str, cause: str, count: int) -> None:
+def _log_loss(place: str, cause: str, count: int) -> None:
     """Logs the first loss of each kind, and then every 2^n-th."""
     if count & (count - 1) == 0:
         fields = {"place": place, "reason": cause, "count": count}
         _log.warning(loss_text(place, cause), extra={"fields": fields})
 
 
-def _of_built(found: Found, otherwise: Reason | None) -> Nominal:
-    return Nominal(origins=found.origins, changed=otherwise)
+def _of_built(discovered: DiscoveredPair, otherwise: Reason | None) -> NominalStatus:
+    return NominalStatus(origins=discovered.origins, changed=otherwise)
 
 
-def _payload(sample: Sample, expected: str) -> bytes:
+def _payload(sample: InputSample, expected: str) -> bytes:
     """The bytes of a sample of this type.
 
     Raises:

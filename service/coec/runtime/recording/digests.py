@@ -20,7 +20,7 @@ from coec.schemas.replies import CalibrationResult
 _log = logging.getLogger(__name__)
 
 
-ROUND_S = 0.1
+DIGEST_ROUND_S = 0.1
 """After this time a round ends, however little was read: pairs may wait to be written, and the thread must beat."""
 
 PIECE_BYTES = 2**16
@@ -37,7 +37,7 @@ class _Reading:
 
     path: Path
     stream: BinaryIO
-    begun: os.stat_result
+    initial_status: os.stat_result
     result: CalibrationResult | None
     sha256: Any = field(default_factory=hashlib.sha256)
 
@@ -96,7 +96,7 @@ class DigestReader:
             raise
 
     def _go_on(self, reading: _Reading, max_bytes: int) -> None:
-        end_s = self._clock() + ROUND_S
+        end_s = self._clock() + DIGEST_ROUND_S
         while max_bytes > 0 and (data := reading.stream.read(min(max_bytes, PIECE_BYTES))):
             reading.sha256.update(data)
             max_bytes -= len(data)
@@ -104,9 +104,9 @@ class DigestReader:
                 return
         if max_bytes <= 0:
             return
-        status, begun = os.fstat(reading.stream.fileno()), reading.begun
+        status, initial = os.fstat(reading.stream.fileno()), reading.initial_status
         self.close()
-        if (status.st_size, status.st_mtime_ns) != (begun.st_size, begun.st_mtime_ns):
+        if (status.st_size, status.st_mtime_ns) != (initial.st_size, initial.st_mtime_ns):
             return  # somebody is writing into the file, so it is read again
         version = WindowVersion(
             size_bytes=status.st_size,

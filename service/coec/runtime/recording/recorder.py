@@ -15,7 +15,7 @@ from coec.adapters.files import durable
 from coec.adapters.mcap.windows import RecordedWindow, WindowWriter, pairs_since, read_result, salvage
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.system.threads import ServiceThread
-from coec.calibration.frames.window import KeptPairs, SliceEnded
+from coec.calibration.frames.window import CarriedOverPairs, SliceClosed
 from coec.calibration.types import FramePair, Matrix4, Reason, Rig
 from coec.config import CalibrationConfig
 from coec.errors import CoecError, RecordingError, WindowError
@@ -64,7 +64,7 @@ class _AddBetween:
 
 
 @dataclass(slots=True)
-class _Open:
+class _OpenWindow:
     """The window being written."""
 
     window_id: str
@@ -114,25 +114,25 @@ class Recorder:
         self._on_recorded = on_recorded
         self._on_lost = on_lost
         self._condition = threading.Condition()
-        self._queue: deque[_Add | _AddBetween | SliceEnded | CalibrationConfig] = deque()
+        self._queue: deque[_Add | _AddBetween | SliceClosed | CalibrationConfig] = deque()
         self._adds = 0
         self._betweens = 0
-        self._open: _Open | None = None
+        self._open: _OpenWindow | None = None
         self._lost: str | None = None
         self._latest: Path | None = None
         self.recorded = 0
         self.writing_took = Histogram(QUICK_S)
-        self._trouble: Reason | None = None
+        self._problem: Reason | None = None
         self.thread = ServiceThread(f"recorder-{plan.rig.pair}", self._run)
 
     @property
-    def trouble(self) -> Reason | None:
+    def problem(self) -> Reason | None:
         """Why windows cannot be recorded; None while they can."""
         silent_s = self.thread.silence_s
-        if self._trouble is None and silent_s > STUCK_S:
+        if self._problem is None and silent_s > STUCK_S:
             text = f"The disk has not answered for {silent_s:.0f} s: no window can be recorded."
             return Reason("recording_stuck", text)
-        return self._trouble
+        return self._problem
 
     @property
     def latest(self) -> Path | None:
@@ -149,7 +149,7 @@ class Recorder:
         """Whether `add` and `add_between` would take a pair now."""
         return self._adds < PAIRS_WAITING and self._betweens < BETWEEN_WAITING
 
-    def use(self, configuration: CalibrationConfig) -> None:
+    def reconfigure(self, configuration: CalibrationConfig) -> None:
         """Queues another configuration for the windows that begin after it in the queue. Called when the limits of the
         rig were learned anew, or do not fit the rig."""
         with self._condition:
@@ -183,10 +183,10 @@ class Recorder:
         if overrun:
             self._losses.add("window", "recorder_overrun")
 
-    def end(self, ended: SliceEnded) -> None:
+    def end(self, closed: SliceClosed) -> None:
         """Queues the end of a window. It is finished if it holds enough pairs, else abandoned."""
         with self._condition:
-            self._queue.append(ended)
+            self._queue.append(closed)
             self._condition.notify()
 
     def request_stop(self) -> None:
@@ -209,11 +209,11 @@ class Recorder:
                 self._adds -= isinstance(item, _Add)
                 self._betweens -= isinstance(item, _AddBetween)
             if isinstance(item, (_Add, _AddBetween)):
-                begun_s = time.monotonic()
+                started_s = time.monotonic()
                 self._write(item)
-                self.writing_took.add(time.monotonic() - begun_s)
-            elif isinstance(item, SliceEnded):
-                self._end(item.window_id, item.kept)
+                self.writing_took.add(time.monotonic() - started_s)
+            elif isinstance(item, SliceClosed):
+                self._end(item.window_id, item.carried_over)
             elif isinstance(item, CalibrationConfig):
                 self._configuration = item
             elif thread.stopping:
@@ -253,7 +253,7 @@ class Recorder:
         for path in unsolved:
             self._hand_over(path.stem, path, live=False)
         if self._snippets is not None:
-            self._snippets.take_up(self.thread.beat)
+            self._snippets.resume(self.thread.beat)
 
     def _salvage(self, part: Path) -> None:
         try:
@@ -297,7 +297,7 @@ class Recorder:
         if self._open is not None and self._open.window_id == item.window_id:
             self._open.writer.add_between(item.pair)
 
-    def _start(self, item: _Add) -> _Open:
+    def _start(self, item: _Add) -> _OpenWindow:
         plan = self._plan  # `follow` may replace it meanwhile
         self._store.make_room(self.thread.beat)
         writer = WindowWriter(
@@ -309,16 +309,16 @@ class Recorder:
             plan.metadata,
             packed=plan.packed,
         )
-        return _Open(item.window_id, writer, plan.min_pairs)
+        return _OpenWindow(item.window_id, writer, plan.min_pairs)
 
-    def _end(self, window_id: str, kept: KeptPairs | None) -> None:
+    def _end(self, window_id: str, carried_over: CarriedOverPairs | None) -> None:
         if self._open is None or self._open.window_id != window_id:
             self._on_lost(window_id)
             return
         opened = self._open
         try:
-            if kept is not None:
-                self._add_kept(kept, opened)
+            if carried_over is not None:
+                self._add_carried_over(carried_over, opened)
             if opened.pairs < opened.min_pairs:
                 self._close_stray()
                 self._on_lost(window_id)
@@ -331,22 +331,22 @@ class Recorder:
         self._open = None
         self._finished(recorded)
 
-    def _add_kept(self, kept: KeptPairs, into: _Open) -> None:
+    def _add_carried_over(self, carried_over: CarriedOverPairs, into: _OpenWindow) -> None:
         """Copies the pairs that another window keeps for this one. They are on the disk, so keeping them costs no
         memory, and they survive a restart."""
         before = into.pairs
         try:
-            into.writer.note_kept(kept.window_id, kept.since_ns)
-            for pair in pairs_since(self._store.path(kept.window_id), kept.since_ns):
+            into.writer.note_carried_over(carried_over.window_id, carried_over.since_ns)
+            for pair in pairs_since(self._store.path(carried_over.window_id), carried_over.since_ns):
                 self.thread.beat()
                 into.writer.add(pair)
                 into.pairs += 1
         except WindowError as error:
-            self._losses.add("window", "kept_pairs_lost", kept.pairs - (into.pairs - before), detail=str(error))
+            self._losses.add("window", "kept_pairs_lost", carried_over.pairs - (into.pairs - before), detail=str(error))
 
     def _finished(self, recorded: RecordedWindow) -> None:
         self.recorded += 1
-        self._trouble = None
+        self._problem = None
         self._latest = recorded.path
         self._store.add(recorded)
         fields = {"window": recorded.window_id, "pairs": recorded.pairs, "bytes": recorded.bytes}
@@ -358,13 +358,13 @@ class Recorder:
         if self._open is not None:
             self._open.writer.abandon()
             self._open = None
-            self._trouble = None  # the pairs that it had could be written
+            self._problem = None  # the pairs that it had could be written
             self._losses.add("window", "too_few_pairs")
 
     def _lose(self, window_id: str, error: Exception) -> None:
         """Gives up the window after an error; the next window tries again."""
         self._lost = window_id
-        self._trouble = Reason("recording_failed", f"The last window could not be recorded: {error}")
+        self._problem = Reason("recording_failed", f"The last window could not be recorded: {error}")
         self._losses.add("window", "recording_failed", detail=str(error))
         if self._open is not None:
             with contextlib.suppress(RecordingError, OSError):

@@ -28,9 +28,9 @@ _log = logging.getLogger(__name__)
 SNIPPET = ".snippet"
 """End of a snippet's id. A window's id ends in a digit."""
 
-TOLD = ".json"
+DESCRIPTION_SUFFIX = ".json"
 
-TOLD_BYTES = 4096
+MAX_DESCRIPTION_BYTES = 4096
 """Largest description of a snippet that is read, bytes; some 250 are written."""
 
 PIECE_BYTES = 2**20
@@ -54,15 +54,19 @@ class SnippetStore:
         self._folder = folder
         self._max_bytes, self._min_free_bytes = max_bytes, min_free_bytes
         self._lock = threading.Lock()
-        self._found: dict[str, SnippetInfo] = {}
+        self._infos: dict[str, SnippetInfo] = {}
         try:
             durable.make_folder(folder)
             for leftover in folder.glob(f"*{REWRITE_SUFFIX}"):  # the original is still there
                 leftover.unlink(missing_ok=True)
-            told = [info for path in folder.glob(f"*{TOLD}") if (info := self._read_told(path)) is not None]
+            infos = [
+                info
+                for path in folder.glob(f"*{DESCRIPTION_SUFFIX}")
+                if (info := self._read_description(path)) is not None
+            ]
         except OSError as error:
             raise RecordingError(f"the folder {folder} cannot be made or read: {error.strerror}") from error
-        self._found = {info.snippet_id: info for info in sorted(told, key=lambda info: info.recorded_ns)}
+        self._infos = {info.snippet_id: info for info in sorted(infos, key=lambda info: info.recorded_ns)}
 
     def path(self, name: str) -> Path:
         """Where a snippet is, or will be."""
@@ -71,7 +75,7 @@ class SnippetStore:
     def listing(self, pair: str) -> tuple[SnippetInfo, ...]:
         """Every snippet of the pair, oldest first."""
         with self._lock:
-            return tuple(info for name, info in self._found.items() if _pair_of(name) == pair)
+            return tuple(info for name, info in self._infos.items() if _pair_of(name) == pair)
 
     def read(self, pair: str, name: str, offset: int, length: int) -> bytes:
         """`length` bytes of a snippet's file from `offset`; fewer at its end.
@@ -81,7 +85,7 @@ class SnippetStore:
             UsageError: the offset lies beyond the end.
         """
         with self._lock:
-            known = name in self._found and _pair_of(name) == pair
+            known = name in self._infos and _pair_of(name) == pair
         if not known:
             raise NotFoundError(f"pair {pair} has no snippet of this id; the list is in `windows`")
         return read_piece(self.path(name), "the snippet", offset, length)
@@ -92,10 +96,10 @@ class SnippetStore:
         Raises:
             OSError: the description could not be written; the next start finds the snippet by its file.
         """
-        durable.replace(self._told(info.snippet_id), to_json(info))
+        durable.replace(self._description_path(info.snippet_id), to_json(info))
         with self._lock:
-            self._found.pop(info.snippet_id, None)
-            self._found[info.snippet_id] = info
+            self._infos.pop(info.snippet_id, None)
+            self._infos[info.snippet_id] = info
 
     def make_room(self, size_bytes: int) -> None:
         """Makes room for a snippet of this size: removes the oldest ones while there are too many bytes.
@@ -109,9 +113,9 @@ class SnippetStore:
             durable.make_folder(self._folder)
             while (oldest := self._oldest_beyond(size_bytes)) is not None:
                 durable.remove(self.path(oldest))
-                durable.remove(self._told(oldest))
+                durable.remove(self._description_path(oldest))
                 with self._lock:
-                    self._found.pop(oldest, None)
+                    self._infos.pop(oldest, None)
             free = shutil.disk_usage(self._folder).free
         except OSError as error:
             raise RecordingError(f"no room can be made in {self._folder}: {error.strerror}") from error
@@ -124,13 +128,13 @@ class SnippetStore:
     def flush(self) -> None:
         """Takes from the list what somebody has removed; for the scribe (`scribe.Book`)."""
         with self._lock:
-            listed = tuple(self._found)
+            listed = tuple(self._infos)
         gone = [name for name in listed if not self.path(name).exists()]
         with self._lock:
             for name in gone:
-                self._found.pop(name, None)
+                self._infos.pop(name, None)
 
-    def take_up(self, pair: str, progress: Callable[[], None]) -> None:
+    def resume(self, pair: str, progress: Callable[[], None]) -> None:
         """Completes what earlier runs left of a pair: finishes files that were cut off, and reads those without a
         description. `progress` is called now and then.
 
@@ -142,22 +146,22 @@ class SnippetStore:
                 salvage_snippet(part, progress)
         for path in self._folder.glob(f"{pair}-*{SNIPPET}{SUFFIX}"):
             name = path.name.removesuffix(SUFFIX)
-            if _pair_of(name) != pair or name in self._found:
+            if _pair_of(name) != pair or name in self._infos:
                 continue
             with suppress(CoecError):  # a damaged file stays, so that people can look into it
-                self.add(_read_anew(path, name, progress))
+                self.add(_read_again(path, name, progress))
 
     def _oldest_beyond(self, size_bytes: int) -> str | None:
         with self._lock:
-            used = sum(info.size_bytes for info in self._found.values())
-            return next(iter(self._found), None) if used + size_bytes > self._max_bytes else None
+            used = sum(info.size_bytes for info in self._infos.values())
+            return next(iter(self._infos), None) if used + size_bytes > self._max_bytes else None
 
-    def _told(self, name: str) -> Path:
-        return self._folder / f"{name}{TOLD}"
+    def _description_path(self, name: str) -> Path:
+        return self._folder / f"{name}{DESCRIPTION_SUFFIX}"
 
-    def _read_told(self, path: Path) -> SnippetInfo | None:
-        name = path.name.removesuffix(TOLD)
-        if path.stat().st_size > TOLD_BYTES:
+    def _read_description(self, path: Path) -> SnippetInfo | None:
+        name = path.name.removesuffix(DESCRIPTION_SUFFIX)
+        if path.stat().st_size > MAX_DESCRIPTION_BYTES:
             return None
         try:
             info = from_json(SnippetInfo, path.read_bytes())
@@ -172,8 +176,8 @@ def _pair_of(name: str) -> str:
     return pair if name.endswith(SNIPPET) and stamp.isascii() and stamp.isdecimal() else ""
 
 
-def _read_anew(path: Path, name: str, progress: Callable[[], None]) -> SnippetInfo:
-    said, digest = metadata_of(path), hashlib.sha256()
+def _read_again(path: Path, name: str, progress: Callable[[], None]) -> SnippetInfo:
+    metadata, digest = metadata_of(path), hashlib.sha256()
     with path.open("rb") as stream:
         while data := stream.read(PIECE_BYTES):
             digest.update(data)
@@ -181,7 +185,7 @@ def _read_anew(path: Path, name: str, progress: Callable[[], None]) -> SnippetIn
         status = os.fstat(stream.fileno())
     return SnippetInfo(
         snippet_id=name,
-        event=said.get("event", ""),
+        event=metadata.get("event", ""),
         stamp_ns=int(name.removesuffix(SNIPPET).rpartition("-")[2]),
         recorded_ns=status.st_mtime_ns,
         size_bytes=status.st_size,

@@ -37,7 +37,7 @@ OVERHEAD = 1.1
 
 
 @dataclass(slots=True)
-class _Open:
+class _OpenSnippet:
     """The snippet that is being written, and the frames that are not in it yet."""
 
     name: str
@@ -60,33 +60,33 @@ class SnippetRecorder:
         self._losses = losses
         self._packed = packed
         self._lock = threading.Lock()
-        self._given: deque[Snippet] = deque()
+        self._submitted: deque[Snippet] = deque()
         self._busy = False
-        self._open: _Open | None = None
+        self._open: _OpenSnippet | None = None
 
-    def give(self, snippet: Snippet) -> None:
+    def submit(self, snippet: Snippet) -> None:
         """Has a snippet written. While another one is being written it is lost, because there is no memory for two."""
         with self._lock:
             busy, self._busy = self._busy, True
             if not busy:
-                self._given.append(snippet)
+                self._submitted.append(snippet)
         if busy:
             self._losses.add("window", "snippet_overrun")
 
-    def take_up(self, progress: Callable[[], None]) -> None:
+    def resume(self, progress: Callable[[], None]) -> None:
         """Completes what earlier runs left unfinished; `progress` is called now and then."""
         try:
-            self._store.take_up(self._rig.pair, progress)
+            self._store.resume(self._rig.pair, progress)
         except (RecordingError, OSError) as error:
             self._losses.add("window", "snippet_salvage_failed", detail=str(error))
 
     def write(self) -> bool:
         """Writes on for one round; False: there is nothing to write."""
-        if not self._given and self._open is None:
+        if not self._submitted and self._open is None:
             return False
         end_s, room = time.monotonic() + ROUND_S, ROUND_BYTES
         try:
-            opened = self._begin(self._given.popleft()) if self._open is None else self._open
+            opened = self._begin(self._submitted.popleft()) if self._open is None else self._open
             while opened.left and room > 0 and time.monotonic() < end_s:
                 frame = opened.left.popleft()
                 opened.file.add(frame)
@@ -102,7 +102,7 @@ class SnippetRecorder:
         end_s = time.monotonic() + STOP_S
         while time.monotonic() < end_s and self.write():
             pass
-        if self._given or self._open is not None:
+        if self._submitted or self._open is not None:
             self._losses.add("window", "snippet_cut_short", detail="the service was stopped")
         if self._open is not None:
             try:
@@ -110,15 +110,15 @@ class SnippetRecorder:
             except (RecordingError, OSError) as error:
                 self._lose(error)
 
-    def _begin(self, snippet: Snippet) -> _Open:
+    def _begin(self, snippet: Snippet) -> _OpenSnippet:
         name = snippet_id(self._rig.pair, snippet.stamp_ns)
         self._store.make_room(round(OVERHEAD * sum(map(frame_bytes, snippet.frames))))
-        said = {"snippet_id": name, "event": snippet.event, "stamp_ns": str(snippet.stamp_ns), **self._metadata}
-        file = SnippetFile(self._store.path(name), self._rig, snippet.T_camera_lidar, said, packed=self._packed)
-        self._open = _Open(name, snippet.event, snippet.stamp_ns, file, deque(snippet.frames))
+        metadata = {"snippet_id": name, "event": snippet.event, "stamp_ns": str(snippet.stamp_ns), **self._metadata}
+        file = SnippetFile(self._store.path(name), self._rig, snippet.T_camera_lidar, metadata, packed=self._packed)
+        self._open = _OpenSnippet(name, snippet.event, snippet.stamp_ns, file, deque(snippet.frames))
         return self._open
 
-    def _finish(self, opened: _Open) -> None:
+    def _finish(self, opened: _OpenSnippet) -> None:
         finished = opened.file.finish()
         self._open, self._busy = None, False
         info = SnippetInfo(

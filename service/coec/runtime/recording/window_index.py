@@ -12,13 +12,13 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from coec.adapters.files.durable import Log
+from coec.adapters.files.durable import LineLog
 from coec.schemas.base import Part, to_json
 from coec.schemas.replies import Decision
 
 _log = logging.getLogger(__name__)
 
-LINES = 1000
+INDEX_LINES = 1000
 """Lines of the index file, 250 bytes each. At twice as many it is written anew, unless that many windows exist."""
 
 
@@ -58,7 +58,7 @@ class WindowIndex:
     def __init__(self, path: Path) -> None:
         """`path`: the index file; it need not exist."""
         self._known: dict[str, IndexedWindow] = {}
-        self._log = Log(path, LINES, lambda: [to_json(known) for known in tuple(self._known.values())])
+        self._log = LineLog(path, INDEX_LINES, lambda: [to_json(known) for known in tuple(self._known.values())])
         self._waiting: deque[bytes] = deque()
         self._writing = threading.Lock()
         lines: list[bytes] = []

@@ -27,7 +27,7 @@ from coec.adapters.mcap.windows import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX, Reco
 from coec.config import StateConfig
 from coec.errors import NotFoundError, RecordingError
 from coec.runtime.recording.window_index import IndexedWindow, WindowIndex, WindowVersion
-from coec.schemas.replies import KeptFor, WindowInfo
+from coec.schemas.replies import RetentionReason, WindowInfo
 
 _log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class Usage:
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _WindowFile:
     """A window in the folder: its pair, the sensor time of its beginning, its place in the order of recordings, and
     size and modification time of its file."""
 
@@ -65,18 +65,18 @@ class _Found:
 
 
 @dataclass(frozen=True, slots=True)
-class _View:
+class _Listing:
     """The windows of one pair, valid until one comes or goes: all in order, and the ids of those that were not read
     yet, the latest first."""
 
     infos: tuple[WindowInfo, ...]
     unread: tuple[str, ...]
 
-    def renewed(self, info: WindowInfo) -> _View:
+    def renewed(self, info: WindowInfo) -> _Listing:
         """The view with new information about one window. So a view of thousands is not made anew for each of them."""
         infos = tuple(info if one.window_id == info.window_id else one for one in self.infos)
         known = info.sha256 is not None
-        return _View(infos, tuple(one for one in self.unread if one != info.window_id) if known else self.unread)
+        return _Listing(infos, tuple(one for one in self.unread if one != info.window_id) if known else self.unread)
 
 
 class WindowStore:
@@ -97,12 +97,12 @@ class WindowStore:
         self._config = config
         self._disk = threading.Lock()  # taken before `_lock`, where both are needed
         self._lock = threading.Lock()
-        self._found: dict[str, _Found] = {}
-        self._views: dict[str, _View] = {}
-        self._protected: dict[str, Mapping[str, KeptFor]] = {}
+        self._files: dict[str, _WindowFile] = {}
+        self._views: dict[str, _Listing] = {}
+        self._protected: dict[str, Mapping[str, RetentionReason]] = {}
         self._held: Counter[str] = Counter()
         self._changed_ns: int | None = None
-        self._changed_s = self._looked_s = 0.0
+        self._changed_s = self._scanned_s = 0.0
         self._free = 0
         self.removed = 0
         try:
@@ -110,11 +110,11 @@ class WindowStore:
             for leftover in folder.glob(f"*{SUFFIX}{REWRITE_SUFFIX}"):  # the original is still there
                 leftover.unlink(missing_ok=True)
             self._index = WindowIndex(folder.with_name(f"{folder.name}.jsonl"))
-            self.look()
+            self.scan()
         except OSError as error:
             raise RecordingError(f"the folder {folder} cannot be made or read: {error.strerror}") from error
 
-    def use(self, config: StateConfig) -> None:
+    def reconfigure(self, config: StateConfig) -> None:
         """Keeps to these limits from the next window on."""
         with self._lock:
             self._config = config
@@ -139,24 +139,24 @@ class WindowStore:
 
     def windows(self, pair: str) -> list[Path]:
         """Files of the pair's windows, in the order in which they were recorded."""
-        self.look()
+        self.scan()
         with self._lock:
             return [self.path(info.window_id) for info in self._view(pair).infos]
 
     def leftovers(self, pair: str) -> list[Path]:
         """Files of the pair that were not finished when the service last ended, in the order of the sensor time of
         their beginning."""
-        found = []
+        parts = []
         for path in self._folder.glob(f"{pair}-*{SUFFIX}{PART_SUFFIX}"):
             match = _WINDOW_ID.fullmatch(path.name.removesuffix(f"{SUFFIX}{PART_SUFFIX}"))
             if match is not None and match[1] == pair:
-                found.append((int(match[2]), path))
-        return [path for _, path in sorted(found)]
+                parts.append((int(match[2]), path))
+        return [path for _, path in sorted(parts)]
 
     def usage(self) -> Usage:
         """How full the folder and its disk are."""
         with self._lock:
-            return Usage(sum(found.size_bytes for found in self._found.values()), self._free)
+            return Usage(sum(file.size_bytes for file in self._files.values()), self._free)
 
     def listing(self, pair: str) -> tuple[WindowInfo, ...]:
         """Every window of the pair, oldest first. Opens no file: fields that have not been read yet are null."""
@@ -183,12 +183,12 @@ class WindowStore:
             pairs=recorded.pairs,
             decision=None,
         )
-        self.look()
+        self.scan()
         with self._lock:
-            found = self._found.get(recorded.window_id)
-            if found is not None:
-                found = self._found[recorded.window_id] = replace(found, order=self._index.next_order())
-                self._index.put(IndexedWindow(window_id=recorded.window_id, order=found.order, version=version))
+            file = self._files.get(recorded.window_id)
+            if file is not None:
+                file = self._files[recorded.window_id] = replace(file, order=self._index.next_order())
+                self._index.put(IndexedWindow(window_id=recorded.window_id, order=file.order, version=version))
                 self._views.clear()
         self.flush()
 
@@ -196,16 +196,16 @@ class WindowStore:
         """Notes the version of a window's file that was just read or written. The note counts only for a file of this
         size and time, so it does no harm if the file has changed since. The next `flush` writes it."""
         with self._lock:
-            found = self._found.get(window_id)
-            if found is not None:
-                if version.modified_ns > found.modified_ns:  # written since the folder was looked at
+            file = self._files.get(window_id)
+            if file is not None:
+                if version.modified_ns > file.modified_ns:  # written since the folder was looked at
                     size_bytes, modified_ns = version.size_bytes, version.modified_ns
-                    found = self._found[window_id] = replace(found, size_bytes=size_bytes, modified_ns=modified_ns)
-                self._index.put(IndexedWindow(window_id=window_id, order=found.order, version=version))
-                view = self._views.get(found.pair)
+                    file = self._files[window_id] = replace(file, size_bytes=size_bytes, modified_ns=modified_ns)
+                self._index.put(IndexedWindow(window_id=window_id, order=file.order, version=version))
+                view = self._views.get(file.pair)
                 if view is not None:
-                    kept_for = self._kept().get(window_id)
-                    self._views[found.pair] = view.renewed(self._info(window_id, found, kept_for))
+                    protected_for = self._protected_windows().get(window_id)
+                    self._views[file.pair] = view.renewed(self._info(window_id, file, protected_for))
 
     def flush(self) -> None:
         """Writes what was noted to the disk."""
@@ -214,12 +214,12 @@ class WindowStore:
     def version(self, window_id: str) -> WindowVersion | None:
         """What was read of a window in its present version; None: not read yet, or no such window."""
         with self._lock:
-            found = self._found.get(window_id)
-            return None if found is None else self._version(window_id, found)
+            file = self._files.get(window_id)
+            return None if file is None else self._version(window_id, file)
 
     def unread(self, pair: str) -> tuple[str, ...]:
         """Ids of the pair's windows of which not everything is known, the latest first."""
-        self.look()
+        self.scan()
         with self._lock:
             return self._view(pair).unread
 
@@ -237,13 +237,13 @@ class WindowStore:
             if self._held[window_id] <= 0:
                 del self._held[window_id]
 
-    def protect(self, pair: str, kept_for: Mapping[str, KeptFor]) -> None:
+    def protect(self, pair: str, protected_for: Mapping[str, RetentionReason]) -> None:
         """Protects these windows of the pair, and no others any more. Age does not remove them, and lack of room does
         so only if no other window may be removed. If all protected windows together have more than
         `max_protected_bytes`, the oldest of them count as ordinary ones."""
         with self._lock:
-            if self._protected.get(pair) != kept_for:
-                self._protected[pair] = dict(kept_for)
+            if self._protected.get(pair) != protected_for:
+                self._protected[pair] = dict(protected_for)
                 self._views.clear()
 
     def make_room(self, progress: Callable[[], None]) -> None:
@@ -264,30 +264,30 @@ class WindowStore:
 
     def _make_room(self, progress: Callable[[], None]) -> None:
         durable.make_folder(self._folder)
-        self.look()
+        self.scan()
         with self._lock:
-            latest = {found.pair: window_id for window_id, found in self._in_order()}
-            newest = {pair: self._found[window_id] for pair, window_id in latest.items()}
+            latest = {file.pair: window_id for window_id, file in self._in_order()}
+            newest = {pair: self._files[window_id] for pair, window_id in latest.items()}
             removable = [item for item in self._in_order() if item[0] != latest[item[1].pair]]
-            kept = self._kept()
-            used = sum(found.size_bytes for found in self._found.values())
-            reserve = max((found.size_bytes for found in self._found.values()), default=0)
+            protected = self._protected_windows()
+            used = sum(file.size_bytes for file in self._files.values())
+            reserve = max((file.size_bytes for file in self._files.values()), default=0)
         expired = 0
-        for window_id, found in sorted(removable, key=lambda item: item[0] in kept):
+        for window_id, file in sorted(removable, key=lambda item: item[0] in protected):
             too_much = used + reserve > self._config.max_bytes
             too_full = _free_bytes(self._folder) < self._config.min_free_bytes + reserve
             by_age = not too_much and not too_full
-            if by_age and (expired == EXPIRED_AT_ONCE or not self._is_too_old(found, newest[found.pair])):
+            if by_age and (expired == EXPIRED_AT_ONCE or not self._is_too_old(file, newest[file.pair])):
                 continue
-            if not self._remove(window_id, spare_kept=by_age or window_id not in kept):
+            if not self._remove(window_id, spare_protected=by_age or window_id not in protected):
                 continue
             expired += by_age
-            used -= found.size_bytes
+            used -= file.size_bytes
             durable.sync_folder(self._folder)
-            _log.info("an old window was removed", extra={"fields": {"window": window_id, "bytes": found.size_bytes}})
+            _log.info("an old window was removed", extra={"fields": {"window": window_id, "bytes": file.size_bytes}})
             progress()
         with self._lock:
-            self._index.prune(self._found)
+            self._index.prune(self._files)
         free = _free_bytes(self._folder)
         if free < self._config.min_free_bytes:
             raise RecordingError(
@@ -295,30 +295,30 @@ class WindowStore:
                 f"{self._config.min_free_bytes >> 20} MiB: free space"
             )
 
-    def _remove(self, window_id: str, *, spare_kept: bool) -> bool:
+    def _remove(self, window_id: str, *, spare_protected: bool) -> bool:
         """Removes a window, unless it is held by now, has gone, or is to be spared."""
         with self._disk:
             with self._lock:
-                spared = spare_kept and window_id in self._kept()
-                if spared or window_id in self._held or window_id not in self._found:
+                spared = spare_protected and window_id in self._protected_windows()
+                if spared or window_id in self._held or window_id not in self._files:
                     return False
-                del self._found[window_id]
+                del self._files[window_id]
                 self._views.clear()
             self._changed_ns = None  # if it cannot be removed, the next `look` finds it again
             self.path(window_id).unlink(missing_ok=True)
             self.removed += 1
             return True
 
-    def _is_too_old(self, found: _Found, newest: _Found) -> bool:
+    def _is_too_old(self, file: _WindowFile, newest: _WindowFile) -> bool:
         """Whether both clocks say that a window is too old. A clock that was set back gives a negative age, which never
         counts as too old."""
         oldest_ns = round(self._config.max_age_days * NS_PER_DAY)
-        by_wall_clock = time.time_ns() - found.modified_ns > oldest_ns
-        return by_wall_clock and newest.start_ns - found.start_ns > oldest_ns
+        by_wall_clock = time.time_ns() - file.modified_ns > oldest_ns
+        return by_wall_clock and newest.start_ns - file.start_ns > oldest_ns
 
     # --- on threads that may wait for the disk ----------------------------------------------------------------------
 
-    def look(self) -> None:
+    def scan(self) -> None:
         """Reads the folder if it has changed. No file in it is written in place: a changed window is replaced, and so
         the folder's modification time changes, too.
 
@@ -332,9 +332,9 @@ class WindowStore:
                 changed_ns = self._folder.stat().st_mtime_ns
                 if changed_ns != self._changed_ns:
                     self._changed_ns, self._changed_s = changed_ns, now_s
-                elif self._looked_s > self._changed_s + SETTLED_S:
+                elif self._scanned_s > self._changed_s + SETTLED_S:
                     return
-                self._looked_s = now_s
+                self._scanned_s = now_s
                 statuses = _statuses(self._folder)
             except FileNotFoundError:  # somebody has removed the folder
                 self._changed_ns, statuses = None, {}
@@ -343,74 +343,74 @@ class WindowStore:
 
     # --- inside; the lock is held -----------------------------------------------------------------------------------
 
-    def _kept(self) -> dict[str, KeptFor]:
+    def _protected_windows(self) -> dict[str, RetentionReason]:
         """The protected windows and what each is kept for: the latest first, as many as `max_protected_bytes`
         allows."""
-        asked = {window_id: reason for of_pair in self._protected.values() for window_id, reason in of_pair.items()}
-        there = sorted(self._found.keys() & asked.keys(), key=lambda window_id: -self._found[window_id].order)
-        left, kept = self._config.max_protected_bytes, dict[str, KeptFor]()
+        requested = {window_id: reason for of_pair in self._protected.values() for window_id, reason in of_pair.items()}
+        there = sorted(self._files.keys() & requested.keys(), key=lambda window_id: -self._files[window_id].order)
+        left, protected = self._config.max_protected_bytes, dict[str, RetentionReason]()
         for window_id in there:
-            left -= self._found[window_id].size_bytes
+            left -= self._files[window_id].size_bytes
             if left < 0:
                 break
-            kept[window_id] = asked[window_id]
-        return kept
+            protected[window_id] = requested[window_id]
+        return protected
 
-    def _in_order(self) -> list[tuple[str, _Found]]:
-        return sorted(self._found.items(), key=lambda item: item[1].order)
+    def _in_order(self) -> list[tuple[str, _WindowFile]]:
+        return sorted(self._files.items(), key=lambda item: item[1].order)
 
     def _compare(self, statuses: Mapping[str, os.stat_result]) -> None:
         """Takes over the present content of the folder. A window that nobody has reported counts as the latest. Several
         of them are ordered by their times, because nothing else is known."""
-        gone = self._found.keys() - statuses.keys()
+        gone = self._files.keys() - statuses.keys()
         changed = [
             (status.st_mtime_ns, start_ns_of(window_id), window_id)
             for window_id, status in statuses.items()
-            if (found := self._found.get(window_id)) is None
-            or (found.size_bytes, found.modified_ns) != (status.st_size, status.st_mtime_ns)
+            if (file := self._files.get(window_id)) is None
+            or (file.size_bytes, file.modified_ns) != (status.st_size, status.st_mtime_ns)
         ]
         if not gone and not changed:
             return
         self._views.clear()
         for window_id in gone:
-            del self._found[window_id]
+            del self._files[window_id]
         for modified_ns, start_ns, window_id in sorted(changed):
             pair, size_bytes = window_id.rpartition("-")[0], statuses[window_id].st_size
-            self._found[window_id] = _Found(pair, start_ns, self._order(window_id), size_bytes, modified_ns)
-        self._index.prune(self._found)
+            self._files[window_id] = _WindowFile(pair, start_ns, self._order(window_id), size_bytes, modified_ns)
+        self._index.prune(self._files)
 
     def _order(self, window_id: str) -> int:
-        found, indexed = self._found.get(window_id), self._index.get(window_id)
-        if found is not None:
-            return found.order
+        file, indexed = self._files.get(window_id), self._index.get(window_id)
+        if file is not None:
+            return file.order
         return self._index.next_order() if indexed is None else indexed.order
 
-    def _version(self, window_id: str, found: _Found) -> WindowVersion | None:
+    def _version(self, window_id: str, file: _WindowFile) -> WindowVersion | None:
         indexed = self._index.get(window_id)
         if indexed is None:
             return None
-        same = (indexed.version.size_bytes, indexed.version.modified_ns) == (found.size_bytes, found.modified_ns)
+        same = (indexed.version.size_bytes, indexed.version.modified_ns) == (file.size_bytes, file.modified_ns)
         return indexed.version if same else None
 
-    def _view(self, pair: str) -> _View:
+    def _view(self, pair: str) -> _Listing:
         view = self._views.get(pair)
         if view is None:
-            ours = [(window_id, found) for window_id, found in self._in_order() if found.pair == pair]
-            kept = self._kept()
-            infos = tuple(self._info(window_id, found, kept.get(window_id)) for window_id, found in ours)
+            ours = [(window_id, file) for window_id, file in self._in_order() if file.pair == pair]
+            protected = self._protected_windows()
+            infos = tuple(self._info(window_id, file, protected.get(window_id)) for window_id, file in ours)
             unread = tuple(info.window_id for info in reversed(infos) if info.sha256 is None)
-            view = self._views[pair] = _View(infos, unread)
+            view = self._views[pair] = _Listing(infos, unread)
         return view
 
-    def _info(self, window_id: str, found: _Found, kept_for: KeptFor | None) -> WindowInfo:
-        version, indexed = self._version(window_id, found), self._index.get(window_id)
+    def _info(self, window_id: str, file: _WindowFile, protected_for: RetentionReason | None) -> WindowInfo:
+        version, indexed = self._version(window_id, file), self._index.get(window_id)
         return WindowInfo(
             window_id=window_id,
             sha256=version.sha256 if version else None,
-            size_bytes=found.size_bytes,
+            size_bytes=file.size_bytes,
             pairs=indexed.version.pairs if indexed else None,
             decision=version.decision if version else None,
-            kept_for=kept_for,
+            kept_for=protected_for,
         )
 
 
@@ -421,16 +421,16 @@ def start_ns_of(window_id: str) -> int:
 
 def _statuses(folder: Path) -> dict[str, os.stat_result]:
     """Status of every window's file, by window id."""
-    found = {}
+    statuses = {}
     with os.scandir(folder) as entries:
         for entry in entries:
             window_id = entry.name.removesuffix(SUFFIX)
             if window_id != entry.name and _WINDOW_ID.fullmatch(window_id):
                 try:
-                    found[window_id] = entry.stat()
+                    statuses[window_id] = entry.stat()
                 except FileNotFoundError:
                     continue
-    return found
+    return statuses
 
 
 def _free_bytes(folder: Path) -> int:

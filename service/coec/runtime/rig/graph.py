@@ -7,7 +7,7 @@ from math import radians
 
 import numpy as np
 
-from coec.calibration.rig.types import Edge, Kind, Link, RigGraph, Sensor
+from coec.calibration.rig.types import Edge, RigGraph, RigidLink, Sensor, SensorKind
 from coec.calibration.types import Matrix4
 from coec.config import LinkConfig, PairConfig
 
@@ -25,7 +25,7 @@ def graph_of(
     edges = []
     for name, (pair, T_camera_lidar) in pairs.items():
         camera, lidar = sensors_of(pair)
-        sensors |= {camera: Sensor(camera, Kind.CAMERA), lidar: Sensor(lidar, Kind.LIDAR)}
+        sensors |= {camera: Sensor(camera, SensorKind.CAMERA), lidar: Sensor(lidar, SensorKind.LIDAR)}
         edges.append(Edge(name, camera, lidar, T_camera_lidar))
     edges += [edge for edge in of_lidars if {edge.a, edge.b} <= set(sensors)]
     rigid = [_link(link) for link in links]
@@ -38,7 +38,7 @@ def sensors_of(pair: PairConfig) -> tuple[str, str]:
     return camera, f"{lidar} (LiDAR)" if lidar == camera else lidar
 
 
-def _link(link: LinkConfig) -> Link:
+def _link(link: LinkConfig) -> RigidLink:
     a, b = link.ends
     sigma = np.array([radians(link.sigma_deg)] * 3 + [link.sigma_m] * 3)
-    return Link(f"link {a} {b}", a, b, np.array(link.T_a_b), sigma)
+    return RigidLink(f"link {a} {b}", a, b, np.array(link.T_a_b), sigma)

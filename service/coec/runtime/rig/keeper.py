@@ -14,14 +14,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from coec.adapters.files.scribe import Scribe
+from coec.adapters.files.scribe import DiskWriter
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration.lidar_to_lidar.types import KNOWN_BEFORE
 from coec.calibration.lifecycle import PairState
 from coec.calibration.rig import vehicle
-from coec.calibration.rig.evidence import Look
+from coec.calibration.rig.evidence import EdgeObservation
 from coec.calibration.rig.types import RigGraph
-from coec.calibration.rig.vehicle import Served, VehicleRig, Windowed
+from coec.calibration.rig.vehicle import EdgeWindow, ServedEdge, VehicleRig
 from coec.calibration.tracker import Measurement, prior_sigma
 from coec.calibration.types import Matrix4, Reason
 from coec.config import LinkConfig, PairConfig
@@ -29,10 +29,10 @@ from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_store import start_ns_of
 from coec.runtime.rig import order
 from coec.runtime.rig.graph import graph_of
-from coec.runtime.rig.lidar_side import LidarsKnown, LidarsSaid
-from coec.runtime.rig.pair_side import Correction, PairOfRig, Said, served_by
-from coec.runtime.rig.rig_file import RigFile
-from coec.runtime.rig.wishes import Wish, wishes
+from coec.runtime.rig.lidar_side import LidarPairReport, LidarPairStatus
+from coec.runtime.rig.pair_side import PairCorrection, PairReport, RigMember, served_by
+from coec.runtime.rig.rig_file import RigStore
+from coec.runtime.rig.wishes import WindowRequest, window_requests
 
 _log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ ONE_PAIR = Reason("one_pair", "One pair cannot tell its camera from its LiDAR: i
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RigKnown:
+class RigSnapshot:
     """Everything that is known of the rig at one moment, from which the answers are made.
 
     Attributes:
@@ -73,7 +73,7 @@ class RigKnown:
     why: tuple[Reason, ...] = ()
     stamp_ns: int | None = None
     from_ns: int | None = None
-    lidars: tuple[LidarsKnown, ...] = ()
+    lidars: tuple[LidarPairStatus, ...] = ()
     losses: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -87,27 +87,29 @@ class _Joined:
 
     config: PairConfig
     nominal: Matrix4
-    serves: Served
-    window: Windowed | None
+    serves: ServedEdge
+    window: EdgeWindow | None
 
 
-class RigKeeper:
+class RigEstimatorThread:
     """The rig of one vehicle. `put`, `at`, `step_back`, `corrections`, `window_wanted`, `join` and `join_lidars` are
     for any thread; everything else belongs to `thread`."""
 
-    def __init__(self, folder: Path, links: Sequence[LinkConfig], scribe: Scribe) -> None:
+    def __init__(self, folder: Path, links: Sequence[LinkConfig], disk_writer: DiskWriter) -> None:
         """Call `listen` before the first report."""
         self.thread = ServiceThread("rig", self._run)
         self._links = tuple(links)
-        self._scribe = scribe
-        self._file = RigFile(folder)
-        scribe.keep(self._file)
+        self._disk_writer = disk_writer
+        self._file = RigStore(folder)
+        disk_writer.register(self._file)
         self._condition = threading.Condition()
-        self._order: order.Order[Said | LidarsSaid | LidarsKnown | _Joined | _SteppedBack] = order.Order()
-        self._corrections: dict[str, deque[Correction]] = {}
-        self._wishes: dict[str, Wish] = {}
+        self._schedule: order.ReportSchedule[
+            PairReport | LidarPairReport | LidarPairStatus | _Joined | _SteppedBack
+        ] = order.ReportSchedule()
+        self._corrections: dict[str, deque[PairCorrection]] = {}
+        self._window_requests: dict[str, WindowRequest] = {}
         self._pairs: dict[str, _Joined] = {}
-        self._lidars: dict[str, LidarsKnown] = {}
+        self._lidars: dict[str, LidarPairStatus] = {}
         self._have_all_answers: list[Callable[[], bool]] = []
         self._count = 0
         self._quiet_ticks = 0
@@ -117,62 +119,66 @@ class RigKeeper:
         self._from_ns: int | None = None
         self._losses: Counter[str] = Counter({"state_damaged": len(self._file.damage)} if self._file.damage else {})
         self._saved_ns = order.NEVER_NS
-        self._tell: Callable[[RigKnown], None] = lambda _: None
+        self._on_update: Callable[[RigSnapshot], None] = lambda _: None
         self._wake: Callable[[], None] = lambda: None
 
-    def listen(self, tell: Callable[[RigKnown], None], wake: Callable[[], None]) -> None:
+    def connect(self, on_update: Callable[[RigSnapshot], None], wake: Callable[[], None]) -> None:
         """Sets two callbacks. `tell` is called with what is known: now, and whenever it has changed. `wake` is called
         when frames that wait for the rig may be looked at."""
-        self._tell, self._wake = tell, wake
-        self._tell_now()
+        self._on_update, self._wake = on_update, wake
+        self._publish()
 
     # --- on any thread ----------------------------------------------------------------------------------------------
 
     def join(
         self, pair: PairConfig, nominal: Matrix4, state: PairState, has_all_answers: Callable[[], bool]
-    ) -> PairOfRig:
+    ) -> RigMember:
         """Adds a pair to the rig: with its nominal calibration (4, 4) and its state at the start. `has_all_answers`
         says whether all its questions are answered."""
         accepted = state.accepted
-        window = None if accepted is None else Windowed(Measurement.of(accepted), start_ns_of(accepted.window_id))
+        window = (
+            None
+            if accepted is None
+            else EdgeWindow(Measurement.from_estimate(accepted), start_ns_of(accepted.window_id))
+        )
         serves = served_by(state, prior_sigma(pair.tracker))
         joined = _Joined(pair, nominal, serves, window)
         with self._condition:
             self._count += 1
             self._have_all_answers.append(has_all_answers)
-            self._order.put(pair.name, None, joined)
+            self._schedule.put(pair.name, None, joined)
             self._condition.notify_all()
-        return PairOfRig(pair, self)
+        return RigMember(pair, self)
 
-    def join_lidars(self, known: LidarsKnown, has_all_answers: Callable[[], bool]) -> None:
+    def join_lidars(self, known: LidarPairStatus, has_all_answers: Callable[[], bool]) -> None:
         """Adds two LiDARs of pairs that have joined, whether they are looked at or not. The name of their edge stands
         for them. The edge belongs to the rig once a look has measured it."""
         with self._condition:
             self._have_all_answers.append(has_all_answers)
-            self._order.put(known.edge.name, None, known)
+            self._schedule.put(known.edge.name, None, known)
             self._condition.notify_all()
 
-    def put(self, pair: str, due_ns: int | None, said: Said | LidarsSaid) -> None:
+    def put(self, pair: str, due_ns: int | None, report: PairReport | LidarPairReport) -> None:
         """See `pair_side.Keeps`."""
         with self._condition:
             if self._count < 2:
-                if isinstance(said, Look):
+                if isinstance(report, EdgeObservation):
                     return
                 due_ns = None  # there is no other pair whose report it could overtake
-            self._order.put(pair, due_ns, said)
-            if self._order.is_ready:
+            self._schedule.put(pair, due_ns, report)
+            if self._schedule.is_ready:
                 self._condition.notify_all()
 
-    def at(self, pair: str, stamp_ns: int, *, waits: bool) -> bool:
+    def report_time(self, pair: str, stamp_ns: int, *, waits: bool) -> bool:
         """See `pair_side.Keeps`."""
         with self._condition:
             if self._count < 2:
                 return False
             self._quiet_ticks = 0
-            self._order.at(pair, stamp_ns, waits=waits)
-            if self._order.is_ready:
+            self._schedule.report_time(pair, stamp_ns, waits=waits)
+            if self._schedule.is_ready:
                 self._condition.notify_all()
-            return self._order.taken_ns < stamp_ns - LAG_NS
+            return self._schedule.taken_ns < stamp_ns - LAG_NS
 
     def step_back(self, pair: str, stamp_ns: int) -> None:
         """See `pair_side.Keeps`."""
@@ -180,29 +186,29 @@ class RigKeeper:
         with self._condition:
             if self._count < 2:
                 return
-            self._order.step_back(stamp_ns, _SteppedBack())
+            self._schedule.step_back(stamp_ns, _SteppedBack())
             for waiting in self._corrections.values():
                 waiting.clear()
-            self._wishes.clear()
+            self._window_requests.clear()
             self._condition.notify_all()
 
-    def corrections(self, pair: str, stamp_ns: int) -> list[Correction]:
+    def corrections(self, pair: str, stamp_ns: int) -> list[PairCorrection]:
         """See `pair_side.Keeps`."""
         with self._condition:
             waiting = self._corrections.get(pair)
-            found = []
+            due = []
             while waiting and waiting[0].from_ns <= stamp_ns:
-                found.append(waiting.popleft())
-            return found
+                due.append(waiting.popleft())
+            return due
 
-    def window_wanted(self, pair: str, stamp_ns: int) -> int | None:
+    def pop_window_request(self, pair: str, stamp_ns: int) -> int | None:
         """See `pair_side.Keeps`."""
         with self._condition:
-            wish = self._wishes.get(pair)
-            if wish is None or wish.from_ns > stamp_ns:
+            request = self._window_requests.get(pair)
+            if request is None or request.from_ns > stamp_ns:
                 return None
-            del self._wishes[pair]
-            return wish.since_ns
+            del self._window_requests[pair]
+            return request.since_ns
 
     def request_stop(self) -> None:
         """Has the thread take what was reported, and end."""
@@ -227,7 +233,7 @@ class RigKeeper:
     def work(self, timeout_s: float) -> bool:
         """Takes the next report, waiting for it up to `timeout_s`; returns whether one came."""
         with self._condition:
-            if not self._order.is_ready and timeout_s > 0.0 and not self._condition.wait(timeout_s):
+            if not self._schedule.is_ready and timeout_s > 0.0 and not self._condition.wait(timeout_s):
                 self._quiet_ticks += 1
             quiet = self._quiet_ticks >= QUIET_TICKS
             have_all_answers = list(self._have_all_answers)
@@ -235,64 +241,66 @@ class RigKeeper:
 
     def _take_one(self, *, silent: bool) -> bool:
         with self._condition:
-            said = self._order.take(all_are_silent=silent)
-        if said is None:
+            report = self._schedule.take(all_are_silent=silent)
+        if report is None:
             return False
         before = self._rig
         try:
-            self._after(said.pair, said.due_ns, said.what)
+            self._after(report.pair, report.due_ns, report.what)
         except ValueError as error:  # unusable numbers, from an estimate that went wrong
             self._losses["refused"] += 1
-            _log.warning(f"what {said.pair} reported is left out of the rig: {error}")
+            _log.warning(f"what {report.pair} reported is left out of the rig: {error}")
         with self._condition:
-            self._tell_pairs(before, said.due_ns)
-            self._order.took(said)
+            self._notify_pairs(before, report.due_ns)
+            self._schedule.finish(report)
         self._wake()
-        self._save_in_time(before, said.due_ns)
-        self._tell_now()
+        self._save_in_time(before, report.due_ns)
+        self._publish()
         return True
 
-    def _after(self, pair: str, due_ns: int, what: Said | LidarsSaid | LidarsKnown | _Joined | _SteppedBack) -> None:
+    def _after(
+        self, pair: str, due_ns: int, what: PairReport | LidarPairReport | LidarPairStatus | _Joined | _SteppedBack
+    ) -> None:
         if isinstance(what, _Joined):
             self._pairs[pair] = what
             self._grow()
-        elif isinstance(what, LidarsKnown):
+        elif isinstance(what, LidarPairStatus):
             self._lidars[pair] = what
-        elif isinstance(what, LidarsSaid):
+        elif isinstance(what, LidarPairReport):
             self._after_lidars(pair, what)
         elif self._rig is None:
             self._meanwhile(pair, what)
         elif isinstance(what, _SteppedBack):
             self._rig = vehicle.forgotten(self._rig)
-        elif isinstance(what, Look):
-            self._rig = vehicle.after_look(self._rig, what)
-        elif isinstance(what, Windowed):
+        elif isinstance(what, EdgeObservation):
+            self._rig = vehicle.after_edge_observation(self._rig, what)
+        elif isinstance(what, EdgeWindow):
             self._rig = vehicle.after_window(self._rig, pair, what, due_ns)
         else:
             self._rig = vehicle.after_served(self._rig, pair, what, due_ns)
 
-    def _after_lidars(self, name: str, said: LidarsSaid) -> None:
-        self._lidars[name] = self._lidars[name].after(said)
-        if said.told is None or self._rig is None:
+    def _after_lidars(self, name: str, report: LidarPairReport) -> None:
+        self._lidars[name] = self._lidars[name].after(report)
+        if report.registration is None or self._rig is None:
             return
         if name not in self._rig.graph.edge:
             self._grow()
         if self._rig is not None and name in self._rig.graph.edge:
-            self._rig = vehicle.after_lidars(self._rig, said.told.look, said.told.window)
+            self._rig = vehicle.after_lidars(self._rig, report.registration.observation, report.registration.window)
 
-    def _meanwhile(self, pair: str, what: Said | _SteppedBack) -> None:
+    def _meanwhile(self, pair: str, what: PairReport | _SteppedBack) -> None:
         """While there is no rig, keeps what a pair serves and its window."""
-        if isinstance(what, Served):
+        if isinstance(what, ServedEdge):
             self._pairs[pair] = replace(self._pairs[pair], serves=what)
-        elif isinstance(what, Windowed):
+        elif isinstance(what, EdgeWindow):
             self._pairs[pair] = replace(self._pairs[pair], window=what)
 
     def _grow(self) -> None:
         """Builds the rig anew, after one more pair or one more edge between two LiDARs."""
-        measured = [known.edge for known in self._lidars.values() if known.looks]
+        measured = [known.edge for known in self._lidars.values() if known.registrations]
         try:
-            told = {name: (joined.config, joined.nominal) for name, joined in self._pairs.items()}
-            self._graph = graph_of(told, self._links, measured)
+            configured = {name: (joined.config, joined.nominal) for name, joined in self._pairs.items()}
+            self._graph = graph_of(configured, self._links, measured)
         except ValueError as error:
             self._rig, self._why = None, (Reason("no_rig", f"The pairs are not put together: {error}."),)
             return
@@ -302,16 +310,16 @@ class RigKeeper:
         self._why = self._file.damage
         serves = {name: joined.serves for name, joined in self._pairs.items()}
         # LiDAR edges begin with the pose as built. A single look must not replace it: it is only one of many.
-        serves |= {edge.name: Served(edge.T_a_b, KNOWN_BEFORE, order.NEVER_NS) for edge in measured}
+        serves |= {edge.name: ServedEdge(edge.T_a_b, KNOWN_BEFORE, order.NEVER_NS) for edge in measured}
         windows = {name: joined.window for name, joined in self._pairs.items() if joined.window is not None}
-        fresh = self._file.recalled(vehicle.begun(self._graph, serves, windows))
+        fresh = self._file.restored(vehicle.initial_rig(self._graph, serves, windows))
         self._rig = fresh if self._rig is None else vehicle.grown(self._rig, fresh)
 
-    def _tell_pairs(self, before: VehicleRig | None, stamp_ns: int) -> None:
+    def _notify_pairs(self, before: VehicleRig | None, stamp_ns: int) -> None:
         """Hands a new correction to its pairs, and wishes to the pairs of which a window is awaited now. Called with
         the lock."""
         rig = self._rig
-        self._wishes |= wishes(before, rig, stamp_ns + LAG_NS)
+        self._window_requests |= window_requests(before, rig, stamp_ns + LAG_NS)
         if rig is None or rig.correction is None or (before is not None and before.correction is rig.correction):
             return
         correction, self._from_ns = rig.correction, stamp_ns + LAG_NS
@@ -320,20 +328,20 @@ class RigKeeper:
         _log.info(
             "a move of a sensor is put right", extra={"fields": {"sensors": sensors, "pairs": [*correction.pairs]}}
         )
-        for name, told in correction.pairs.items():
+        for name, joint_pose in correction.pairs.items():
             self._corrections.setdefault(name, deque(maxlen=MOST_CORRECTIONS)).append(
-                Correction(told, stamp_ns, self._from_ns, text)
+                PairCorrection(joint_pose, stamp_ns, self._from_ns, text)
             )
 
     # --- telling ----------------------------------------------------------------------------------------------------
 
-    def _tell_now(self) -> None:
+    def _publish(self) -> None:
         with self._condition:
-            stamp_ns = self._order.taken_ns
-            losses = {**self._losses, **self._order.losses}
+            stamp_ns = self._schedule.taken_ns
+            losses = {**self._losses, **self._schedule.losses}
         known = stamp_ns if stamp_ns > order.NEVER_NS // 2 else None
         lidars = tuple(self._lidars[name] for name in sorted(self._lidars))
-        self._tell(RigKnown(self._graph, self._rig, self._why, known, self._from_ns, lidars, losses))
+        self._on_update(RigSnapshot(self._graph, self._rig, self._why, known, self._from_ns, lidars, losses))
 
     def _save_in_time(self, before: VehicleRig | None, stamp_ns: int) -> None:
         rig = self._rig
@@ -346,5 +354,5 @@ class RigKeeper:
 
     def _save(self) -> None:
         if self._rig is not None:
-            self._file.remember(self._rig)
-            self._scribe.write(self._file)
+            self._file.update(self._rig)
+            self._disk_writer.write(self._file)

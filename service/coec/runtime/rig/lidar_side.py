@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from coec.calibration.lidar_to_lidar.types import RangeBias
-from coec.calibration.rig.evidence import Look
+from coec.calibration.rig.evidence import EdgeObservation
 from coec.calibration.rig.types import Edge
-from coec.calibration.rig.vehicle import Windowed
+from coec.calibration.rig.vehicle import EdgeWindow
 from coec.calibration.types import Reason
 
 
@@ -35,8 +35,8 @@ class Registration:
         points, share: number and share of the points of b that met a surface.
     """
 
-    look: Look
-    window: Windowed
+    observation: EdgeObservation
+    window: EdgeWindow
     range_bias: RangeBias
     rms_m: float
     points: int
@@ -44,7 +44,7 @@ class Registration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LidarsSaid:
+class LidarPairReport:
     """The outcome of a look, or of the sweeps that should have given one.
 
     Attributes:
@@ -55,13 +55,13 @@ class LidarsSaid:
     """
 
     stamp_ns: int
-    told: Registration | None
+    registration: Registration | None
     reasons: tuple[Reason, ...]
     losses: Mapping[str, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LidarsKnown:
+class LidarPairStatus:
     """Everything that is known of two LiDARs.
 
     Attributes:
@@ -78,13 +78,13 @@ class LidarsKnown:
     state: LidarState = LidarState.WAITING
     reasons: tuple[Reason, ...] = ()
     stamp_ns: int | None = None
-    told: Registration | None = None
-    looks: int = 0
+    registration: Registration | None = None
+    registrations: int = 0
     losses: Mapping[str, int] = field(default_factory=dict)
 
-    def after(self, said: LidarsSaid) -> LidarsKnown:
+    def after(self, report: LidarPairReport) -> LidarPairStatus:
         """This knowledge with the outcome of one more look."""
-        known = replace(self, stamp_ns=said.stamp_ns, reasons=said.reasons, losses=said.losses)
-        if said.told is None:
+        known = replace(self, stamp_ns=report.stamp_ns, reasons=report.reasons, losses=report.losses)
+        if report.registration is None:
             return replace(known, state=LidarState.REFUSED)
-        return replace(known, state=LidarState.MEASURED, told=said.told, looks=self.looks + 1)
+        return replace(known, state=LidarState.MEASURED, registration=report.registration, registrations=self.registrations + 1)

@@ -32,7 +32,7 @@ NEVER_NS = -(2**62)
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Said(Generic[T]):
+class Report(Generic[T]):
     """A report of a pair, and the sensor time from which it counts."""
 
     due_ns: int
@@ -42,14 +42,14 @@ class Said(Generic[T]):
 
 
 @dataclass(slots=True)
-class _Place:
+class _PairProgress:
     """Where a pair is: all its reports that count up to `at_ns` are made, and its frames have come up to `head_ns`."""
 
     at_ns: int
     head_ns: int
 
 
-class Order(Generic[T]):
+class ReportSchedule(Generic[T]):
     """The order of the reports of one vehicle. Not safe for use from several threads at once: its owner has a lock.
 
     Attributes:
@@ -60,17 +60,17 @@ class Order(Generic[T]):
     def __init__(self) -> None:
         self.taken_ns = NEVER_NS
         self.losses: Counter[str] = Counter()
-        self._places: dict[str, _Place] = {}
-        self._waiting: list[Said[T]] = []
+        self._places: dict[str, _PairProgress] = {}
+        self._waiting: list[Report[T]] = []
         self._number = 0
         self._taking = False
 
-    def at(self, pair: str, stamp_ns: int, *, waits: bool) -> None:
+    def report_time(self, pair: str, stamp_ns: int, *, waits: bool) -> None:
         """A pair has frames of this sensor time. If it `waits`, answers that count up to there are still missing; else
         it has made all its reports up to there."""
         place = self._places.get(pair)
         if place is None:
-            place = self._places[pair] = _Place(stamp_ns - 1 if waits else stamp_ns, stamp_ns)
+            place = self._places[pair] = _PairProgress(stamp_ns - 1 if waits else stamp_ns, stamp_ns)
         place.head_ns = max(place.head_ns, stamp_ns)
         if not waits:
             place.at_ns = max(place.at_ns, stamp_ns)
@@ -86,10 +86,10 @@ class Order(Generic[T]):
             self.losses["overrun"] += 1
             return
         self._number += 1
-        heapq.heappush(self._waiting, Said(due_ns, pair, self._number, what))
+        heapq.heappush(self._waiting, Report(due_ns, pair, self._number, what))
         self._advance()
 
-    def take(self, *, all_are_silent: bool) -> Said[T] | None:
+    def take(self, *, all_are_silent: bool) -> Report[T] | None:
         """Takes out the next report; `took` has to follow. None while an earlier report may still come. Once the
         streams of all pairs have stopped, nothing is waited for."""
         if not self._waiting or not (all_are_silent or self._waiting[0].due_ns <= self._passed_ns()):
@@ -97,10 +97,10 @@ class Order(Generic[T]):
         self._taking = True
         return heapq.heappop(self._waiting)
 
-    def took(self, said: Said[T]) -> None:
+    def finish(self, report: Report[T]) -> None:
         """Everything that follows from a report that was taken is known now."""
         self._taking = False
-        self.taken_ns = max(self.taken_ns, said.due_ns if not self._waiting else self.taken_ns)
+        self.taken_ns = max(self.taken_ns, report.due_ns if not self._waiting else self.taken_ns)
         self._advance()
 
     @property
@@ -112,11 +112,11 @@ class Order(Generic[T]):
         """Sensor time has stepped back to this stamp. Waiting reports still count; then comes `what`, and after it the
         new time."""
         self.losses["time_stepped_back"] += 1
-        waiting = [replace(said, due_ns=stamp_ns, pair="") for said in sorted(self._waiting)]
+        waiting = [replace(report, due_ns=stamp_ns, pair="") for report in sorted(self._waiting)]
         self._number += len(waiting) + 1
         first = self._number - len(waiting)
-        self._waiting = [replace(said, number=first + place) for place, said in enumerate(waiting)]
-        self._waiting.append(Said(stamp_ns, "", self._number, what))
+        self._waiting = [replace(report, number=first + place) for place, report in enumerate(waiting)]
+        self._waiting.append(Report(stamp_ns, "", self._number, what))
         self.taken_ns = stamp_ns - 1
         for place in self._places.values():
             place.at_ns = place.head_ns = stamp_ns

@@ -20,11 +20,11 @@ from pydantic import Field, ValidationError
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.rig import attribution, vehicle
 from coec.calibration.rig.attribution import RigState
-from coec.calibration.rig.before import Before
+from coec.calibration.rig.before import PreMoveKnowledge
 from coec.calibration.rig.evidence import MOST_SIGMA, information_of
-from coec.calibration.rig.steps import History
+from coec.calibration.rig.steps import EdgeHistory
 from coec.calibration.rig.types import MOST_SENSORS
-from coec.calibration.rig.vehicle import Event, VehicleRig
+from coec.calibration.rig.vehicle import MoveEvent, VehicleRig
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4, Reason, Uncertainty
 from coec.errors import StateError
@@ -32,7 +32,7 @@ from coec.geometry import se3
 from coec.schemas.base import Part
 from coec.schemas.replies import Maybe6x6, Row4, Vector6
 
-FILE = "sensors.json"
+RIG_FILE = "sensors.json"
 
 MOST_PAIRS = 128
 """Most pairs that a file may hold to be read: twice as many as a vehicle may have, and as many edges between its
@@ -81,7 +81,7 @@ class StoredRig(Part):
     event: Any = None
 
 
-class RigFile:
+class RigStore:
     """The file of one rig. `recalled` and `remember` belong to the rig's thread, `flush` to the one that waits for the
     disk.
 
@@ -90,7 +90,7 @@ class RigFile:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._file = StateFile(folder / FILE)
+        self._file = StateFile(folder / RIG_FILE)
         self._lock = threading.Lock()
         self._body: dict[str, Any] | None = None
         loaded = self._file.load()
@@ -100,10 +100,10 @@ class RigFile:
         self._event: StoredEvent | None = None
         refused = [] if loaded.body is None else self._read(loaded.body)
         if refused:
-            self._file.distrust()
+            self._file.reject()
             self._on_disk = None
             why = "not in the form of this version, or with a pose that is no rigid transform"
-            damage.append(f"{FILE}: {', '.join(refused)} ({why})")
+            damage.append(f"{RIG_FILE}: {', '.join(refused)} ({why})")
         text = (
             f"Something that was known of the rig cannot be used: {'; '.join(damage)}. The file is kept aside, what is "
             "missing is learnt anew, and everything else is kept."
@@ -125,7 +125,7 @@ class RigFile:
         edges = [f"{unread} of {len(stored.edges)} edges"] if unread else []
         return edges if self._event is not None or stored.event is None else [*edges, "the move of a sensor"]
 
-    def recalled(self, rig: VehicleRig) -> VehicleRig:
+    def restored(self, rig: VehicleRig) -> VehicleRig:
         """Adds to a fresh rig, before any look, what was known before the restart."""
         histories = dict(rig.believed.histories)
         for name, edge in rig.graph.edge.items():
@@ -133,28 +133,28 @@ class RigFile:
             # With another nominal calibration the mount is another one.
             if stored is not None and np.array_equal(_pose(stored.nominal), edge.T_a_b):
                 sigma = np.array([np.nan if value is None else value for value in stored.sigma])
-                histories[name] = History.at(_pose(stored.T_camera_lidar), sigma)
+                histories[name] = EdgeHistory.at(_pose(stored.T_camera_lidar), sigma)
         event = self._event
         if event is None or not set(event.sensors) <= set(rig.graph.place):
             return replace(rig, believed=RigState(histories))
         named = frozenset(event.named) & frozenset(event.sensors)
-        going_on = Event(event.sensors, event.since_ns, event.stepped_ns)
+        going_on = MoveEvent(event.sensors, event.since_ns, event.stepped_ns)
         known = {name: _measurement(one) for name, one in event.before.items() if name in rig.graph.edge}
         believed = RigState(histories, stepped_ns=event.stepped_ns, named=named)
-        return vehicle.going_on(replace(rig, believed=believed), going_on, Before(event.sensors, known))
+        return vehicle.resumed(replace(rig, believed=believed), going_on, PreMoveKnowledge(event.sensors, known))
 
-    def remember(self, rig: VehicleRig) -> None:
+    def update(self, rig: VehicleRig) -> None:
         """Keeps what is known; the next `flush` writes it."""
         edges = {}
         for name, edge in rig.graph.edge.items():
-            kept = rig.believed.histories[name]
-            history = kept.counted() if rig.believed.calm else kept
+            whole_history = rig.believed.histories[name]
+            history = whole_history.counted() if rig.believed.calm else whole_history
             sigma = [float(value) if 0.0 < value < MOST_SIGMA else None for value in history.sigma.tolist()]
             edges[name] = {"nominal": edge.T_a_b.tolist(), "T_camera_lidar": history.pose.tolist(), "sigma": sigma}
         event = rig.event
-        told = None
+        event_document = None
         if event is not None:
-            told = {
+            event_document = {
                 "sensors": list(event.sensors),
                 "since_ns": event.since_ns,
                 "stepped_ns": max(event.stepped_ns, attribution.BEFORE_ALL_NS),
@@ -162,7 +162,7 @@ class RigFile:
                 "before": {} if rig.before is None else {name: _stored(of) for name, of in rig.before.edges.items()},
             }
         with self._lock:
-            self._body = {"edges": edges, "event": told}
+            self._body = {"edges": edges, "event": event_document}
 
     def flush(self) -> None:
         """Writes what is kept to the disk, and what was written before if the file is gone.

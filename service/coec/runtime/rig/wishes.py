@@ -10,7 +10,7 @@ from coec.calibration.rig.vehicle import VehicleRig, pairs_of
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class WindowRequest:
     """A window of a pair is wanted.
 
     Attributes:
@@ -22,15 +22,17 @@ class Wish:
     from_ns: int
 
 
-def wishes(before: VehicleRig | None, rig: VehicleRig | None, from_ns: int) -> Mapping[str, Wish]:
+def window_requests(before: VehicleRig | None, rig: VehicleRig | None, from_ns: int) -> Mapping[str, WindowRequest]:
     """The new wishes, by pair: those that hold for `rig` and did not for `before`. They count from `from_ns` on."""
     if rig is None or rig.event is None:
         return {}
-    known = _awaited(before)
-    return {name: Wish(rig.event.stepped_ns, from_ns) for name in _awaited(rig) if name not in known}
+    known = _pairs_without_window(before)
+    return {
+        name: WindowRequest(rig.event.stepped_ns, from_ns) for name in _pairs_without_window(rig) if name not in known
+    }
 
 
-def _awaited(rig: VehicleRig | None) -> tuple[str, ...]:
+def _pairs_without_window(rig: VehicleRig | None) -> tuple[str, ...]:
     """Pairs of the moved sensors without a window since the move, until the sensors are put right. Edges between LiDARs
     are left out: they have no windows, but are registered at their own times."""
     if rig is None or rig.event is None or rig.event.corrected:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coec.adapters.ros.diagnostics import Service
+from coec.adapters.ros.diagnostics import ServicePhase
 from coec.calibration.types import Rig
 from coec.schemas.replies import ExtrinsicReply, HealthReply
 from coec.schemas.rig_state import RigReply
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PairTold:
+class PairOutput:
     """One pair. `serial` is that of its camera; `extrinsic` and `rig` are None while the pair is awaited."""
 
     health: HealthReply
@@ -21,9 +21,9 @@ class PairTold:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class VehicleOutput:
     """The service, its pairs and their rig at one moment; `rig` is None if there is only one pair."""
 
-    service: Service
-    pairs: tuple[PairTold, ...]
+    service: ServicePhase
+    pairs: tuple[PairOutput, ...]
     rig: RigReply | None = None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coec.adapters.ros.outgoing import Placed
+from coec.adapters.ros.outgoing import PlacedFrame
 from coec.config import RosConfig
 from coec.geometry import se3
 from coec.schemas.replies import ExtrinsicReply
@@ -19,8 +19,8 @@ from coec.schemas.ros_names import ros_name
 class Transforms:
     """The transforms of one message, and for each pair a short text: what is published of it, or why nothing is."""
 
-    placed: tuple[Placed, ...]
-    words: dict[str, str]
+    placed: tuple[PlacedFrame, ...]
+    texts: dict[str, str]
 
 
 class CalibratedFrames:
@@ -34,32 +34,32 @@ class CalibratedFrames:
 
     def __init__(self, ros: RosConfig) -> None:
         self._ros = ros
-        self._told: set[str] = set()
+        self._published: set[str] = set()
 
     def transforms(self, served: Sequence[ExtrinsicReply]) -> Transforms:
         """The transforms for what is served of all pairs."""
         cameras = Counter(_frame(extrinsic.camera_frame) for extrinsic in served)
-        placed, words = [], {}
+        placed, texts = [], {}
         for extrinsic in served:
             camera, lidar = _frame(extrinsic.camera_frame), _frame(extrinsic.lidar_frame)
             child = self._child(extrinsic.pair, camera, shared=cameras[camera] > 1)
             if child is None:
-                words[extrinsic.pair] = (
+                texts[extrinsic.pair] = (
                     f"not published: {camera} is the camera of several pairs, and a frame has one parent"
                 )
             elif child == lidar:
-                words[extrinsic.pair] = f"not published: {child} is the frame of the LiDAR, too"
+                texts[extrinsic.pair] = f"not published: {child} is the frame of the LiDAR, too"
             elif not self._is_due(extrinsic):
-                words[extrinsic.pair] = "not published: nominal still"
+                texts[extrinsic.pair] = "not published: nominal still"
             else:
-                self._told.add(extrinsic.pair)
+                self._published.add(extrinsic.pair)
                 T_camera_lidar = np.array(extrinsic.camera_from_lidar.matrix)
-                placed.append(Placed(lidar, child, se3.inverse(T_camera_lidar)))
-                words[extrinsic.pair] = f"{child} in {lidar}, {extrinsic.provenance}"
-        return Transforms(tuple(placed), words)
+                placed.append(PlacedFrame(lidar, child, se3.inverse(T_camera_lidar)))
+                texts[extrinsic.pair] = f"{child} in {lidar}, {extrinsic.provenance}"
+        return Transforms(tuple(placed), texts)
 
     def _is_due(self, extrinsic: ExtrinsicReply) -> bool:
-        return self._ros.replace_camera_frames or extrinsic.provenance != "nominal" or extrinsic.pair in self._told
+        return self._ros.replace_camera_frames or extrinsic.provenance != "nominal" or extrinsic.pair in self._published
 
     def _child(self, pair: str, camera: str, *, shared: bool) -> str | None:
         """Name of the frame to publish; None if every possible one has another parent already."""

@@ -26,9 +26,9 @@ from coec.runtime.worker.jobs import (
     Answer,
     Checked,
     Commissioned,
-    Drawn,
     Kind,
     Registered,
+    RenderedImage,
     Solved,
     Underway,
     WrittenFile,
@@ -54,17 +54,17 @@ class _SolvedOnTheWire:
 
 def pack_answer(number: int, answer: Answer | None) -> dict[str, Any]:
     """The answer to the question of this number; None if the question asks for nothing."""
-    return {"id": number, "result": None if answer is None else _packed(answer)}
+    return {"id": number, "result": None if answer is None else _encoded(answer)}
 
 
 def pack_refusal(number: int, reason: Reason) -> dict[str, Any]:
     """The refusal of the question of this number, with its reason."""
-    return {"id": number, "refused": _packed(reason)}
+    return {"id": number, "refused": _encoded(reason)}
 
 
 def pack_underway(number: int, underway: Underway) -> dict[str, Any]:
     """The answer that the work of the question of this number is not complete."""
-    return {"id": number, "underway": _packed(underway)}
+    return {"id": number, "underway": _encoded(underway)}
 
 
 def number_of(message: Mapping[str, Any]) -> int:
@@ -119,7 +119,7 @@ def _solved(wire: _SolvedOnTheWire) -> Solved:
 def _reader() -> TypeAdapter[Any]:
     """Reads a map into the dataclass with exactly its fields. Made at the first answer: only the service reads."""
     settings = ConfigDict(arbitrary_types_allowed=True, extra="forbid")
-    forms = _SolvedOnTheWire | Checked | Drawn | Commissioned | Underway | Registered | Reason
+    forms = _SolvedOnTheWire | Checked | RenderedImage | Commissioned | Underway | Registered | Reason
     return TypeAdapter(forms, config=settings)
 
 
@@ -130,7 +130,7 @@ def _read(form: type, value: Any) -> Any:
         MalformedAnswerError: it is not in this form.
     """
     try:
-        read = _reader().validate_python(_unpacked(value))
+        read = _reader().validate_python(_decoded(value))
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
         raise MalformedAnswerError(f"it is no {form.__name__.strip('_')}") from error
     if not isinstance(read, form):
@@ -154,30 +154,30 @@ def _check_shapes(read: object) -> None:
             raise MalformedAnswerError("it has an array that is not of the six axes")
 
 
-def _packed(value: Any) -> Any:
+def _encoded(value: Any) -> Any:
     """The value as values that msgpack knows."""
     if isinstance(value, BaseModel):
         return to_msgpack(value)
     if is_dataclass(value):
-        return {field.name: _packed(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: _encoded(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, np.ndarray):
         doubles = np.ascontiguousarray(value, dtype="<f8")
         return msgpack.ExtType(ARRAY, msgpack.packb([doubles.shape, doubles.tobytes()]))
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, tuple):
-        return [_packed(entry) for entry in value]
+        return [_encoded(entry) for entry in value]
     return value
 
 
-def _unpacked(value: Any) -> Any:
+def _decoded(value: Any) -> Any:
     """The value with the arrays that `_packed` packed, at any depth."""
     if isinstance(value, msgpack.ExtType):
         return _array(value)
     if isinstance(value, dict):
-        return {name: _unpacked(entry) for name, entry in value.items()}
+        return {name: _decoded(entry) for name, entry in value.items()}
     if isinstance(value, list):
-        return [_unpacked(entry) for entry in value]
+        return [_decoded(entry) for entry in value]
     return value
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from coec.adapters.system.memory import resident_bytes
-from coec.adapters.system.processor import processor_s
+from coec.adapters.system.processor import processor_time_s
 from coec.config import WorkerConfig
-from coec.runtime.worker.link import Link, NoMessageError
+from coec.runtime.worker.link import Link, MalformedMessageError
 
 _log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ PACKAGE_ROOT = Path(__file__).resolve().parents[3]
 MAX_ANSWER_BYTES = 2**26
 """Largest answer, bytes: a picture has some MB, every other answer some kB."""
 
-LAST_WORDS_S = 1.0
+EXIT_WAIT_S = 1.0
 """Time for a process that has broken its connection to end, s, so that its exit code can be reported."""
 
 KILL_S = 5.0
@@ -79,7 +79,7 @@ class Child:
             except (OSError, subprocess.SubprocessError) as error:
                 self._link.close()
                 raise ChildError(Fault.NOT_STARTED, f"could not be started ({error})") from error
-        self._cpu_s = self._told_cpu_s = 0.0
+        self._cpu_s = self._reported_cpu_s = 0.0
 
     @property
     def pid(self) -> int:
@@ -94,7 +94,7 @@ class Child:
         """
         if (exit_text := self._exit_text()) is not None:
             raise ChildError(Fault.DIED, exit_text)
-        self._look_at_processor()
+        self._read_processor_time()
         resident, allowed = self._resident_bytes(), self._config.max_memory_bytes
         if resident > allowed:
             text = f"used {resident >> 20} MiB of memory; worker.max_memory_bytes allows {allowed >> 20} MiB"
@@ -103,8 +103,8 @@ class Child:
 
     def taken_s(self) -> float:
         """Processor time since the last call, s. If the process has ended, up to when it was last watched."""
-        self._look_at_processor()
-        taken_s, self._told_cpu_s = self._cpu_s - self._told_cpu_s, self._cpu_s
+        self._read_processor_time()
+        taken_s, self._reported_cpu_s = self._cpu_s - self._reported_cpu_s, self._cpu_s
         return taken_s
 
     def send(self, message: dict[str, Any]) -> None:
@@ -122,7 +122,7 @@ class Child:
             text = f"could not be sent a message ({type(error).__name__}: {error})"
             raise ChildError(Fault.UNSENDABLE_JOB, text) from error
 
-    def has_spoken(self, within_s: float) -> bool:
+    def has_message(self, within_s: float) -> bool:
         """Whether a message, or the end of the connection, can be received within this time."""
         return self._link.poll(within_s)
 
@@ -134,7 +134,7 @@ class Child:
         """
         try:
             return self._link.receive(MAX_ANSWER_BYTES)
-        except NoMessageError as error:
+        except MalformedMessageError as error:
             raise ChildError(Fault.MALFORMED_ANSWER, f"sent something that is not a message: {error}") from error
         except (OSError, EOFError) as error:
             raise self._broken(error) from error
@@ -148,13 +148,13 @@ class Child:
             _log.error("a killed worker does not end and is left behind", extra={"fields": {"pid": self.pid}})
         self._link.close()
 
-    def _look_at_processor(self) -> None:
+    def _read_processor_time(self) -> None:
         with contextlib.suppress(OSError):
-            self._cpu_s = processor_s(self.pid)
+            self._cpu_s = processor_time_s(self.pid)
 
     def _broken(self, error: Exception) -> ChildError:
         """The fault behind a broken connection: how the process ended, if it did, because that tells more."""
-        exit_text = self._exit_text(LAST_WORDS_S)
+        exit_text = self._exit_text(EXIT_WAIT_S)
         if exit_text is not None:
             return ChildError(Fault.DIED, exit_text)
         return ChildError(Fault.DISCONNECTED, f"broke the connection ({type(error).__name__})")

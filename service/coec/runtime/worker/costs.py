@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coec.runtime.worker.jobs import PREFETCH, Job, Kind, Prefetch
+from coec.runtime.worker.jobs import PREFETCH, Kind, Prefetch, WorkerJob
 
 START, IDLE, BACKLOG = "start", "idle", "backlog"
 """Kinds of cost beside the present jobs: a process that starts, a process that waits, windows of an earlier run."""
@@ -25,7 +25,7 @@ class Cost:
     cpu_s: float
 
 
-def cost_of(work: Job | Prefetch, cpu_s: float) -> Cost:
+def cost_of(work: WorkerJob | Prefetch, cpu_s: float) -> Cost:
     """The cost of a piece of work."""
     if isinstance(work, Prefetch):
         return Cost(PREFETCH, work.pair, cpu_s)

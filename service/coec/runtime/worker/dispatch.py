@@ -21,12 +21,12 @@ INTERNAL_ERROR = "internal_error"
 """Code of the refusal if the program failed in the work."""
 
 
-def answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
+def answer_request(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
     """The answer to one question, under its number. If the solve of a window raises anything but a `CoecError`, the
     process ends; the service replaces it and tries again, a limited number of times."""
     number = message["id"]
     try:
-        end = solver.solve(Path(message["path"])) if message["kind"] == Kind.SOLVE else _errand(solver, message)
+        end = solver.solve(Path(message["path"])) if message["kind"] == Kind.SOLVE else _answer_once(solver, message)
     except CoecError as error:
         end = Reason(error.reply_code, str(error))
     if isinstance(end, Reason):
@@ -34,7 +34,7 @@ def answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
     return pack_underway(number, end) if isinstance(end, Underway) else pack_answer(number, end)
 
 
-def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Underway | Reason | None:
+def _answer_once(solver: Solver, message: dict[str, Any]) -> Answer | Underway | Reason | None:
     """The answer to work that is tried only once. A fault of the program is an answer, too, because checks come every
     few seconds: if each of them ended the worker, it would solve no more windows.
 

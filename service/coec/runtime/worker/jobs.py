@@ -103,7 +103,7 @@ class Checked:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class RenderedImage:
     """A picture, JPEG."""
 
     jpeg: bytes
@@ -147,13 +147,13 @@ class Registered:
     reasons: tuple[Reason, ...]
 
 
-Answer = Solved | Checked | Drawn | Commissioned | Registered
+Answer = Solved | Checked | RenderedImage | Commissioned | Registered
 
 ANSWERS: dict[Kind, type[Answer]] = {
     Kind.SOLVE: Solved,
     Kind.CHECK: Checked,
-    Kind.OVERLAY: Drawn,
-    Kind.PICTURE: Drawn,
+    Kind.OVERLAY: RenderedImage,
+    Kind.PICTURE: RenderedImage,
     Kind.COMMISSION: Commissioned,
     Kind.REGISTER: Registered,
 }
@@ -189,7 +189,7 @@ class JobOutcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Job:
+class WorkerJob:
     """One question to the worker. The functions below make them.
 
     Attributes:
@@ -233,61 +233,69 @@ class Prefetch:
 Done = Callable[[JobOutcome], None]
 
 
-def solve(pair: str, path: Path, window_id: str, done: Done, live: bool = True) -> Job:
+def solve(pair: str, path: Path, window_id: str, done: Done, live: bool = True) -> WorkerJob:
     """Calibrates the file of a finished window and writes the result into it; answered with `Solved`."""
-    return Job(Kind.SOLVE, pair, window_id, {"path": str(path)}, done, live)
+    return WorkerJob(Kind.SOLVE, pair, window_id, {"path": str(path)}, done, live)
 
 
-def check(pair: str, configuration: CalibrationConfig, pose: Matrix4, pairs: Sequence[FramePair], done: Done) -> Job:
+def check(
+    pair: str, configuration: CalibrationConfig, pose: Matrix4, pairs: Sequence[FramePair], done: Done
+) -> WorkerJob:
     """Has the monitor look at pairs at an extrinsic (4, 4); answered with `Checked`. The question brings the
     configuration of the moment at which it is asked, whatever the worker was started with."""
-    body = {"configuration": _packed(configuration), "pose": pack_pose(pose), "frames": pack_pairs(pairs)}
-    return Job(Kind.CHECK, pair, "check", body, done)
+    body = {
+        "configuration": _configuration_document(configuration),
+        "pose": pack_pose(pose),
+        "frames": pack_pairs(pairs),
+    }
+    return WorkerJob(Kind.CHECK, pair, "check", body, done)
 
 
-def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadline_s: float | None = None) -> Job:
+def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadline_s: float | None = None) -> WorkerJob:
     """Draws the last pair of a window's file at an extrinsic (4, 4); answered with `Drawn`."""
     body = {"path": str(path), "pose": pack_pose(pose), "title": title}
-    return Job(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
+    return WorkerJob(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
 
 
-def comparison(pair: str, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Done) -> Job:
+def comparison(pair: str, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Done) -> WorkerJob:
     """Draws a window's file at two extrinsics (4, 4), where they differ most; `names` are their captions. Answered with
     `Drawn`."""
     body = {"path": str(path), "poses": [pack_pose(pose) for pose in poses], "names": list(names)}
-    return Job(Kind.OVERLAY, pair, path.stem, body, done)
+    return WorkerJob(Kind.OVERLAY, pair, path.stem, body, done)
 
 
 def picture(
-    pair: str, configuration: CalibrationConfig, pose: Matrix4, drawn: FramePair, title: str, done: Done
-) -> Job:
+    pair: str, configuration: CalibrationConfig, pose: Matrix4, frame_pair: FramePair, title: str, done: Done
+) -> WorkerJob:
     """Draws a pair of the stream at an extrinsic (4, 4); answered with `Drawn`."""
     body = {
-        "configuration": _packed(configuration),
+        "configuration": _configuration_document(configuration),
         "pose": pack_pose(pose),
-        "frames": pack_pairs([drawn]),
+        "frames": pack_pairs([frame_pair]),
         "title": title,
     }
-    return Job(Kind.PICTURE, pair, "picture", body, done)
+    return WorkerJob(Kind.PICTURE, pair, "picture", body, done)
 
 
-def commission(pair: str, configuration: CalibrationConfig, pose: Matrix4, paths: Sequence[Path], done: Done) -> Job:
+def commission(
+    pair: str, configuration: CalibrationConfig, pose: Matrix4, paths: Sequence[Path], done: Done
+) -> WorkerJob:
     """Learns the rig's baseline at an extrinsic (4, 4) from windows' files; answered with `Commissioned`. It takes
     minutes, so it is done in slices: the worker answers `Underway` until it is complete."""
     body = {
         "run": next(_COMMISSIONINGS),
-        "configuration": _packed(configuration),
+        "configuration": _configuration_document(configuration),
         "pose": pack_pose(pose),
         "paths": [str(path) for path in paths],
     }
-    return Job(Kind.COMMISSION, pair, "commissioning", body, done)
+    return WorkerJob(Kind.COMMISSION, pair, "commissioning", body, done)
 
 
-def register(edge: str, rig: LidarRig, pairs: Sequence[SweepPair], done: Done) -> Job:
+def register(edge: str, rig: LidarRig, pairs: Sequence[SweepPair], done: Done) -> WorkerJob:
     """Finds the pose of one LiDAR in another from pairs of their sweeps; answered with `Registered`."""
     body = {"lidars": pack_lidars(rig), "frames": pack_sweeps(pairs)}
-    return Job(Kind.REGISTER, edge, "lidars", body, done)
+    return WorkerJob(Kind.REGISTER, edge, "lidars", body, done)
 
 
-def _packed(configuration: CalibrationConfig) -> dict[str, Any]:
+def _configuration_document(configuration: CalibrationConfig) -> dict[str, Any]:
     return configuration.model_dump(mode="json")

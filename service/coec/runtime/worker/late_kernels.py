@@ -17,13 +17,13 @@ from coec.geometry.edges.alignment import (
     alignments_of_late,
     significances,
 )
-from coec.geometry.edges.charts import charted_significances, climb, edge_charts, keep_apart
-from coec.geometry.edges.climbs import Climb, climbed
+from coec.geometry.edges.charts import charted_significances, edge_charts, pattern_search, select_separated
+from coec.geometry.edges.climbs import AscentStart, ascend
 from coec.geometry.mutual_information import BinnedFrames, information_of_each, mutual_information
 from coec.geometry.projection import project
 from coec.geometry.shares import share_of_pixels
 
-CAMERA_PX = 64
+LATE_CAMERA_PX = 64
 """Longer side of the image: kernels are compiled for types, not for sizes."""
 
 BLUR_RAD = 0.1
@@ -32,7 +32,7 @@ BLUR_RAD = 0.1
 
 def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
     """The functions to run; those that a solve needs last come first."""
-    scale = min(1.0, CAMERA_PX / max(camera.width, camera.height))
+    scale = min(1.0, LATE_CAMERA_PX / max(camera.width, camera.height))
     camera = scaled(camera, scale, scale)
     edges, pose = one_edge(camera), np.eye(4)
     two, point = np.stack([pose, pose]), np.zeros((3, 1), np.float32)
@@ -41,16 +41,16 @@ def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
     binned = _binned(camera)
     values = np.ones((camera.height, camera.width), np.float32)
     return (
-        lambda: climbed(edges, [Climb(pose, 0, 1)], pose[None, None]),
+        lambda: ascend(edges, [AscentStart(pose, 0, 1)], pose[None, None]),
         lambda: alignments_of_late(edges, point, point, point.T, two),
-        lambda: climb(charts, two, steps, 1, pose, reach),
+        lambda: pattern_search(charts, two, steps, 1, pose, reach),
         lambda: charted_significances(charts, two),
         lambda: information_of_each(binned, two),
         lambda: mutual_information(binned, pose),
         lambda: share_of_pixels(values, values > 0.0, np.ones(1, np.float32)),
         lambda: significances(edges, two),
         lambda: sample_reach(pose, SearchBox(0.1, 0.0), 8),
-        lambda: keep_apart(two, np.arange(2), 1, 3.0),
+        lambda: select_separated(two, np.arange(2), 1, 3.0),
         lambda: alignments(edges, two),
         lambda: alignment_of_parts(edges, np.zeros(1, np.uint8), 1, two),
         lambda: project(camera, np.ones((1, 3))),

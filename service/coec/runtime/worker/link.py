@@ -31,7 +31,7 @@ TRANSFER_TIMEOUT_S = 10
 """Largest pause inside one transfer, s. The other end only has to read from its socket buffer."""
 
 
-class NoMessageError(Exception):
+class MalformedMessageError(Exception):
     """What came over the wire is not a message; the text says why."""
 
 
@@ -77,13 +77,13 @@ class Link:
             try:
                 unpacker.feed(part)
             except msgpack.BufferFull:
-                raise NoMessageError(f"it is larger than {max_bytes} bytes") from None
+                raise MalformedMessageError(f"it is larger than {max_bytes} bytes") from None
         try:
             message = unpacker.unpack()
         except (ValueError, msgpack.UnpackException) as error:
-            raise NoMessageError(f"it is not msgpack ({type(error).__name__})") from error
+            raise MalformedMessageError(f"it is not msgpack ({type(error).__name__})") from error
         if not isinstance(message, dict):
-            raise NoMessageError("it is not a map")
+            raise MalformedMessageError("it is not a map")
         return message
 
     def _part(self, max_bytes: int) -> bytes:
@@ -91,7 +91,7 @@ class Link:
             return self._connection.recv_bytes(max_bytes)
         except OSError:
             if not self._connection.readable:  # the library sets this when a part is too large
-                raise NoMessageError(f"it is larger than {max_bytes} bytes") from None
+                raise MalformedMessageError(f"it is larger than {max_bytes} bytes") from None
             raise
 
     def close(self) -> None:

@@ -25,12 +25,12 @@ T = TypeVar("T")
 def pack_pairs(pairs: Sequence[FramePair]) -> Sequence[list[bytes | None]]:
     """Camera, LiDAR and ego-motion frame of each pair in native msgpack. Each entry is packed whenever it is read,
     because the pairs of a check have 15 MB and need not be in memory twice."""
-    return _Packed(pairs, _pair)
+    return _PackedLazily(pairs, _pair)
 
 
 def pack_sweeps(pairs: Sequence[SweepPair]) -> Sequence[list[bytes | None]]:
     """The same for sweeps of two LiDARs."""
-    return _Packed(pairs, _sweeps)
+    return _PackedLazily(pairs, _sweeps)
 
 
 def _pair(pair: FramePair) -> list[bytes | None]:
@@ -41,7 +41,7 @@ def _sweeps(pair: SweepPair) -> list[bytes | None]:
     return [encode_lidar(pair.a), encode_lidar(pair.b), encode_ego(pair.motion) if pair.motion else None]
 
 
-class _Packed(Sequence[list[bytes | None]], Generic[T]):
+class _PackedLazily(Sequence[list[bytes | None]], Generic[T]):
     def __init__(self, pairs: Sequence[T], pack: Callable[[T], list[bytes | None]]) -> None:
         self._pairs = tuple(pairs)
         self._pack = pack
@@ -52,10 +52,10 @@ class _Packed(Sequence[list[bytes | None]], Generic[T]):
     @overload
     def __getitem__(self, index: int) -> list[bytes | None]: ...
     @overload
-    def __getitem__(self, index: slice) -> _Packed[T]: ...
-    def __getitem__(self, index: int | slice) -> list[bytes | None] | _Packed[T]:
+    def __getitem__(self, index: slice) -> _PackedLazily[T]: ...
+    def __getitem__(self, index: int | slice) -> list[bytes | None] | _PackedLazily[T]:
         if isinstance(index, slice):
-            return _Packed(self._pairs[index], self._pack)
+            return _PackedLazily(self._pairs[index], self._pack)
         return self._pack(self._pairs[index])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 
-from coec.adapters.system.parent import die_with
+from coec.adapters.system.parent import die_with_parent
 
 
 def tie_to(parent: int) -> None:
@@ -12,4 +12,4 @@ def tie_to(parent: int) -> None:
     which the parent handles."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    die_with(parent)
+    die_with_parent(parent)

@@ -34,7 +34,7 @@ START = "start"
 WARM_UP = "warm_up"
 """Kind of a message that has the next of the kernels compiled that no check needs."""
 
-DEPTH_MAPS_KEPT = 64
+DEPTH_MAPS_CACHED = 64
 """Number of depth maps kept per network: two windows of 25 and some more. A map at network resolution is about 1 MB."""
 
 
@@ -47,7 +47,7 @@ def main(arguments: list[str]) -> int:
         config = Config.model_validate_json(link.receive()["settings"])
         logs.configure(config.log.level, config.log.format)
         os.nice(config.worker.niceness)
-        allocator.return_large()
+        allocator.return_large_allocations()
         _serve(link, config)
     return 0
 
@@ -56,7 +56,7 @@ def _serve(link: Link, config: Config) -> None:
     # Imported here because numba and onnxruntime take most of a second, and the process is tied to its parent before.
     # The imported objects stay for good: without `freeze`, looking through them for garbage took a tenth of the start.
     gc.disable()
-    from coec.runtime.worker.dispatch import answer
+    from coec.runtime.worker.dispatch import answer_request
     from coec.runtime.worker.second_compiler import second_compiler
     from coec.runtime.worker.tasks import Solver
 
@@ -67,9 +67,9 @@ def _serve(link: Link, config: Config) -> None:
         with ExitStack() as reporting, ExitStack() as helping:
             try:
                 if solver is None:
-                    solver = Solver(config, DEPTH_MAPS_KEPT)
+                    solver = Solver(config, DEPTH_MAPS_CACHED)
                 else:
-                    solver.use(config)
+                    solver.reconfigure(config)
                 helping.enter_context(second_compiler(config))
                 reporting.enter_context(_reported(link, solver.lenses))
                 solver.warm_up_checks()
@@ -86,7 +86,7 @@ def _serve(link: Link, config: Config) -> None:
                     link.send({"kind": "warmed", "more": more})
                     continue
                 solver.forget_abandoned()
-                link.send(answer(solver, message))
+                link.send(answer_request(solver, message))
             config = Config.model_validate_json(message["settings"])
 
 
@@ -108,26 +108,26 @@ def _reported(link: Link, lenses: int) -> Iterator[None]:
     """Inside the context, the service is sent how far the compilation of kernels is, see `compilation`."""
     from coec.runtime.worker.kernels import compiled
 
-    told_s: float | None = None
+    reported_s: float | None = None
 
     def step(_: str) -> None:
-        nonlocal told_s
+        nonlocal reported_s
         now_s = time.monotonic()
-        if told_s is None or now_s - told_s >= REPORT_S:
-            told_s = now_s
+        if reported_s is None or now_s - reported_s >= REPORT_S:
+            reported_s = now_s
             reached = compiled(lenses)
             send({"kind": "compiling", "done": reached.done, "total": reached.total})
 
     def end(_: str) -> None:
-        nonlocal told_s
-        told_s = None
+        nonlocal reported_s
+        reported_s = None
         send({"kind": "compiled"})
 
     def send(message: dict[str, Any]) -> None:
         with contextlib.suppress(OSError):  # the service is gone, which the next message to it shows, too
             link.send(message)
 
-    with compile_news.heard_by(step, end):
+    with compile_news.listening(step, end):
         yield
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from coec.calibration.types import Reason
-from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, JobOutcome, Kind, Prefetch, Underway
+from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, JobOutcome, Kind, Prefetch, Underway, WorkerJob
 
 
 class Lane(Enum):
@@ -57,7 +57,7 @@ class Ticket:
     """The next work for the worker, under a number that no other ticket has had."""
 
     number: int
-    work: Job | Prefetch
+    work: WorkerJob | Prefetch
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +75,8 @@ class _Entry:
     """A job on its way. `attempts`: how often a worker had it; `returned`: sending it has failed once; `reached`: how
     far a commissioning is that has been begun."""
 
-    job: Job
-    asked_s: float
+    job: WorkerJob
+    submitted_s: float
     attempts: int = 0
     returned: bool = False
     settled: bool = False
@@ -84,7 +84,7 @@ class _Entry:
 
     @property
     def deadline_s(self) -> float:
-        return self.asked_s + self.job.patience_s
+        return self.submitted_s + self.job.patience_s
 
 
 @dataclass(slots=True, eq=False)
@@ -104,7 +104,7 @@ class JobQueue:
         self._lanes: dict[Lane, deque[_Entry]] = {lane: deque() for lane in Lane}
         self._prefetches: deque[Prefetch] = deque()
         self._in_hand: _InHand | None = None
-        self._outbox: list[tuple[Job, JobOutcome]] = []
+        self._outbox: list[tuple[WorkerJob, JobOutcome]] = []
         self._number = 0
         self._check_was_fatal = False
         self._stopped = False
@@ -113,7 +113,7 @@ class JobQueue:
 
     # --- from those who ask -----------------------------------------------------------------------------------------
 
-    def ask(self, job: Job, now_s: float) -> None:
+    def submit(self, job: WorkerJob, now_s: float) -> None:
         """Takes in a job."""
         entry = _Entry(job, now_s)
         if self._stopped:
@@ -129,7 +129,7 @@ class JobQueue:
             self._end(oldest, Fate.SUPERSEDED, SUPERSEDED, now_s)
         self._lanes[lane].append(entry)
 
-    def refuse(self, job: Job, reason: Reason, now_s: float) -> None:
+    def refuse(self, job: WorkerJob, reason: Reason, now_s: float) -> None:
         """Answers a job at once with the reason why it is not taken in."""
         self._end(_Entry(job, now_s), Fate.FAILED, reason, now_s)
 
@@ -239,10 +239,10 @@ class JobQueue:
         if isinstance(entry, _Entry) and not entry.settled:
             self._end(entry, Fate.FAILED, STOPPING, now_s)
 
-    def drain(self) -> list[tuple[Job, JobOutcome]]:
+    def drain(self) -> list[tuple[WorkerJob, JobOutcome]]:
         """Takes out the jobs that have ended since the last call, in order."""
-        ended, self._outbox = self._outbox, []
-        return ended
+        finished, self._outbox = self._outbox, []
+        return finished
 
     # --- figures ----------------------------------------------------------------------------------------------------
 
@@ -291,7 +291,7 @@ class JobQueue:
         checks, live = self._lanes[Lane.CHECK], self._lanes[Lane.LIVE]
         # A check that kills the worker must not keep every new worker from its windows, nor may many checks of other
         # pairs keep a window waiting.
-        windows_turn = live and (self._check_was_fatal or now_s - live[0].asked_s > WINDOW_WAITS_S)
+        windows_turn = live and (self._check_was_fatal or now_s - live[0].submitted_s > WINDOW_WAITS_S)
         if checks and not windows_turn:
             return checks.popleft()
         lidars, errands = self._lanes[Lane.LIDARS], self._lanes[Lane.ERRAND]
@@ -330,10 +330,10 @@ class JobQueue:
         self._outcomes[fate] += 1
         if reason is not None:
             self._causes[reason.code] += 1
-        self._outbox.append((entry.job, JobOutcome(fate, answer, reason, now_s - entry.asked_s)))
+        self._outbox.append((entry.job, JobOutcome(fate, answer, reason, now_s - entry.submitted_s)))
 
 
-def _lane_of(job: Job) -> Lane:
+def _lane_of(job: WorkerJob) -> Lane:
     match job.kind:
         case Kind.CHECK:
             return Lane.CHECK

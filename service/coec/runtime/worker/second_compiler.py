@@ -27,12 +27,12 @@ def second_compiler(config: Config) -> Iterator[None]:
     worker only needs more time."""
     children: list[subprocess.Popen[bytes]] = []
 
-    def hear(_: str) -> None:
+    def on_compilation(_: str) -> None:
         if not children and len(os.sched_getaffinity(0)) > 1:
             children.append(_started(config))
 
     try:
-        with compile_news.heard_by(hear):
+        with compile_news.listening(on_compilation):
             yield
     finally:
         for child in children:

@@ -27,7 +27,7 @@ from coec.runtime.worker.answers import MalformedAnswerError, number_of, read_an
 from coec.runtime.worker.child import Child, ChildError, Fault
 from coec.runtime.worker.compilation import STALLED_S, Compilation, Compiling
 from coec.runtime.worker.costs import IDLE, START, Cost, cost_of
-from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, Kind, Prefetch, Underway
+from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Kind, Prefetch, Underway, WorkerJob
 from coec.runtime.worker.queue import WORKER_FAILED, InProgress, JobQueue, Ticket
 
 _log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class WorkerState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerStatus:
+class SupervisorStatus:
     """State and counters of the worker.
 
     Attributes:
@@ -125,7 +125,7 @@ class Worker:
         process takes, on the supervisor's thread; for a job before its outcome is reported."""
         self._config = config
         self._settings = settings
-        self._told = ""
+        self._sent_settings = ""
         self._command = tuple(command)
         self._pay = pay
         self._compilation = Compilation()
@@ -151,7 +151,7 @@ class Worker:
         """Starts the supervisor, which starts the process."""
         self.thread.start()
 
-    def use(self, settings: str) -> None:
+    def reconfigure(self, settings: str) -> None:
         """Goes on with another configuration, which holds for every job that is asked for from now on."""
         with self._condition:
             self._settings = settings
@@ -160,18 +160,18 @@ class Worker:
         """Ends the supervisor, which kills the process whatever it is doing. When this returns, all jobs have been
         answered (`stopping`). Unsolved windows stay on the disk."""
         self.thread.request_stop()
-        with self._held() as queue:
+        with self._locked_queue() as queue:
             queue.stop(self._now_s())
             self._condition.notify_all()
 
-    def ask(self, job: Job) -> None:
+    def submit(self, job: WorkerJob) -> None:
         """Queues a job; `job.done` will be called once, perhaps before this returns."""
         compiling = self._compilation.status if self.warms_up and job.kind in NOT_WHILE_COMPILING else None
-        with self._held() as queue:
+        with self._locked_queue() as queue:
             if compiling is not None:
                 queue.refuse(job, compiling.reason, self._now_s())
                 return
-            queue.ask(job, self._now_s())
+            queue.submit(job, self._now_s())
             self._condition.notify_all()
 
     def commissioning(self, pair: str) -> str | None:
@@ -182,7 +182,7 @@ class Worker:
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Queues the depth inference of a camera frame (native msgpack). It only saves time, so it may be dropped."""
-        with self._held() as queue:
+        with self._locked_queue() as queue:
             queue.prefetch(Prefetch(pair, frame))
             self._condition.notify_all()
 
@@ -207,11 +207,11 @@ class Worker:
         """Time that workers have spent compiling kernels so far, s. It counts towards no time limit."""
         return self._compilation.paused_s
 
-    def status(self) -> WorkerStatus:
+    def status(self) -> SupervisorStatus:
         """State and counters of the worker."""
         raised = {"done_raised": self._done_raised} if self._done_raised else {}
         with self._condition:
-            return WorkerStatus(
+            return SupervisorStatus(
                 self._state,
                 self._starts,
                 self._failure,
@@ -232,12 +232,12 @@ class Worker:
         return self._compilation.now_s()
 
     @contextmanager
-    def _held(self) -> Iterator[JobQueue]:
+    def _locked_queue(self) -> Iterator[JobQueue]:
         """The queue under its lock. Outcomes of jobs that end in the block are reported after it, without the lock."""
         with self._condition:
             yield self._queue
-            ended = self._queue.drain()
-        for job, outcome in ended:
+            finished = self._queue.drain()
+        for job, outcome in finished:
             if outcome.fate is Fate.RESULT:
                 self.jobs_took.add(outcome.elapsed_s, job.kind.value)
             try:
@@ -263,7 +263,7 @@ class Worker:
                     backoff_s = min(2 * backoff_s, LAST_BACKOFF_S)
         finally:
             self._state = WorkerState.STOPPED
-            with self._held() as queue:
+            with self._locked_queue() as queue:
                 queue.stop(self._now_s())
 
     def _run_child(self) -> _Reached:
@@ -288,7 +288,7 @@ class Worker:
                     reached = _Reached.ANSWER
         except ChildError as error:
             self._note_fault(error, child.pid)
-            with self._held() as queue:
+            with self._locked_queue() as queue:
                 queue.died(str(error), self._now_s())
         finally:
             self._pid = None
@@ -299,8 +299,8 @@ class Worker:
     def _await_ready(self, child: Child) -> None:
         self._is_preparing = True
         with self._condition:
-            self._told = self._settings
-        child.send({"kind": "start", "settings": self._told})
+            self._sent_settings = self._settings
+        child.send({"kind": "start", "settings": self._sent_settings})
         message = self._next_message(child, START_TIMEOUT_S)
         match message:
             case None:
@@ -317,18 +317,18 @@ class Worker:
 
     def _take_turn(self, child: Child) -> bool:
         """Checks the worker, then gives it the next job, if there is one. Returns whether it has answered a job."""
-        self._look_after(child)
-        if child.has_spoken(0.0) and not self._compilation.take(child.receive()):  # raises if the process has ended
+        self._watch(child)
+        if child.has_message(0.0) and not self._compilation.take(child.receive()):  # raises if the process has ended
             raise ChildError(Fault.STRAY_ANSWER, "answered though nothing was asked")
-        if self._told != self._settings:
+        if self._sent_settings != self._settings:
             self._await_ready(child)
         ticket = self._take()
         if ticket is None:
             if not self._is_warm:
                 self._warm_up_further(child)
             return False
-        kind = ticket.work.kind if isinstance(ticket.work, Job) else None
-        timeout_s = ticket.work.timeout_s if isinstance(ticket.work, Job) else None
+        kind = ticket.work.kind if isinstance(ticket.work, WorkerJob) else None
+        timeout_s = ticket.work.timeout_s if isinstance(ticket.work, WorkerJob) else None
         self._pay(Cost(IDLE, "", child.taken_s()))
         try:
             self._send(child, ticket)
@@ -342,7 +342,7 @@ class Worker:
         answer = _checked_answer(message, ticket.number, kind)
         if isinstance(answer, Underway):
             self._log_progress(ticket.work.pair, answer)
-        with self._held() as queue:
+        with self._locked_queue() as queue:
             queue.answered(answer, self._now_s())
         return True
 
@@ -370,7 +370,7 @@ class Worker:
 
     def _take(self) -> Ticket | None:
         """The next job; None if there is none, after waiting for `POLL_S` at most."""
-        with self._held() as queue:
+        with self._locked_queue() as queue:
             ticket = queue.take(self._now_s())
             # A worker that compiles kernels while nothing waits is at work, too.
             self._state = WorkerState.READY if ticket is None and self._is_warm else WorkerState.BUSY
@@ -380,15 +380,15 @@ class Worker:
 
     def _send(self, child: Child, ticket: Ticket) -> None:
         try:
-            child.send(_question(ticket))
+            child.send(_request_message(ticket))
         except ChildError as error:
             if error.fault is Fault.UNSENDABLE_JOB:
-                with self._held() as queue:
+                with self._locked_queue() as queue:
                     queue.answered(Reason("unsendable", f"The worker {error}."), self._now_s())
             raise
-        if isinstance(ticket.work, Job) and ticket.work.kind not in SENT_AGAIN:
+        if isinstance(ticket.work, WorkerJob) and ticket.work.kind not in SENT_AGAIN:
             ticket.work.body.clear()  # frees the frames of a check, 15 MB, which are not sent twice
-        with self._held() as queue:
+        with self._locked_queue() as queue:
             queue.sent(self._now_s())
 
     def _next_message(self, child: Child, timeout_s: float) -> dict[str, Any] | None:
@@ -400,10 +400,10 @@ class Worker:
         """
         deadline_s = self._now_s() + timeout_s
         while True:
-            while not child.has_spoken(POLL_S):
+            while not child.has_message(POLL_S):
                 if self.thread.stopping:
                     return None
-                self._look_after(child)
+                self._watch(child)
                 if self._compilation.has_stalled:
                     text = f"made no progress in the compilation of its kernels within {STALLED_S:g} s"
                     raise ChildError(Fault.TIMED_OUT, text)
@@ -413,9 +413,9 @@ class Worker:
             if not self._compilation.take(message):
                 self._compilation.end()
                 return message
-            self._look_after(child)
+            self._watch(child)
 
-    def _look_after(self, child: Child) -> None:
+    def _watch(self, child: Child) -> None:
         """Checks time limits, memory and life of the worker; called many times a second.
 
         Raises:
@@ -426,7 +426,7 @@ class Worker:
 
     def _keep_time(self) -> None:
         self.thread.beat()
-        with self._held() as queue:
+        with self._locked_queue() as queue:
             queue.expire(self._now_s())
 
     def _note_fault(self, error: ChildError, pid: int | None) -> None:
@@ -447,7 +447,7 @@ class Worker:
                 self._condition.wait(POLL_S)
 
 
-def _question(ticket: Ticket) -> dict[str, Any]:
+def _request_message(ticket: Ticket) -> dict[str, Any]:
     """The message to the worker."""
     work = ticket.work
     if isinstance(work, Prefetch):

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from coec.adapters.depth.maps import CachedDepth, open_depth
-from coec.adapters.files.baseline_file import BASELINES, baseline_of, save_baseline
+from coec.adapters.files.baseline_file import BASELINES, baseline_of_rig, save_baseline
 from coec.adapters.files.rig import rig_of
 from coec.adapters.frames.msgpack_frames import decode_camera
 from coec.adapters.images.codec import CachedGreys, GreyImages, decode_bgr, encode_jpeg
-from coec.adapters.images.range_colours import RangeScale, kept_or, scale_of
+from coec.adapters.images.range_colours import RangeScale, scale_of, stable_scale
 from coec.adapters.registration.nearest import Trees, installed
 from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.baseline import Baseline, learned_hash, mismatch
@@ -39,14 +39,14 @@ from coec.config import CalibrationConfig, Config, DepthConfig
 from coec.errors import CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.vectors import lengths
 from coec.reports.instants import instant
-from coec.reports.overlay import draw, titled
+from coec.reports.overlay import render_points, titled
 from coec.runtime.worker.jobs import (
     DEADLINE_S,
     Checked,
     Commissioned,
-    Drawn,
     Kind,
     Registered,
+    RenderedImage,
     Solved,
     Underway,
     WrittenFile,
@@ -79,21 +79,21 @@ class Solver:
     schemas take 0.15 s, and the first work, a check, needs none of them.
     """
 
-    def __init__(self, config: Config, depth_maps_kept: int) -> None:
+    def __init__(self, config: Config, depth_maps_cached: int) -> None:
         """Opens every depth model that a pair of `config` names.
 
         Raises:
             ModelError: a network is missing, corrupt or does not match its card.
             ConfigError: a rig cannot be built.
         """
-        self._depth_maps_kept = depth_maps_kept
+        self._depth_maps_cached = depth_maps_cached
         self._images = GreyImages(config.limits)
         self._networks: dict[DepthConfig, CachedDepth] = {}
         self._scales: dict[str, RangeScale] = {}
         self._commissioning: _Commissioning | None = None
-        self.use(config)
+        self.reconfigure(config)
 
-    def use(self, config: Config) -> None:
+    def reconfigure(self, config: Config) -> None:
         """Goes on with another configuration that has the same limits. Networks of awaited pairs are opened, too, so
         that the start shows what is wrong with them.
 
@@ -182,7 +182,7 @@ class Solver:
         title = f"{window.window_id}  {estimate.verdict.decision.value}"
         pose = estimate.optimum.T_camera_lidar.tolist()
         try:
-            return self._drawn(window.rig, configuration, pose, window.pairs[-1], title).jpeg
+            return self._render(window.rig, configuration, pose, window.pairs[-1], title).jpeg
         except DecodeError as error:
             _log.warning(f"the result is not drawn: {error}", extra={"fields": {"window": window.window_id}})
             return None
@@ -211,7 +211,7 @@ class Solver:
         images = CachedGreys(self._images, len(window.pairs))
         return Checked(observe(window, network, images, configuration, baseline), not_used)
 
-    def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> Drawn:
+    def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> RenderedImage:
         """JPEG of a window's last pair, with its points drawn on its image at an extrinsic (rows of the (4, 4) matrix).
 
         Raises:
@@ -220,9 +220,9 @@ class Solver:
         from coec.adapters.mcap.windows import read_window
 
         window, configuration = read_window(path)
-        return self._drawn(window.rig, configuration, pose, window.pairs[-1], title)
+        return self._render(window.rig, configuration, pose, window.pairs[-1], title)
 
-    def comparison(self, path: Path, poses: Sequence[Sequence[Sequence[float]]], names: Sequence[str]) -> Drawn:
+    def comparison(self, path: Path, poses: Sequence[Sequence[Sequence[float]]], names: Sequence[str]) -> RenderedImage:
         """JPEG of two extrinsics (rows of the (4, 4) matrices) side by side on a window, where they differ most.
 
         Raises:
@@ -243,7 +243,7 @@ class Solver:
             caption=Caption(before=names[0], after=names[1]),
             limits=self._config.limits,
         )
-        return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
+        return RenderedImage(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
 
     def picture(
         self,
@@ -252,14 +252,16 @@ class Solver:
         pose: Sequence[Sequence[float]],
         frames: Sequence[Sequence[bytes | None]],
         title: str,
-    ) -> Drawn:
+    ) -> RenderedImage:
         """JPEG of one pair of the stream at an extrinsic, like `overlay`; the pair is packed as `messages` does.
 
         Raises:
             DecodeError: a frame cannot be decoded.
         """
-        (drawn,) = unpack_pairs(frames, self._config.limits)
-        return self._drawn(self._rigs[pair], configuration, pose, drawn, title, self._scale(pair, drawn.lidar))
+        (frame_pair,) = unpack_pairs(frames, self._config.limits)
+        return self._render(
+            self._rigs[pair], configuration, pose, frame_pair, title, self._scale(pair, frame_pair.lidar)
+        )
 
     def commission(
         self, run: int, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
@@ -325,7 +327,7 @@ class Solver:
         """
         return _registered(register(unpack_lidars(lidars), unpack_sweeps(frames, self._config.limits), Trees()))
 
-    def _drawn(
+    def _render(
         self,
         rig: Rig,
         configuration: CalibrationConfig,
@@ -333,17 +335,17 @@ class Solver:
         pair: FramePair,
         title: str,
         scale: RangeScale | None = None,
-    ) -> Drawn:
+    ) -> RenderedImage:
         xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
         image = decode_bgr(pair.camera.image, self._config.limits)
         T_camera_lidar = np.array(pose, dtype=np.float64)
-        told = f"{title}\n{instant(pair.camera.stamp_ns)}"
-        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, scale)
-        return Drawn(encode_jpeg(titled(picture, told), OVERLAY_JPEG_QUALITY))
+        caption = f"{title}\n{instant(pair.camera.stamp_ns)}"
+        picture = render_points(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, scale)
+        return RenderedImage(encode_jpeg(titled(picture, caption), OVERLAY_JPEG_QUALITY))
 
     def _scale(self, pair: str, sweep: LidarFrame) -> RangeScale:
         """The colour scale of a stream, which stays the same from picture to picture."""
-        scale = kept_or(self._scales.get(pair), scale_of(lengths(sweep.xyz_m)))
+        scale = stable_scale(self._scales.get(pair), scale_of(lengths(sweep.xyz_m)))
         self._scales[pair] = scale
         return scale
 
@@ -352,7 +354,7 @@ class Solver:
     ) -> tuple[Baseline | None, str | None]:
         """The baseline of the rig if it holds for this configuration and network; else why it does not hold."""
         try:
-            learned = baseline_of(self._rigs[pair], self._config.state)
+            learned = baseline_of_rig(self._rigs[pair], self._config.state)
         except StateError as error:
             return None, str(error)
         if learned is None:
@@ -363,7 +365,7 @@ class Solver:
 
     def _network(self, config: DepthConfig) -> CachedDepth:
         if config not in self._networks:
-            self._networks[config] = CachedDepth(open_depth(config, self._config.limits), self._depth_maps_kept)
+            self._networks[config] = CachedDepth(open_depth(config, self._config.limits), self._depth_maps_cached)
         return self._networks[config]
 
 

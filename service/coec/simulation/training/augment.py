@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.simulation.training.shown import SKY, Shown
+from coec.simulation.training.shown import SKY, TrainingFrame
 
 Floats = NDArray[np.float32]
 
@@ -14,7 +14,7 @@ ZOOM = 1.35
 """At least 1/`ZOOM` of each side is kept."""
 
 
-def augment(shown: Shown, height: int, width: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def augment(shown: TrainingFrame, height: int, width: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """RGB (height, width, 3), 0 to 255, and the target (height, width): see `target`."""
     bgr, code = _cut(shown, height, width, rng)
     rgb = bgr[:, :, ::-1].astype(np.float32)
@@ -42,7 +42,7 @@ def target(code: NDArray[np.uint16]) -> Floats:
 
 
 def _cut(
-    shown: Shown, height: int, width: int, rng: np.random.Generator
+    shown: TrainingFrame, height: int, width: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     h, w = shown.code.shape
     zoom = rng.uniform(1.0, ZOOM) if rng.random() < 0.6 else 1.0

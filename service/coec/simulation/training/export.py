@@ -76,7 +76,7 @@ def same(checkpoint: Path, path: Path, image: Tensor) -> float:
     network.load_state_dict(torch.load(checkpoint, weights_only=True)["average"])
     network.eval()
     with torch.no_grad():
-        wanted = network(image).numpy()
+        expected = network(image).numpy()
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     got = session.run([OUTPUT], {INPUT: image.numpy()})[0]
-    return float(np.abs(got - wanted).max() / np.ptp(wanted))
+    return float(np.abs(got - expected).max() / np.ptp(expected))

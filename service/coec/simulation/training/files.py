@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from coec.simulation.training.shown import SHAPES, Shown
+from coec.simulation.training.shown import SHAPES, TrainingFrame
 
 
-def write(folder: Path, seed: int, frames: Iterable[Shown]) -> Path:
+def write(folder: Path, seed: int, frames: Iterable[TrainingFrame]) -> Path:
     """Writes `town_<seed>.npz`: for each kind that occurs, the stacked arrays `<kind>_bgr` and `<kind>_code`."""
-    by_kind: dict[str, list[Shown]] = {}
+    by_kind: dict[str, list[TrainingFrame]] = {}
     for frame in frames:
         by_kind.setdefault(frame.kind, []).append(frame)
     arrays = {}
@@ -31,14 +31,14 @@ def path_of(folder: Path, seed: int) -> Path:
     return folder / f"town_{seed}.npz"
 
 
-def read(path: Path) -> list[Shown]:
+def read(path: Path) -> list[TrainingFrame]:
     """The frames of one file."""
     frames = []
     with np.load(path) as arrays:
         for kind in SHAPES:
             if f"{kind}_bgr" in arrays:
                 pairs = zip(arrays[f"{kind}_bgr"], arrays[f"{kind}_code"], strict=True)
-                frames += [Shown(kind, bgr, code) for bgr, code in pairs]
+                frames += [TrainingFrame(kind, bgr, code) for bgr, code in pairs]
     return frames
 
 

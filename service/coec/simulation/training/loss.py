@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 GRADIENT_WEIGHT, RANK_WEIGHT = 0.5, 0.5
-SCALES = 4
+GRADIENT_SCALES = 4
 """Scales of the gradient term, each half the size of the one before."""
 PAIRS = 4096
 """Random pairs of pixels per picture whose order is compared; half of them are neighbours."""
@@ -30,11 +30,13 @@ def loss(output: Tensor, target: Tensor, generator: torch.Generator) -> Tensor:
         target: (B, H, W), NaN where unknown.
     """
     known = torch.isfinite(target)
-    wanted = torch.where(known, target, torch.zeros_like(target))
-    a, b = output, _normalised(wanted, known)
-    apart = torch.where(known, a - b, torch.zeros_like(a))
-    shape = apart.abs().sum() / known.sum().clamp(min=1)
-    return shape + GRADIENT_WEIGHT * _gradients(apart, known) + RANK_WEIGHT * _order(a, wanted, known, generator)
+    known_target = torch.where(known, target, torch.zeros_like(target))
+    a, b = output, _normalised(known_target, known)
+    residual = torch.where(known, a - b, torch.zeros_like(a))
+    shape = residual.abs().sum() / known.sum().clamp(min=1)
+    return (
+        shape + GRADIENT_WEIGHT * _gradients(residual, known) + RANK_WEIGHT * _order(a, known_target, known, generator)
+    )
 
 
 def _normalised(x: Tensor, known: Tensor) -> Tensor:
@@ -48,27 +50,27 @@ def _normalised(x: Tensor, known: Tensor) -> Tensor:
     return ((flat - middle) / spread).view_as(x)
 
 
-def _gradients(apart: Tensor, known: Tensor) -> Tensor:
-    total = apart.new_zeros(())
-    for scale in range(SCALES):
+def _gradients(residual: Tensor, known: Tensor) -> Tensor:
+    total = residual.new_zeros(())
+    for scale in range(GRADIENT_SCALES):
         step = 2**scale
-        a, m = apart[:, ::step, ::step], known[:, ::step, ::step]
+        a, m = residual[:, ::step, ::step], known[:, ::step, ::step]
         for dim in (1, 2):
             n = a.shape[dim] - 1
             both = m.narrow(dim, 0, n) & m.narrow(dim, 1, n)
             change = (a.narrow(dim, 1, n) - a.narrow(dim, 0, n)).abs()
             total = total + (change * both).sum() / both.sum().clamp(min=1)
-    return total / SCALES
+    return total / GRADIENT_SCALES
 
 
-def _order(output: Tensor, wanted: Tensor, known: Tensor, generator: torch.Generator) -> Tensor:
-    flat, goal, mask = output.flatten(1), wanted.flatten(1), known.flatten(1)
+def _order(output: Tensor, target: Tensor, known: Tensor, generator: torch.Generator) -> Tensor:
+    flat, goal, mask = output.flatten(1), target.flatten(1), known.flatten(1)
     first, second = torch.randint(flat.shape[1], (2, PAIRS), generator=generator)
     down, right = torch.randint(-REACH_PX, REACH_PX + 1, (2, PAIRS // 2), generator=generator)
     second[: PAIRS // 2] = (first[: PAIRS // 2] + down * output.shape[2] + right) % flat.shape[1]
     difference = goal[:, first] - goal[:, second]
     larger = torch.maximum(goal[:, first], goal[:, second])
-    told = mask[:, first] & mask[:, second] & (difference.abs() > SAME * larger)
+    ordered = mask[:, first] & mask[:, second] & (difference.abs() > SAME * larger)
     # Scaled so that the term stops pulling once a pair is well apart.
     wrong = functional.softplus(-4.0 * difference.sign() * (flat[:, first] - flat[:, second]))
-    return (wrong * told).sum() / told.sum().clamp(min=1)
+    return (wrong * ordered).sum() / ordered.sum().clamp(min=1)

@@ -81,13 +81,13 @@ class StreetNet(nn.Module):
     def forward(self, rgb: Tensor) -> Tensor:
         """See the class."""
         x = (rgb - self.mean) / self.std
-        kept = []
+        skips = []
         for stage in self.down:
             x = stage(x)
-            kept.append(x)
-        x = self.context(kept.pop())
+            skips.append(x)
+        x = self.context(skips.pop())
         for level in reversed(range(len(UP))):
             x = self.below[level](x)
             x = functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-            x = self.up[level](functional.relu(x + self.across[level](kept[level])))
+            x = self.up[level](functional.relu(x + self.across[level](skips[level])))
         return functional.interpolate(self.head(x), scale_factor=2.0, mode="bilinear", align_corners=False)

@@ -19,9 +19,9 @@ from coec.simulation.mesh import Material, Mesh, box, join, quads
 from coec.simulation.props import car
 from coec.simulation.road import Road, build_road
 from coec.simulation.scene import Scene, Town
-from coec.simulation.sky import draw_sky
+from coec.simulation.sky import sample_sky
 
-Doubles = NDArray[np.float64]
+DoublesOfScenes = NDArray[np.float64]
 
 PLACES = 3
 """Places of each seed."""
@@ -32,40 +32,40 @@ LANE_M = 3.2
 WALLS = (Material.PAINT, Material.BRICK, Material.PLASTER, Material.CONCRETE, Material.TILES)
 
 
-class Place(Protocol):
+class TrainingScene(Protocol):
     """Somewhere to take pictures. Its methods must be called in this order, because they draw random numbers."""
 
-    def draw_spot(self, rng: np.random.Generator) -> float:
+    def sample_spot(self, rng: np.random.Generator) -> float:
         """A random spot along the place, metres."""
 
     def stand(self, spot_m: float, rng: np.random.Generator) -> Matrix4:
         """T_world_ego (4, 4) of a vehicle there."""
 
-    def draw_scene(self, rng: np.random.Generator) -> Scene:
+    def sample_scene(self, rng: np.random.Generator) -> Scene:
         """The surroundings."""
 
 
-def places(seed: int) -> Iterator[tuple[Place, np.random.Generator]]:
+def training_scenes(seed: int) -> Iterator[tuple[TrainingScene, np.random.Generator]]:
     """The places of a seed, each with the generator of its frames."""
     town = Town(seed, TOWN_M)
     for number in range(PLACES):
         rng = np.random.default_rng([seed, 140, number])
         if seed < CROWDED:
-            yield Street(town, rng.uniform(0.0, TOWN_M)), rng
+            yield StreetScene(town, rng.uniform(0.0, TOWN_M)), rng
         elif number % 2 == seed % 2:
-            yield Hall(rng), rng
+            yield HallScene(rng), rng
         else:
-            yield Jam(town, rng.uniform(0.0, TOWN_M), rng), rng
+            yield JamScene(town, rng.uniform(0.0, TOWN_M), rng), rng
 
 
-class Street:
+class StreetScene:
     """A street of a town."""
 
     def __init__(self, town: Town, at_m: float) -> None:
         self._town = town
         self._at_m = at_m
 
-    def draw_spot(self, rng: np.random.Generator) -> float:
+    def sample_spot(self, rng: np.random.Generator) -> float:
         """See `Place`."""
         return self._at_m + rng.uniform(-20, 20)
 
@@ -76,12 +76,12 @@ class Street:
             left_m = rng.uniform(-6, 6)
         return _ego(self._town.road, spot_m, left_m, rng)
 
-    def draw_scene(self, rng: np.random.Generator) -> Scene:
+    def sample_scene(self, rng: np.random.Generator) -> Scene:
         """See `Place`: with the traffic of some time."""
         return self._town.scene(self._at_m, float(rng.uniform(0, 60)))
 
 
-class Jam:
+class JamScene:
     """A street full of cars and lorries, at times under a bridge."""
 
     def __init__(self, town: Town, at_m: float, rng: np.random.Generator) -> None:
@@ -100,7 +100,7 @@ class Jam:
             parts.append(self._on_road(_bridge(rng), rng.uniform(-6, 30), 0.0, street.origin_m))
         self._scene = Scene(town.road, street.sky, street.origin_m, join(parts), [])
 
-    def draw_spot(self, rng: np.random.Generator) -> float:
+    def sample_spot(self, rng: np.random.Generator) -> float:
         """See `Place`."""
         return self._at_m + rng.uniform(-2, 2)
 
@@ -108,17 +108,17 @@ class Jam:
         """See `Place`."""
         return _ego(self._road, spot_m, self._left_m + rng.normal(0, 0.25), rng)
 
-    def draw_scene(self, rng: np.random.Generator) -> Scene:  # noqa: ARG002 - as Place's
+    def sample_scene(self, rng: np.random.Generator) -> Scene:  # noqa: ARG002 - as Place's
         """See `Place`."""
         return self._scene
 
-    def _on_road(self, mesh: Mesh, ahead_m: float, left_m: float, origin_m: Doubles) -> Mesh:
+    def _on_road(self, mesh: Mesh, ahead_m: float, left_m: float, origin_m: DoublesOfScenes) -> Mesh:
         s = self._at_m + ahead_m
         x, y, z = self._road.points(s, left_m, 0.0) - origin_m
         return mesh.placed(x, y, z, float(self._road.at(s)[3]))
 
 
-class Hall:
+class HallScene:
     """A closed hall with pillars, cars, doors and boxes."""
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -151,9 +151,9 @@ class Hall:
                 _block(x, y, rng.uniform(0.1, 3.0, 2), low_m, height_m - 0.01, rng, 3.0 * (rng.random() < 0.5))
             )
         road = build_road(0, -60.0, 60.0)
-        self._scene = Scene(road, draw_sky(int(rng.integers(2**31))), np.zeros(3), join(parts), [])
+        self._scene = Scene(road, sample_sky(int(rng.integers(2**31))), np.zeros(3), join(parts), [])
 
-    def draw_spot(self, rng: np.random.Generator) -> float:
+    def sample_spot(self, rng: np.random.Generator) -> float:
         """See `Place`."""
         return rng.uniform(-0.4, 0.4) * self._length_m
 
@@ -161,7 +161,7 @@ class Hall:
         """See `Place`."""
         return _upright([spot_m, rng.uniform(-0.35, 0.35) * self._width_m, 0.0], rng.uniform(-np.pi, np.pi))
 
-    def draw_scene(self, rng: np.random.Generator) -> Scene:  # noqa: ARG002 - as Place's
+    def sample_scene(self, rng: np.random.Generator) -> Scene:  # noqa: ARG002 - as Place's
         """See `Place`."""
         return self._scene
 
@@ -171,7 +171,7 @@ def _ego(road: Road, at_m: float, left_m: float, rng: np.random.Generator) -> Ma
     return _upright(road.points(at_m, left_m, 0.0), heading)
 
 
-def _upright(position_m: Doubles | list[float], heading_rad: float) -> Matrix4:
+def _upright(position_m: DoublesOfScenes | list[float], heading_rad: float) -> Matrix4:
     pose = np.eye(4)
     pose[:3, :3] = rotation_exp(np.array([0.0, 0.0, heading_rad]))
     pose[:3, 3] = position_m
@@ -205,7 +205,7 @@ def _bridge(rng: np.random.Generator) -> Mesh:
     return join([deck, quads([under], colour, Material.CONCRETE), *pillars])
 
 
-def _doors(a: Doubles, b: Doubles, height_m: float, rng: np.random.Generator) -> list[Mesh]:
+def _doors(a: DoublesOfScenes, b: DoublesOfScenes, height_m: float, rng: np.random.Generator) -> list[Mesh]:
     """Gates and doors, some ribbed, 5 cm in front of a wall from a to b (2,)."""
     inward = -(a + b) / 2
     inward /= np.linalg.norm(inward)
@@ -224,7 +224,13 @@ def _doors(a: Doubles, b: Doubles, height_m: float, rng: np.random.Generator) ->
 
 
 def _block(
-    x_m: float, y_m: float, half_m: Doubles, low_m: float, high_m: float, rng: np.random.Generator, glow: float = 0.0
+    x_m: float,
+    y_m: float,
+    half_m: DoublesOfScenes,
+    low_m: float,
+    high_m: float,
+    rng: np.random.Generator,
+    glow: float = 0.0,
 ) -> Mesh:
     """A box with an underside; `glow` is added to its reflectance: a lamp."""
     colour = rng.uniform(0.03, 0.9, 3) + glow

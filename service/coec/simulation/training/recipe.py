@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import Camera, build
 from coec.geometry.se3 import rotation_exp
-from coec.simulation.exposure import Lens, dirt_cover, expose
+from coec.simulation.exposure import LensProperties, dirt_cover, expose
 from coec.simulation.mesh import Floats
 from coec.simulation.render import pixel_rays, render_radiance
 from coec.simulation.scene import Scene, Solid
-from coec.simulation.sky import draw_sky
-from coec.simulation.training.places import Place, places
-from coec.simulation.training.shown import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, Shown
+from coec.simulation.sky import sample_sky
+from coec.simulation.training.places import TrainingScene, training_scenes
+from coec.simulation.training.shown import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, TrainingFrame
 from coec.simulation.vehicle import P_EGO_CAMERA_M, body
 
 Doubles = NDArray[np.float64]
@@ -46,15 +46,15 @@ class Eye:
     half_view_rad: float
 
 
-def frames(seed: int) -> Iterator[Shown]:
+def frames(seed: int) -> Iterator[TrainingFrame]:
     """The frames of the places of a seed, `FRAMES_PER_PLACE` of each."""
     own = Solid(body())
-    for place, rng in places(seed):
+    for place, rng in training_scenes(seed):
         for _ in range(FRAMES_PER_PLACE):
             yield _frame(place, own, rng)
 
 
-def draw_eye(kind: str, rng: np.random.Generator) -> Eye:
+def sample_camera(kind: str, rng: np.random.Generator) -> Eye:
     """A random camera of a kind."""
     height, width = SHAPES[kind]
     cx, cy = (width - 1) / 2 + rng.normal(0, 0.015) * width, (height - 1) / 2 + rng.normal(0, 0.03) * height
@@ -73,9 +73,9 @@ def draw_eye(kind: str, rng: np.random.Generator) -> Eye:
     return Eye(build("pinhole", fx=focal, fy=focal, **size), np.pi)
 
 
-def draw_lens(rng: np.random.Generator) -> Lens:
+def sample_lens(rng: np.random.Generator) -> LensProperties:
     """Random properties of a lens, from a clean picture to a poor one."""
-    return Lens(
+    return LensProperties(
         blur_px=float(rng.uniform(0.25, 1.1)),
         vignetting=float(rng.uniform(0.0, 0.45)),
         full_well=float(10 ** rng.uniform(2.7, 4.2)),
@@ -85,15 +85,15 @@ def draw_lens(rng: np.random.Generator) -> Lens:
     )
 
 
-def _frame(place: Place, own: Solid, rng: np.random.Generator) -> Shown:
+def _frame(place: TrainingScene, own: Solid, rng: np.random.Generator) -> TrainingFrame:
     while True:
         kind = str(rng.choice([name for name, _ in KINDS], p=[share for _, share in KINDS]))
-        eye = draw_eye(kind, rng)
+        eye = sample_camera(kind, rng)
         with_body = rng.random() < 0.3
-        spot_m = place.draw_spot(rng)
+        spot_m = place.sample_spot(rng)
         T_ego_camera = _mount(with_body, rng)
         pose = np.einsum("ij,jk->ik", place.stand(spot_m, rng), T_ego_camera)
-        scene = place.draw_scene(rng)
+        scene = place.sample_scene(rng)
         _repaint(scene, rng)
         radiance = render_radiance(scene, eye.camera, pose, half_view_rad=eye.half_view_rad, smooth_edges=False)
         near = float(np.mean(radiance.range_m < TOO_NEAR_M))
@@ -103,7 +103,7 @@ def _frame(place: Place, own: Solid, rng: np.random.Generator) -> Shown:
         seen, hidden = _seen(eye, own if with_body else None, T_ego_camera)
         paint = np.array(scene.sky.horizon, np.float32) * np.exp(rng.uniform(-4, -0.5, 3)).astype(np.float32)
         radiance.linear[hidden] = paint
-        return Shown(kind, _photograph(radiance.linear, seen, rng), _code(radiance.range_m, seen & ~hidden))
+        return TrainingFrame(kind, _photograph(radiance.linear, seen, rng), _code(radiance.range_m, seen & ~hidden))
 
 
 def _mount(with_body: bool, rng: np.random.Generator) -> Matrix4:
@@ -124,7 +124,7 @@ def _mount(with_body: bool, rng: np.random.Generator) -> Matrix4:
 
 def _repaint(scene: Scene, rng: np.random.Generator) -> None:
     """Gives a scene new weather and colours; colours change from those of the frame before if the scene is the same."""
-    scene.sky = draw_sky(int(rng.integers(2**31)))
+    scene.sky = sample_sky(int(rng.integers(2**31)))
     colour = scene.colour
     if rng.random() < 0.5:  # all surfaces alike: lighter, darker, another tint
         colour = colour ** np.float32(rng.uniform(0.5, 1.6)) * np.exp(rng.normal(0, 0.2, 3)).astype(np.float32)
@@ -149,7 +149,7 @@ def _seen(eye: Eye, own: Solid | None, T_ego_camera: Matrix4) -> tuple[NDArray[n
 
 
 def _photograph(linear: Floats, seen: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.uint8]:
-    lens = draw_lens(rng)
+    lens = sample_lens(rng)
     dirt = None
     if rng.random() < 0.1:
         dirt = dirt_cover((seen.shape[0], seen.shape[1]), float(rng.uniform(0.02, 0.15)), int(rng.integers(2**31)))

@@ -17,7 +17,7 @@ UNKNOWN, SKY = 0, 1
 """Codes of pixels without a target (own body, outside the lens) and of the sky."""
 
 
-class Shown(NamedTuple):
+class TrainingFrame(NamedTuple):
     """A frame to learn from.
 
     Attributes:

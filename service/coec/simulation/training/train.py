@@ -14,7 +14,7 @@ from coec.simulation.training import files
 from coec.simulation.training.augment import augment
 from coec.simulation.training.loss import loss
 from coec.simulation.training.network import StreetNet
-from coec.simulation.training.shown import SHAPES, Shown
+from coec.simulation.training.shown import SHAPES, TrainingFrame
 
 logger = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ AVERAGE = 0.995
 """Share of the averaged weights that is kept at each step (Polyak)."""
 CLIP = 1.0
 """Largest norm of a gradient."""
-SCALES = (0.84, 1.0, 1.2)
+SIZE_FACTORS = (0.84, 1.0, 1.2)
 """Factors on the sizes in `SHAPES`, drawn for each batch; the sizes are rounded to multiples of 32."""
 SHARES = {"round": 0.3, "wide": 0.3, "panorama": 0.4}
 """How often each kind is shown; strips most often, because they are the hardest."""
@@ -39,7 +39,7 @@ class Shelf:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._read: set[Path] = set()
-        self.frames: dict[str, list[Shown]] = {kind: [] for kind in SHAPES}
+        self.frames: dict[str, list[TrainingFrame]] = {kind: [] for kind in SHAPES}
 
     def refresh(self) -> int:
         """Reads the files that have come since the last call; returns the number of all frames."""
@@ -53,7 +53,7 @@ class Shelf:
     def batch(self, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """A random batch: RGB (B, 3, H, W) and target (B, H, W)."""
         kind = str(rng.choice(list(SHARES), p=list(SHARES.values())))
-        scale = rng.choice(SCALES)
+        scale = rng.choice(SIZE_FACTORS)
         height, width = (max(32, 32 * round(scale * side / 32)) for side in SHAPES[kind])
         shown = self.frames[kind]
         pairs = [augment(shown[int(rng.integers(len(shown)))], height, width, rng) for _ in range(BATCH)]
@@ -80,7 +80,7 @@ def train(folder: Path, checkpoint: Path, steps: int, seed: int, threads: int) -
         begin = saved["step"]
     shelf = Shelf(folder)
     network.train()
-    told: list[float] = []
+    losses: list[float] = []
     since = time.perf_counter()
     for step in range(begin, steps):
         if step % SAVE_STEPS == 0 or step == begin:
@@ -96,11 +96,13 @@ def train(folder: Path, checkpoint: Path, steps: int, seed: int, threads: int) -
         torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP)
         optimiser.step()
         _follow(average, network, min(AVERAGE, (1 + step) / (10 + step)))
-        told.append(float(blame.detach()))
+        losses.append(float(blame.detach()))
         if (step + 1) % SAVE_STEPS == 0 or step + 1 == steps:
             lasted_s = time.perf_counter() - since
-            logger.info("step %d of %d, %d frames, loss %.4f, %.0f s", step + 1, steps, count, np.mean(told), lasted_s)
-            told, since = [], time.perf_counter()
+            logger.info(
+                "step %d of %d, %d frames, loss %.4f, %.0f s", step + 1, steps, count, np.mean(losses), lasted_s
+            )
+            losses, since = [], time.perf_counter()
             _save(checkpoint, step + 1, network, average, optimiser)
 
 

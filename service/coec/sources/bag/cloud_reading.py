@@ -13,7 +13,7 @@ from coec.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)
-class Clouds:
+class CloudDecoder:
     """How the clouds of a bag are read.
 
     Attributes:
@@ -25,7 +25,7 @@ class Clouds:
     source: int | None = None
 
     @classmethod
-    def asked(cls, time: str | None, source: str | None) -> Clouds:
+    def from_query(cls, time: str | None, source: str | None) -> CloudDecoder:
         """From the values of a query: `time` is `FIELD,UNIT[,BASE]`, `source` a whole number.
 
         Raises:
@@ -42,7 +42,7 @@ class Clouds:
         except ValueError:
             raise UsageError(f"lidar_source={source}: it is a whole number, as in the points' field") from None
 
-    def decoded(self, type_name: str, data: bytes) -> CameraFrame | LidarFrame | EgoMotion:
+    def decode(self, type_name: str, data: bytes) -> CameraFrame | LidarFrame | EgoMotion:
         """The frame in a message of this type.
 
         Raises:

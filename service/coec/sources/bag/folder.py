@@ -23,17 +23,17 @@ from coec.config import describe, load_yaml
 from coec.errors import ConfigError, SourceError
 from coec.sources.bag.mcap_storage import McapStorage
 from coec.sources.bag.sqlite_storage import SqliteStorage
-from coec.sources.bag.storage import Entry, Reader, Storage
+from coec.sources.bag.storage import BagMessage, BagReader, BagStorage
 
 METADATA = "metadata.yaml"
 
 MAX_FILES = 10_000
 """Most files of one bag: a day in files of ten seconds."""
 
-MAX_MESSAGE_BYTES = 256 * 2**20
+MAX_UNPACKED_MESSAGE_BYTES = 256 * 2**20
 """Largest unpacked size of one packed message, bytes; the same as for MCAP's chunks."""
 
-KEPT_FREE_BYTES = 2**30
+MIN_FREE_BYTES = 2**30
 """Bytes that stay free on the disk of temporary files. A packed file that would leave less is refused."""
 
 _COPY_BYTES = 2**20
@@ -59,13 +59,13 @@ class FolderStorage:
     """
 
     path: Path
-    files: tuple[Storage, ...]
+    files: tuple[BagStorage, ...]
     packed_messages: bool
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[BagMessage]:
         """See `Storage`."""
         for number, file in enumerate(self.files):
-            left = MAX_MESSAGE_BYTES
+            left = MAX_UNPACKED_MESSAGE_BYTES
             for entry in file.entries():
                 data = self.plain(entry.data)
                 left += MAX_RATIO * len(entry.data) - len(data)
@@ -74,7 +74,7 @@ class FolderStorage:
                 yield replace(entry, data=data, place=(number, *entry.place))
 
     @contextmanager
-    def open(self) -> Iterator[Reader]:
+    def open(self) -> Iterator[BagReader]:
         """See `Storage`."""
         with ExitStack() as opened:
             yield _FolderReader(self, opened, {})
@@ -84,12 +84,12 @@ class FolderStorage:
         if not self.packed_messages:
             return data
         try:
-            if zstandard.get_frame_parameters(data).content_size > MAX_MESSAGE_BYTES:
+            if zstandard.get_frame_parameters(data).content_size > MAX_UNPACKED_MESSAGE_BYTES:
                 raise SourceError(
-                    f"{self.path}: a message does not state that it unpacks to at most {MAX_MESSAGE_BYTES} bytes"
+                    f"{self.path}: a message does not state that it unpacks to at most {MAX_UNPACKED_MESSAGE_BYTES} bytes"
                 )
             unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
-            return unpacker.decompress(data, max_output_size=MAX_MESSAGE_BYTES)
+            return unpacker.decompress(data, max_output_size=MAX_UNPACKED_MESSAGE_BYTES)
         except zstandard.ZstdError as error:
             raise SourceError(f"{self.path} is damaged: a message is no zstd frame: {error}") from error
 
@@ -100,7 +100,7 @@ class _FolderReader:
 
     folder: FolderStorage
     opened: ExitStack
-    current: dict[int, Reader]
+    current: dict[int, BagReader]
 
     def read(self, place: tuple[int, ...]) -> bytes:
         """See `Reader`."""
@@ -141,7 +141,7 @@ def open_folder(path: Path) -> FolderStorage:
     return storage
 
 
-def _files(path: Path, information: BagInformation, names: Sequence[Path]) -> tuple[Storage, ...]:
+def _files(path: Path, information: BagInformation, names: Sequence[Path]) -> tuple[BagStorage, ...]:
     for name in names:
         if not name.is_file():
             raise SourceError(f"{path} lacks {name.name}, which its {METADATA} names")
@@ -170,12 +170,12 @@ def _unpacked(file: Path, folder: Path) -> Path:
     unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
     try:
         with file.open("rb") as packed, target.open("wb") as plain:
-            left = MAX_MESSAGE_BYTES + MAX_RATIO * file.stat().st_size
+            left = MAX_UNPACKED_MESSAGE_BYTES + MAX_RATIO * file.stat().st_size
             for block in unpacker.read_to_iter(packed, write_size=_COPY_BYTES):
                 left -= len(block)
                 if left < 0:
                     raise SourceError(f"{file} unpacks to more than {MAX_RATIO} times its size")
-                if shutil.disk_usage(folder).free < KEPT_FREE_BYTES:
+                if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
                     raise SourceError(f"{file} unpacks to more than {folder.parent} has room for")
                 plain.write(block)
     except FileNotFoundError as error:

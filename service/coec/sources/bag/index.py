@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TypeVar
 
 from coec.adapters.ros import messages
-from coec.adapters.ros.camera_info import Info, decode_info
-from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
+from coec.adapters.ros.camera_info import CameraInfoContent, decode_info
+from coec.adapters.ros.static_transforms import StaticTransforms, decode_static_transforms
 from coec.calibration.types import Matrix4
 from coec.errors import DecodeError, SourceError
 from coec.schemas.ros_names import TF_STATIC
-from coec.sources.bag.cloud_reading import Clouds
-from coec.sources.bag.storage import Entry, Storage
+from coec.sources.bag.cloud_reading import CloudDecoder
+from coec.sources.bag.storage import BagMessage, BagStorage
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
 CLOUD_TYPES = (messages.POINT_CLOUD,)
@@ -33,7 +33,7 @@ _HEADER = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Place:
+class MessageLocation:
     """Where a message lies. Places are ordered by the stamp of the header; equal stamps by the order in the bag."""
 
     stamp_ns: int
@@ -42,19 +42,19 @@ class Place:
 
 
 @dataclass(slots=True)
-class Stream:
+class TopicStream:
     """The frames of a topic."""
 
     type_name: str
-    places: list[Place] = field(default_factory=list)
+    locations: list[MessageLocation] = field(default_factory=list)
 
-    def ordered(self) -> list[Place]:
+    def ordered(self) -> list[MessageLocation]:
         """The places in the order of their stamps."""
-        return sorted(self.places)
+        return sorted(self.locations)
 
 
 @dataclass(slots=True)
-class Index:
+class BagIndex:
     """One pass over a bag.
 
     Attributes:
@@ -66,36 +66,38 @@ class Index:
     """
 
     path: Path
-    clouds: Clouds
-    streams: dict[str, Stream] = field(default_factory=dict)
-    infos: dict[str, Info] = field(default_factory=dict)
+    clouds: CloudDecoder
+    streams: dict[str, TopicStream] = field(default_factory=dict)
+    infos: dict[str, CameraInfoContent] = field(default_factory=dict)
     transforms: StaticTransforms = field(default_factory=StaticTransforms)
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
 
-    def topic(self, types: tuple[str, ...], asked: str | None, key: str) -> str:
+    def topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str:
         """The topic of these types that was asked for, else the only one.
 
         Raises:
             SourceError: there is no such topic, or there are several and none was asked for.
         """
-        found = self.optional_topic(types, asked, key)
-        if found is None:
+        topic = self.optional_topic(types, requested, key)
+        if topic is None:
             raise SourceError(f"{self.path} has no message of type {' or '.join(types)}")
-        return found
+        return topic
 
-    def optional_topic(self, types: tuple[str, ...], asked: str | None, key: str) -> str | None:
+    def optional_topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str | None:
         """As `topic`, but None if the bag has none and none was asked for."""
         there = [topic for topic, stream in self.streams.items() if stream.type_name in types]
-        if asked is not None:
-            if asked not in there:
-                raise SourceError(f"{self.path} has no topic {asked} for {key}; there: {', '.join(there) or 'none'}")
-            return asked
+        if requested is not None:
+            if requested not in there:
+                raise SourceError(
+                    f"{self.path} has no topic {requested} for {key}; there: {', '.join(there) or 'none'}"
+                )
+            return requested
         if len(there) > 1:
-            told = ", ".join(
-                f"{topic} ({self.streams[topic].type_name}, {len(self.streams[topic].places)} messages)"
+            candidates = ", ".join(
+                f"{topic} ({self.streams[topic].type_name}, {len(self.streams[topic].locations)} messages)"
                 for topic in there
             )
-            raise SourceError(f"{self.path} has several topics for {key}, choose one with ?{key}=...: {told}")
+            raise SourceError(f"{self.path} has several topics for {key}, choose one with ?{key}=...: {candidates}")
         return there[0] if there else None
 
     def transform(self, target: str, source: str) -> Matrix4 | None:
@@ -109,7 +111,7 @@ class Index:
             raise SourceError(f"{self.path}: /tf_static is no tree: {'; '.join(doubts)}")
         return self.transforms.transform(target, source)
 
-    def take(self, entry: Entry) -> None:
+    def add(self, entry: BagMessage) -> None:
         """Notes a message.
 
         Raises:
@@ -117,44 +119,44 @@ class Index:
         """
         name = entry.type_name
         if name in (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES):
-            stream = self.streams.setdefault(entry.topic, Stream(name))
+            stream = self.streams.setdefault(entry.topic, TopicStream(name))
             stamp_ns = _header_stamp_ns(entry.data)
             if stamp_ns is None:
                 raise SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
             if stamp_ns == 0 and name in CLOUD_TYPES:
                 stamp_ns = self._stamp_of_points(entry)
-            stream.places.append(Place(stamp_ns, entry.place, name))
+            stream.locations.append(MessageLocation(stamp_ns, entry.place, name))
         elif name == messages.CAMERA_INFO and entry.topic not in self.infos:
             self.infos[entry.topic] = self._decoded(entry, decode_info)
         elif name == messages.TF and entry.topic == TF_STATIC:
-            self._decoded(entry, lambda data: self.transforms.take(decode_joints(data)))
+            self._decoded(entry, lambda data: self.transforms.add(decode_static_transforms(data)))
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
 
-    def _stamp_of_points(self, entry: Entry) -> int:
+    def _stamp_of_points(self, entry: BagMessage) -> int:
         """Stamp of a cloud without one, from its points; 0 if they give none. If the cloud cannot be decoded, that is
         reported when it is used."""
         try:
-            return self.clouds.decoded(entry.type_name, entry.data).stamp_ns
+            return self.clouds.decode(entry.type_name, entry.data).stamp_ns
         except DecodeError:
             return 0
 
-    def _decoded(self, entry: Entry, decode: Callable[[bytes], T]) -> T:
+    def _decoded(self, entry: BagMessage, decode: Callable[[bytes], T]) -> T:
         try:
             return decode(entry.data)
         except DecodeError as error:
             raise SourceError(f"{self.path}: a {entry.type_name} on {entry.topic} is refused: {error}") from error
 
 
-def index_of(storage: Storage, clouds: Clouds) -> Index:
+def build_index(storage: BagStorage, clouds: CloudDecoder) -> BagIndex:
     """Makes the index of a bag whose clouds are read by `clouds`.
 
     Raises:
         SourceError: a file is absent, cut off or damaged, or a message is not what its topic says.
     """
-    index = Index(storage.path, clouds)
+    index = BagIndex(storage.path, clouds)
     for entry in storage.entries():
-        index.take(entry)
+        index.add(entry)
     return index
 
 

@@ -11,16 +11,16 @@ from coec.adapters.mcap.files import (
     MAX_CHUNK_BYTES,
     MAX_RATIO,
     Channel,
-    McapDamaged,
-    Message,
+    McapDamagedError,
+    McapMessage,
     MessageReader,
     Schema,
     read_records,
 )
 from coec.errors import SourceError
-from coec.sources.bag.storage import Entry, Reader
+from coec.sources.bag.storage import BagMessage, BagReader
 
-_OUTSIDE_CHUNKS = -1
+_NO_CHUNK = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class McapStorage:
 
     path: Path
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[BagMessage]:
         """See `Storage`."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
@@ -43,18 +43,18 @@ class McapStorage:
                             schemas[record.schema_id] = record
                         case Channel():
                             channels[record.channel_id] = record
-                        case Message():
+                        case McapMessage():
                             channel = channels.get(record.channel_id)
                             schema = None if channel is None else schemas.get(channel.schema_id)
                             if channel is not None and schema is not None and channel.message_encoding == "cdr":
                                 yield _entry(channel.topic, schema.name, record)
         except OSError as error:
             raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
-        except McapDamaged as error:
+        except McapDamagedError as error:
             raise SourceError(error.of(self.path)) from error
 
     @contextmanager
-    def open(self) -> Iterator[Reader]:
+    def open(self) -> Iterator[BagReader]:
         """See `Storage`."""
         with self.path.open("rb") as stream:
             yield _McapReader(self.path, MessageReader(stream))
@@ -69,12 +69,12 @@ class _McapReader:
         """See `Reader`."""
         chunk_at, at, length = place
         try:
-            return self.reader.read(None if chunk_at == _OUTSIDE_CHUNKS else chunk_at, at, length)
-        except McapDamaged as error:
+            return self.reader.read(None if chunk_at == _NO_CHUNK else chunk_at, at, length)
+        except McapDamagedError as error:
             raise SourceError(f"{self.path}: {error}") from error
 
 
-def _entry(topic: str, type_name: str, message: Message) -> Entry:
-    chunk_at = _OUTSIDE_CHUNKS if message.chunk_at is None else message.chunk_at
+def _entry(topic: str, type_name: str, message: McapMessage) -> BagMessage:
+    chunk_at = _NO_CHUNK if message.chunk_at is None else message.chunk_at
     place = (chunk_at, message.at, len(message.data))
-    return Entry(topic, type_name, message.data, message.log_time_ns, place)
+    return BagMessage(topic, type_name, message.data, message.log_time_ns, place)

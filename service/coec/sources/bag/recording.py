@@ -15,19 +15,19 @@ from coec.calibration.frames.origin import ApparentOrigin
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.sources.bag.cloud_reading import Clouds
-from coec.sources.bag.index import CLOUD_TYPES, IMAGE_TYPES, Index, Place, index_of
-from coec.sources.bag.motion import VEHICLE, motion_topic, moved_on
+from coec.sources.bag.cloud_reading import CloudDecoder
+from coec.sources.bag.index import CLOUD_TYPES, IMAGE_TYPES, BagIndex, MessageLocation, build_index
+from coec.sources.bag.motion import VEHICLE, motion_topic, motions_of_transforms
 from coec.sources.bag.rig import rig_of_bag
-from coec.sources.bag.storage import Reader, Storage, open_storage
+from coec.sources.bag.storage import BagReader, BagStorage, open_storage
 from coec.sources.clouds import measured_from
 from coec.sources.recording import (
     MOTION_REACH_NS,
     FramewiseRecording,
-    Message,
     RecordedFrame,
-    Recording,
-    chosen_indices,
+    RecordingSource,
+    SensorMessage,
+    selected_indices,
 )
 from coec.sources.spec import SourceSpec
 
@@ -42,7 +42,7 @@ _ADVICE = {
 }
 
 
-def open_bag(spec: SourceSpec) -> Recording:
+def open_bag(spec: SourceSpec) -> RecordingSource:
     """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]
     [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N]`.
 
@@ -67,9 +67,9 @@ def open_bag(spec: SourceSpec) -> Recording:
     query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame", "moving", "time", "lidar_source")
     if not query and spec.path.suffix == ".mcap" and is_window(spec.path):
         return _window_recording(spec.path)
-    clouds, frames = Clouds.asked(query.get("time"), query.get("lidar_source")), _frames(query.get("moving"))
+    clouds, frames = CloudDecoder.from_query(query.get("time"), query.get("lidar_source")), _frames(query.get("moving"))
     storage = open_storage(spec.path)
-    index = index_of(storage, clouds)
+    index = build_index(storage, clouds)
     camera_topic = index.topic(IMAGE_TYPES, query.get("camera"), "camera")
     lidar_topic = index.topic(CLOUD_TYPES, query.get("points"), "points")
     with storage.open() as reader:
@@ -106,20 +106,20 @@ def _window_recording(path: Path) -> FramewiseRecording:
 
 
 @dataclass(frozen=True, slots=True)
-class Streams:
+class PairStreams:
     """Places of a pair's messages, each ascending by stamp; `motion` may be empty.
 
     Attributes:
         moved: the motion itself, instead of `motion`, if it was taken from transforms; ascending by stamp.
     """
 
-    camera: list[Place]
-    lidar: list[Place]
-    motion: list[Place]
+    camera: list[MessageLocation]
+    lidar: list[MessageLocation]
+    motion: list[MessageLocation]
     moved: tuple[EgoMotion, ...] = ()
 
     @property
-    def motions(self) -> list[Place | EgoMotion]:
+    def motions(self) -> list[MessageLocation | EgoMotion]:
         """`motion` or `moved`, whichever is not empty."""
         return [*self.motion, *self.moved]
 
@@ -138,10 +138,10 @@ class BagRecording:
     name: str
     rig: Rig
     T_camera_lidar_start: Matrix4
-    storage: Storage
-    streams: Streams
+    storage: BagStorage
+    streams: PairStreams
     T_cloud_lidar: Matrix4
-    clouds: Clouds
+    clouds: CloudDecoder
     configuration: CalibrationConfig | None = None
 
     @property
@@ -159,17 +159,17 @@ class BagRecording:
         """See `Recording`."""
         return tuple(motion.stamp_ns for motion in self.streams.motions)
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
         """See `Recording.messages`. With chosen camera frames, only the sweep nearest to each of them comes."""
-        chosen = [self.streams.camera[index] for index in chosen_indices(cameras, len(self.streams.camera))]
+        selected = [self.streams.camera[index] for index in selected_indices(cameras, len(self.streams.camera))]
         sweeps = self.streams.lidar
         motions = self.streams.motions
         if cameras is not None:
-            sweeps = sorted({min(sweeps, key=lambda place: abs(place.stamp_ns - c.stamp_ns)) for c in chosen})
-            motions = [m for m in motions if any(abs(m.stamp_ns - c.stamp_ns) <= MOTION_REACH_NS for c in chosen)]
-        queue: list[tuple[int, int, int, Place | EgoMotion]] = [
+            sweeps = sorted({min(sweeps, key=lambda place: abs(place.stamp_ns - c.stamp_ns)) for c in selected})
+            motions = [m for m in motions if any(abs(m.stamp_ns - c.stamp_ns) <= MOTION_REACH_NS for c in selected)]
+        queue: list[tuple[int, int, int, MessageLocation | EgoMotion]] = [
             (item.stamp_ns, kind, number, item)
-            for kind, items in ((_EGO, motions), (_LIDAR, sweeps), (_CAMERA, chosen))
+            for kind, items in ((_EGO, motions), (_LIDAR, sweeps), (_CAMERA, selected))
             for number, item in enumerate(items)
         ]
         with self.storage.open() as reader:
@@ -185,22 +185,24 @@ class BagRecording:
 
 
 def _streams(
-    index: Index, reader: Reader, camera: str, lidar: str, motion: tuple[tuple[str, str], str | None]
-) -> Streams:
+    index: BagIndex, reader: BagReader, camera: str, lidar: str, motion: tuple[tuple[str, str], str | None]
+) -> PairStreams:
     """The streams of the pair. `motion`: the vehicle's frames, and the topic that was asked for."""
-    frames, asked = motion
-    found = motion_topic(index, reader, frames, asked)
-    places = index.streams[found].ordered() if found in index.streams else []
-    moved = moved_on(index, reader, found, frames) if found is not None and not places else ()
+    frames, requested = motion
+    motion_source = motion_topic(index, reader, frames, requested)
+    places = index.streams[motion_source].ordered() if motion_source in index.streams else []
+    moved = (
+        motions_of_transforms(index, reader, motion_source, frames) if motion_source is not None and not places else ()
+    )
     for topic in (camera, lidar):
         _require_stamps(index, topic)
-    return Streams(index.streams[camera].ordered(), index.streams[lidar].ordered(), places, moved)
+    return PairStreams(index.streams[camera].ordered(), index.streams[lidar].ordered(), places, moved)
 
 
-def _require_stamps(index: Index, topic: str) -> None:
+def _require_stamps(index: BagIndex, topic: str) -> None:
     """Raises SourceError if all messages of a topic have one stamp."""
-    stamps_ns = {place.stamp_ns for place in index.streams[topic].places}
-    count = len(index.streams[topic].places)
+    stamps_ns = {place.stamp_ns for place in index.streams[topic].locations}
+    count = len(index.streams[topic].locations)
     if count > 1 and len(stamps_ns) == 1:
         raise SourceError(
             f"{index.path}: all {count} messages on {topic} have the stamp {stamps_ns.pop()} ns in their header, so "
@@ -220,9 +222,9 @@ def _frames(text: str | None) -> tuple[str, str]:
     return parent, child
 
 
-def _load(storage: Storage, reader: Reader, place: Place, clouds: Clouds) -> Message:
+def _load(storage: BagStorage, reader: BagReader, place: MessageLocation, clouds: CloudDecoder) -> SensorMessage:
     data = reader.read(place.at)
     try:
-        return clouds.decoded(place.type_name, data)
+        return clouds.decode(place.type_name, data)
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error

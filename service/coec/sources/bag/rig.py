@@ -9,19 +9,26 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from coec.adapters.files.home import from_home
+from coec.adapters.files.home import expand_home
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
-from coec.adapters.ros.camera_info import Info, Lens, info_of_yaml, info_topic, is_rectified, lens_of
+from coec.adapters.ros.camera_info import (
+    CameraInfoContent,
+    CameraInfoIntrinsics,
+    info_of_yaml,
+    info_topic,
+    intrinsics_of_info,
+    is_rectified,
+)
 from coec.adapters.ros.transforms import bare
 from coec.calibration.types import CameraFrame, EgoMotion, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, SourceError
-from coec.sources.bag.index import Index
+from coec.sources.bag.index import BagIndex
 
 _PATH: TypeAdapter[Path] = TypeAdapter(FilePath)
 
 
-def with_camera_info(document: Any, path: Path, rectified: bool) -> Any:
+def with_ros_camera_info(document: Any, path: Path, rectified: bool) -> Any:
     """The document of a file with a `camera:`, in which that may be a `camera_info.yaml` of ROS: its content, or its
     path. The whole file may be one, too. Any other document is returned as it is.
 
@@ -41,13 +48,13 @@ def with_camera_info(document: Any, path: Path, rectified: bool) -> Any:
         info = info_of_yaml(camera)
         if info is None:
             return document
-        intrinsics = lens_of(info, rectified=rectified).intrinsics.model_dump(exclude_none=True)
+        intrinsics = intrinsics_of_info(info, rectified=rectified).intrinsics.model_dump(exclude_none=True)
     except SourceError as error:
         raise SourceError(f"{path}, a CameraInfo: {error}") from error
     return {"camera": intrinsics} if whole else {**document, "camera": intrinsics}
 
 
-class RigFile(BaseModel):
+class IntrinsicsFile(BaseModel):
     """`intrinsics=FILE`: the head of a `dataset.yaml`, for bags without camera info or without a transform."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -58,7 +65,7 @@ class RigFile(BaseModel):
 
 
 def rig_of_bag(
-    index: Index,
+    index: BagIndex,
     intrinsics: str | None,
     image_topic: str,
     image: CameraFrame,
@@ -80,8 +87,10 @@ def rig_of_bag(
             info = _info(index, intrinsics, camera_frame, image_topic)
             camera = camera_of(_lens(index, info, image_topic).intrinsics)
         else:
-            path = from_home(intrinsics)
-            document = RigFile.model_validate(with_camera_info(load_yaml(path), path, is_rectified(image_topic)))
+            path = expand_home(intrinsics)
+            document = IntrinsicsFile.model_validate(
+                with_ros_camera_info(load_yaml(path), path, is_rectified(image_topic))
+            )
             camera = camera_of(document.camera)
             if document.T_camera_lidar is not None:
                 T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
@@ -114,20 +123,20 @@ def rig_of_bag(
     )
 
 
-def _lens(index: Index, info: Info, image_topic: str) -> Lens:
+def _lens(index: BagIndex, info: CameraInfoContent, image_topic: str) -> CameraInfoIntrinsics:
     try:
-        return lens_of(info, rectified=is_rectified(image_topic))
+        return intrinsics_of_info(info, rectified=is_rectified(image_topic))
     except SourceError as error:
         raise SourceError(f"the camera info of {index.path}: {error}; give ?intrinsics=FILE") from error
 
 
-def _info(index: Index, asked: str | None, camera_frame: str, image_topic: str) -> Info:
+def _info(index: BagIndex, requested: str | None, camera_frame: str, image_topic: str) -> CameraInfoContent:
     """The camera info that was asked for, else the one beside the images, of the camera's frame, or the only one."""
-    if asked is not None:
-        return index.infos[asked]
-    beside = index.infos.get(info_topic(image_topic))
-    if beside is not None:
-        return beside
+    if requested is not None:
+        return index.infos[requested]
+    of_images = index.infos.get(info_topic(image_topic))
+    if of_images is not None:
+        return of_images
     matching = [info for info in index.infos.values() if bare(info.frame_id) == camera_frame]
     candidates = matching or list(index.infos.values())
     if len(candidates) != 1:

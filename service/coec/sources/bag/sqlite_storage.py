@@ -14,7 +14,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from coec.errors import SourceError
-from coec.sources.bag.storage import Entry, Reader
+from coec.sources.bag.storage import BagMessage, BagReader
 
 MAX_MESSAGE_BYTES = 256 * 2**20
 """Largest message, bytes; the same as for MCAP's chunks."""
@@ -37,7 +37,7 @@ class SqliteStorage:
 
     path: Path
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[BagMessage]:
         """See `Storage`."""
         with self._connected() as connection:
             topics = self._topics(connection)
@@ -55,10 +55,10 @@ class SqliteStorage:
                     raise SourceError(f"{self.path} is damaged: its messages are longer than the file")
                 topic, type_name, serialization = topics[topic_id]
                 if serialization == "cdr":
-                    yield Entry(topic, type_name, message, logged_ns, (row,))
+                    yield BagMessage(topic, type_name, message, logged_ns, (row,))
 
     @contextmanager
-    def open(self) -> Iterator[Reader]:
+    def open(self) -> Iterator[BagReader]:
         """See `Storage`."""
         with self._connected() as connection:
             yield _SqliteReader(self, connection)
@@ -77,10 +77,10 @@ class SqliteStorage:
 
     def read_from(self, connection: sqlite3.Connection, row: int) -> bytes:
         """The data of the message in a row."""
-        found = connection.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
-        if found is None:
+        row_data = connection.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
+        if row_data is None:
             raise SourceError(f"{self.path}: there is no message {row} any more: the file has changed")
-        return self._bytes(row, found[0])
+        return self._bytes(row, row_data[0])
 
     def _bytes(self, row: int, data: object) -> bytes:
         if not isinstance(data, bytes):
@@ -93,8 +93,8 @@ class SqliteStorage:
         beside it."""
         if not self.path.is_file():
             raise SourceError(f"{self.path} does not exist")
-        beside = self.path.with_name(f"{self.path.name}-wal")
-        mode = "mode=ro" if beside.exists() and beside.stat().st_size else "mode=ro&immutable=1"
+        write_ahead_log = self.path.with_name(f"{self.path.name}-wal")
+        mode = "mode=ro" if write_ahead_log.exists() and write_ahead_log.stat().st_size else "mode=ro&immutable=1"
         try:
             with closing(sqlite3.connect(f"file:{quote(str(self.path))}?{mode}", uri=True)) as connection:
                 connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)

@@ -12,7 +12,7 @@ from coec.errors import SourceError
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class BagMessage:
     """A message, and the place at which it can be read again.
 
     Attributes:
@@ -29,7 +29,7 @@ class Entry:
     place: tuple[int, ...]
 
 
-class Reader(Protocol):
+class BagReader(Protocol):
     """Reads messages again while the files are open."""
 
     def read(self, place: tuple[int, ...]) -> bytes:
@@ -41,7 +41,7 @@ class Reader(Protocol):
         ...
 
 
-class Storage(Protocol):
+class BagStorage(Protocol):
     """The messages of a bag.
 
     Attributes:
@@ -53,7 +53,7 @@ class Storage(Protocol):
         """See above."""
         ...
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[BagMessage]:
         """All CDR messages, in the order in which they lie in the bag.
 
         Raises:
@@ -61,12 +61,12 @@ class Storage(Protocol):
         """
         ...
 
-    def open(self) -> AbstractContextManager[Reader]:
+    def open(self) -> AbstractContextManager[BagReader]:
         """A context manager that gives a reader; the files are closed at its end."""
         ...
 
 
-def open_storage(path: Path) -> Storage:
+def open_storage(path: Path) -> BagStorage:
     """The storage of an `.mcap` or `.db3` file, or of a folder with rosbag2's `metadata.yaml`.
 
     Raises:

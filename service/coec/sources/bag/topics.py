@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from coec.adapters.ros.topics import TopicInfo, TopicMessage
 from coec.errors import SourceError, UsageError
-from coec.sources.bag.storage import Storage, open_storage
+from coec.sources.bag.storage import BagStorage, open_storage
 from coec.sources.spec import SourceSpec, is_bag
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class _Place:
+class _LoggedMessage:
     logged_ns: int
     at: tuple[int, ...]
     topic: str
@@ -29,8 +29,8 @@ class BagTopics:
 
     name: str
     infos: dict[str, TopicInfo]
-    _storage: Storage
-    _places: tuple[_Place, ...]
+    _storage: BagStorage
+    _places: tuple[_LoggedMessage, ...]
 
     def messages(self, topics: Collection[str]) -> Iterator[TopicMessage]:
         """The messages of these topics, in the order in which they were recorded, each loaded when it is its turn.
@@ -57,11 +57,11 @@ def open_topics(spec: SourceSpec) -> BagTopics:
     spec.only()
     storage = open_storage(spec.path)
     types: dict[str, str] = {}
-    places: list[_Place] = []
+    places: list[_LoggedMessage] = []
     for entry in storage.entries():
         if types.setdefault(entry.topic, entry.type_name) != entry.type_name:
             raise SourceError(f"{spec.path}: {entry.topic} has messages of several types")
-        places.append(_Place(entry.logged_ns, entry.place, entry.topic))
+        places.append(_LoggedMessage(entry.logged_ns, entry.place, entry.topic))
     places.sort()
     times_ns: defaultdict[str, list[int]] = defaultdict(list)
     for place in places:

@@ -8,9 +8,18 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from coec.adapters.mcap.files import Attachment, Channel, Message, Metadata, Record, Schema
+from coec.adapters.mcap.files import Channel, McapAttachment, McapMessage, Metadata, Record, Schema
 from coec.adapters.mcap.windows import rig_attachment
-from coec.adapters.mcap.windows.names import CONFIGURATION, DEPTH, KEPT, MASK, METADATA, OVERLAY, RIG, is_between
+from coec.adapters.mcap.windows.names import (
+    CARRIED_OVER,
+    CONFIGURATION,
+    DEPTH,
+    MASK,
+    METADATA,
+    OVERLAY,
+    RIG,
+    is_between,
+)
 from coec.adapters.ros import incoming, messages
 from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
@@ -24,7 +33,7 @@ bytes are in memory already, images are not decoded here, and `reading.MAX_UNPAC
 _FRAME_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY, messages.IMU)
 
 
-class Place(NamedTuple):
+class PairKey(NamedTuple):
     """The index of a pair in writing order: among the pairs of the window, or among the thinned pairs between them."""
 
     between: bool
@@ -42,7 +51,7 @@ class _Parts:
 
 
 @dataclass(slots=True)
-class Content:
+class WindowContent:
     """What has been read of a window so far.
 
     Attributes:
@@ -53,33 +62,33 @@ class Content:
 
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
-    kept: dict[str, str] = field(default_factory=dict)
+    carried_over: dict[str, str] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    parts: dict[Place, _Parts] = field(default_factory=dict)
+    parts: dict[PairKey, _Parts] = field(default_factory=dict)
 
-    def take(self, record: Record) -> Place | None:
+    def add(self, record: Record) -> PairKey | None:
         """Adds a record. Returns the place of the pair that it completes; None if it completes none."""
         match record:
             case Schema():
                 self.schemas[record.schema_id] = record
             case Channel():
                 self.channels[record.channel_id] = record
-            case Attachment():
+            case McapAttachment():
                 self.attachments[record.name] = record.data
             case Metadata() if record.name == METADATA:
                 self.metadata = record.values
-            case Metadata() if record.name == KEPT:
-                self.kept = record.values
-            case Message():
-                return self._take_message(record)
+            case Metadata() if record.name == CARRIED_OVER:
+                self.carried_over = record.values
+            case McapMessage():
+                return self._add_message(record)
         return None
 
     def head(self, path: Path) -> tuple[Rig, Matrix4, str]:
         """Rig, extrinsic at the start and window id."""
         if RIG not in self.attachments:
             raise WindowError(f"{path} is not a recorded window: it has no attachment {RIG}")
-        return rig_attachment.decoded(path, self.attachments[RIG], self.attachments.get(MASK))
+        return rig_attachment.decode_rig(path, self.attachments[RIG], self.attachments.get(MASK))
 
     def parsed_configuration(self, path: Path) -> CalibrationConfig:
         """The configuration of the window."""
@@ -90,18 +99,18 @@ class Content:
         except ValidationError as error:
             raise WindowError(f"{path}: {CONFIGURATION}: {describe(error)}") from error
 
-    def pair(self, path: Path, place: Place) -> FramePair:
+    def pair(self, path: Path, key: PairKey) -> FramePair:
         """Removes and returns the pair at a place."""
-        parts = self.parts.pop(place)
+        parts = self.parts.pop(key)
         if parts.camera is None or parts.lidar is None:
-            named = f"{'thinned ' if place.between else ''}pair {place.order}"
+            named = f"{'thinned ' if key.between else ''}pair {key.order}"
             raise WindowError(f"{path}: {named} lacks its {'sweep' if parts.lidar is None else 'image'}")
         camera = parts.camera
         if parts.depth is not None:
             camera = CameraFrame(camera.stamp_ns, camera.frame_id, camera.image, depth=parts.depth.image)
         return FramePair(camera, parts.lidar, parts.motion)
 
-    def _take_message(self, message: Message) -> Place | None:
+    def _add_message(self, message: McapMessage) -> PairKey | None:
         channel = self.channels.get(message.channel_id)
         schema = None if channel is None else self.schemas.get(channel.schema_id)
         if channel is None or schema is None or schema.name not in _FRAME_TYPES:
@@ -112,8 +121,8 @@ class Content:
             frame = incoming.decode(schema.name, message.data, _LIMITS, point_time=WRITTEN_TIME)
         except DecodeError as error:
             raise WindowError(f"a message on {channel.topic} cannot be decoded: {error}") from error
-        place = Place(is_between(channel.topic), message.sequence)
-        parts = self.parts.setdefault(place, _Parts())
+        key = PairKey(is_between(channel.topic), message.sequence)
+        parts = self.parts.setdefault(key, _Parts())
         match frame:
             case LidarFrame():
                 parts.lidar = frame
@@ -123,5 +132,5 @@ class Content:
                 parts.depth = frame
             case CameraFrame():
                 parts.camera = frame
-                return place
+                return key
         return None

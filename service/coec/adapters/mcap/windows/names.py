@@ -17,7 +17,7 @@ RIG, CONFIGURATION, MASK, RESULT = "rig.json", "configuration.json", "mask.png",
 
 JSON = "application/json"
 
-METADATA, KEPT = "coec", "coec_kept"
+METADATA, CARRIED_OVER = "coec", "coec_kept"
 """Metadata records: what the window is, and which other window it holds pairs of."""
 
 PACKING, LZ4 = "packing", "lz4"
@@ -45,6 +45,6 @@ def is_between(topic: str) -> bool:
     return topic.split("/")[3:4] == [BETWEEN.rstrip("/")]
 
 
-def beside(path: Path, suffix: str) -> Path:
+def with_suffix(path: Path, suffix: str) -> Path:
     """The path with a suffix added to the file name."""
     return path.with_name(path.name + suffix)

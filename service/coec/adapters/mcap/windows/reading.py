@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from coec.adapters.mcap.chunk_writer import CHUNK_BYTES
-from coec.adapters.mcap.files import McapDamaged, Message, Metadata, Record, read_attachment, read_records
-from coec.adapters.mcap.windows.content import Content
+from coec.adapters.mcap.files import McapDamagedError, McapMessage, Metadata, Record, read_attachment, read_records
+from coec.adapters.mcap.windows.content import WindowContent
 from coec.adapters.mcap.windows.names import METADATA, RESULT, RIG
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import FramePair, Window
@@ -27,15 +27,17 @@ def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
     Raises:
         WindowError: unreadable, cut off, damaged, not a window of coec, or without a pair.
     """
-    content = Content()
+    content = WindowContent()
     size = _size(path)
     for record in records_of(path, max_unpacked_bytes=size * MAX_UNPACKED + CHUNK_BYTES):
-        content.take(record)
+        content.add(record)
     rig, T_camera_lidar_start, window_id = content.head(path)
     places = sorted(content.parts)
     pairs, between = (
-        tuple(sorted((content.pair(path, of) for of in places if of.between == asked), key=lambda pair: pair.stamp_ns))
-        for asked in (False, True)
+        tuple(
+            sorted((content.pair(path, of) for of in places if of.between == thinned), key=lambda pair: pair.stamp_ns)
+        )
+        for thinned in (False, True)
     )
     if not pairs:
         raise WindowError(f"{path} holds no camera-LiDAR pair")
@@ -50,9 +52,9 @@ def pairs_since(path: Path, since_ns: int) -> Iterator[FramePair]:
     Raises:
         WindowError: unreadable, cut off or damaged.
     """
-    content = Content()
+    content = WindowContent()
     for record in records_of(path, max_unpacked_bytes=_size(path) * MAX_UNPACKED + CHUNK_BYTES):
-        place = content.take(record)
+        place = content.add(record)
         if place is None:
             continue
         pair = content.pair(path, place)
@@ -94,7 +96,7 @@ def metadata_of(path: Path) -> dict[str, str]:
         match record:
             case Metadata() if record.name == METADATA:
                 return record.values
-            case Message():
+            case McapMessage():
                 break
     return {}
 
@@ -109,7 +111,7 @@ def is_window(path: Path) -> bool:
         return read_attachment(path, RIG) is not None
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror}") from error
-    except McapDamaged as error:
+    except McapDamagedError as error:
         raise SourceError(error.of(path)) from error
 
 
@@ -124,7 +126,7 @@ def records_of(path: Path, max_unpacked_bytes: int | None = None) -> Iterator[Re
             yield from read_records(stream, max_unpacked_bytes=max_unpacked_bytes)
     except OSError as error:
         raise WindowError(f"cannot read {path}: {error.strerror}") from error
-    except McapDamaged as error:
+    except McapDamagedError as error:
         raise WindowError(_damage(path, error)) from error
 
 
@@ -133,13 +135,13 @@ def _attachment(path: Path, name: str) -> bytes | None:
         return read_attachment(path, name)
     except OSError as error:
         raise WindowError(f"cannot read {path}: {error.strerror}") from error
-    except McapDamaged as error:
+    except McapDamagedError as error:
         raise WindowError(_damage(path, error)) from error
 
 
-def _damage(path: Path, error: McapDamaged) -> str:
-    told = error.of(path)
-    return f"{told}; the daemon does so for its own at start" if error.is_mcap else told
+def _damage(path: Path, error: McapDamagedError) -> str:
+    message = error.of(path)
+    return f"{message}; the daemon does so for its own at start" if error.is_mcap else message
 
 
 def _size(path: Path) -> int:

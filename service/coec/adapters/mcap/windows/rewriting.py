@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from coec.adapters.mcap.files import Attachment, Channel, Message, Metadata, Schema
+from coec.adapters.mcap.files import Channel, McapAttachment, McapMessage, Metadata, Schema
 from coec.adapters.mcap.ros_channels import RosChannel
 from coec.adapters.mcap.whole_file import WholeFile
 from coec.adapters.mcap.windows.names import (
@@ -19,9 +19,9 @@ from coec.adapters.mcap.windows.names import (
     RESULT_TOPIC,
     REWRITE_SUFFIX,
     SUFFIX,
-    beside,
     is_between,
     topic,
+    with_suffix,
 )
 from coec.adapters.mcap.windows.reading import metadata_of, records_of
 from coec.adapters.mcap.windows.writer import RecordedWindow
@@ -43,17 +43,17 @@ def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | No
         RecordingError: it could not be written; then the file is unchanged.
     """
     packed = metadata_of(path).get(PACKING) == LZ4
-    file = WholeFile(beside(path, REWRITE_SUFFIX), path, packed=packed)
-    told, overlay = topic(result.pair, RESULT_TOPIC), topic(result.pair, OVERLAY)
+    file = WholeFile(with_suffix(path, REWRITE_SUFFIX), path, packed=packed)
+    result_topic, overlay = topic(result.pair, RESULT_TOPIC), topic(result.pair, OVERLAY)
     try:
-        earlier, moved = (DIAGNOSTICS, told, overlay), result.moved is not None
+        earlier, moved = (DIAGNOSTICS, result_topic, overlay), result.moved is not None
         window_id, pairs = _copy(path, file, lambda topic: topic in earlier or (is_between(topic) and not moved))
         stamp_ns, document = result.data_stamp_ns, to_json(result)
         if overlay_jpeg is not None:
             picture = outgoing.encode_jpeg(stamp_ns, result.camera_frame, overlay_jpeg)
             file.ros(RosChannel(overlay, messages.COMPRESSED_IMAGE), stamp_ns, 0, picture)
         file.ros(RosChannel(DIAGNOSTICS, messages.DIAGNOSTICS), stamp_ns, 0, _diagnostics(result))
-        file.message(told, "json", None, {}, stamp_ns, 0, document)
+        file.message(result_topic, "json", None, {}, stamp_ns, 0, document)
         file.attach(RESULT, JSON, document)
     except WindowError:
         file.abandon()
@@ -73,12 +73,12 @@ def _copy(path: Path, file: WholeFile, leave_out: Callable[[str], bool]) -> tupl
                 schemas[record.schema_id] = record
             case Channel():
                 channels[record.channel_id] = record
-            case Attachment() if record.name != RESULT:
+            case McapAttachment() if record.name != RESULT:
                 file.attach(record.name, record.media_type, record.data)
             case Metadata():
                 file.metadata(record.name, record.values)
                 window_id = record.values.get("window_id", window_id)
-            case Message():
+            case McapMessage():
                 channel = channels.get(record.channel_id)
                 if channel is None:
                     raise WindowError(f"{path}: a message belongs to no channel")
@@ -99,4 +99,4 @@ def _copy(path: Path, file: WholeFile, leave_out: Callable[[str], bool]) -> tupl
 
 def _diagnostics(result: CalibrationResult) -> bytes:
     """The verdict with its figures, for ROS tools."""
-    return outgoing.encode_diagnostics(result.data_stamp_ns, [diagnostics.of_result(result)])
+    return outgoing.encode_diagnostics(result.data_stamp_ns, [diagnostics.status_of_result(result)])

@@ -24,13 +24,13 @@ class _RigAttachment(BaseModel):
     rig: dict[str, Any]
 
 
-def encoded(rig: Rig, T_camera_lidar_start: Matrix4, window_id: str) -> bytes:
+def encode_rig(rig: Rig, T_camera_lidar_start: Matrix4, window_id: str) -> bytes:
     """The attachment, without the rig's mask, which is a separate one."""
     start = matrix_rows(T_camera_lidar_start)
     return to_json(_RigAttachment(window_id=window_id, T_camera_lidar_start=start, rig=rig_to_json(rig)))
 
 
-def decoded(path: Path, data: bytes, mask_png: bytes | None) -> tuple[Rig, Matrix4, str]:
+def decode_rig(path: Path, data: bytes, mask_png: bytes | None) -> tuple[Rig, Matrix4, str]:
     """Rig, extrinsic at the start (4, 4) and window id of the window at `path`.
 
     Raises:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from coec.adapters.files import durable
 from coec.adapters.mcap.whole_file import failing_as_recording_error
-from coec.adapters.mcap.windows.content import Content
-from coec.adapters.mcap.windows.names import LZ4, PACKING, PART_SUFFIX, REWRITE_SUFFIX, beside
+from coec.adapters.mcap.windows.content import WindowContent
+from coec.adapters.mcap.windows.names import LZ4, PACKING, PART_SUFFIX, REWRITE_SUFFIX, with_suffix
 from coec.adapters.mcap.windows.reading import records_of
 from coec.adapters.mcap.windows.writer import RecordedWindow, WindowWriter
 from coec.errors import WindowError
@@ -37,13 +37,13 @@ def salvage(part_path: Path, progress: Callable[[], None]) -> RecordedWindow | N
 
 
 def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> RecordedWindow | None:
-    content = Content()
+    content = WindowContent()
     writer: WindowWriter | None = None
     try:
         # The error at the damaged end of the file ends the loop; everything before it is sound.
         with suppress(WindowError):
             for record in records_of(part_path):
-                place = content.take(record)
+                place = content.add(record)
                 if place is None:
                     continue
                 if writer is None:
@@ -63,12 +63,12 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> Rec
     if writer.pairs == 0:
         writer.abandon()
         return None
-    if content.kept:
-        writer.note_of_kept(content.kept)
+    if content.carried_over:
+        writer.copy_carried_over(content.carried_over)
     return writer.finish()
 
 
-def _writer_like(content: Content, part_path: Path, final: Path) -> WindowWriter:
+def _writer_like(content: WindowContent, part_path: Path, final: Path) -> WindowWriter:
     rig, T_camera_lidar_start, window_id = content.head(part_path)
     configuration = content.parsed_configuration(part_path)
     return WindowWriter(
@@ -79,5 +79,5 @@ def _writer_like(content: Content, part_path: Path, final: Path) -> WindowWriter
         configuration,
         content.metadata,
         packed=content.metadata.get(PACKING) == LZ4,
-        temporary=beside(final, REWRITE_SUFFIX),
+        temporary=with_suffix(final, REWRITE_SUFFIX),
     )

@@ -32,13 +32,13 @@ from coec.adapters.mcap.windows.names import (
     BETWEEN,
     BETWEEN_IMAGE,
     CAMERA_INFO,
+    CARRIED_OVER,
     COMPRESSED,
     CONFIGURATION,
     DEPTH,
     IMAGE,
     IMU,
     JSON,
-    KEPT,
     LZ4,
     MASK,
     METADATA,
@@ -47,8 +47,8 @@ from coec.adapters.mcap.windows.names import (
     PART_SUFFIX,
     POINTS,
     RIG,
-    beside,
     topic,
+    with_suffix,
 )
 from coec.adapters.ros import messages, outgoing
 from coec.calibration.types import FramePair, Matrix4, Rig
@@ -108,25 +108,25 @@ class WindowWriter:
         self.pairs = 0
         self._between = 0
         self._rig, self._T_start, self._window_id = rig, T_camera_lidar_start, window_id
-        self._file = WholeFile(temporary or beside(path_final, PART_SUFFIX), path_final, packed=packed)
-        self._file.attach(RIG, JSON, rig_attachment.encoded(rig, T_camera_lidar_start, window_id))
+        self._file = WholeFile(temporary or with_suffix(path_final, PART_SUFFIX), path_final, packed=packed)
+        self._file.attach(RIG, JSON, rig_attachment.encode_rig(rig, T_camera_lidar_start, window_id))
         self._file.attach(CONFIGURATION, JSON, to_json(configuration))
         if rig.mask is not None:
             self._file.attach(MASK, "image/png", mask_to_png(rig.mask))
         self._file.metadata(METADATA, {"window_id": window_id, PACKING: LZ4 if packed else "", **metadata})
         self._file.sync()
 
-    def note_kept(self, from_window_id: str, since_ns: int) -> None:
+    def note_carried_over(self, from_window_id: str, since_ns: int) -> None:
         """Notes that the pairs added from now on come from another window, from stamp `since_ns` on.
 
         Raises:
             RecordingError: it could not be written; the `.part` file has been removed.
         """
-        self.note_of_kept({"from_window": from_window_id, "since_ns": str(since_ns)})
+        self.copy_carried_over({"from_window": from_window_id, "since_ns": str(since_ns)})
 
-    def note_of_kept(self, values: Mapping[str, str]) -> None:
+    def copy_carried_over(self, values: Mapping[str, str]) -> None:
         """The same, with the metadata found in another file."""
-        self._file.metadata(KEPT, values)
+        self._file.metadata(CARRIED_OVER, values)
 
     def add(self, pair: FramePair) -> None:
         """Appends a pair.

@@ -32,7 +32,7 @@ CPU_KEY: Final = "/_buf_cpu"
 """Suffix of a topic's key to which Lyrical's publishers send messages with large arrays for subscribers with
 `CPU_BACKEND`."""
 
-MAX_TOKEN: Final = 1024
+MAX_RMW_TOKEN: Final = 1024
 """Most characters of a token that is read; tokens of real nodes have some 200."""
 
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
@@ -40,10 +40,10 @@ _ATTACHMENT: Final = struct.Struct("<qqB16s")
 MAX_ATTACHMENT: Final = _ATTACHMENT.size
 """Size of an attachment in bytes; anything longer is not one."""
 
-_TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_RMW_TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _NODE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+|/")
 
-_TYPE: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]{0,127})::(msg|srv|action)::dds_::([A-Za-z][A-Za-z0-9_]{0,127})_")
+_RMW_TYPE: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]{0,127})::(msg|srv|action)::dds_::([A-Za-z][A-Za-z0-9_]{0,127})_")
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ def ros_type(chunk: str) -> str:
     Raises:
         UsageError: not the name of a type.
     """
-    match = _TYPE.fullmatch(chunk)
+    match = _RMW_TYPE.fullmatch(chunk)
     if match is None:
         raise UsageError("not a type of rmw_zenoh: expected package::msg::dds_::Name_")
     return "/".join(match.groups())
@@ -136,14 +136,14 @@ def publisher_tokens(domain: int) -> str:
     return f"{TOKENS}/{domain}/*/*/*/MP/**"
 
 
-def publisher_of(token: str) -> Publisher | None:
+def rmw_publisher(token: str) -> Publisher | None:
     """The publisher that a token describes; None if it describes none, or one that is impossible in ROS."""
-    chunks = token.split("/") if len(token) <= MAX_TOKEN else []
+    chunks = token.split("/") if len(token) <= MAX_RMW_TOKEN else []
     if len(chunks) < 13 or chunks[0] != TOKENS or chunks[5] != "MP":
         return None
     topic, described = unmangled(chunks[9]), chunks[10]
     node = f"{unmangled(chunks[7]).rstrip('/')}/{chunks[8]}"
-    if not (_TOPIC.fullmatch(topic) and _NODE.fullmatch(node) and _TYPE.fullmatch(described)):
+    if not (_RMW_TOPIC.fullmatch(topic) and _NODE.fullmatch(node) and _RMW_TYPE.fullmatch(described)):
         return None
     return Publisher(topic, ros_type(described), node, gid_of(token))
 
@@ -174,7 +174,7 @@ class RmwZenoh:
 
     def attachment(self, token: str, sequence: int, source_ns: int) -> bytes:
         """See `Dialect`."""
-        return Attachment(sequence, source_ns, gid_of(token)).packed
+        return MessageAttachment(sequence, source_ns, gid_of(token)).packed
 
     def _topic(self, topic: str, type_name: str) -> TopicKey:
         return TopicKey(self.node.domain, topic, type_name, self.type_hash(type_name))
@@ -191,7 +191,7 @@ def unmangled(chunk: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Attachment:
+class MessageAttachment:
     """What comes with each message: its number (from 1), the sender's wall clock, and the publisher's id."""
 
     sequence: int
@@ -204,7 +204,7 @@ class Attachment:
         return _ATTACHMENT.pack(self.sequence, self.source_ns, len(self.gid), self.gid)
 
     @classmethod
-    def parse(cls, attachment: bytes | None) -> Attachment | None:
+    def parse(cls, attachment: bytes | None) -> MessageAttachment | None:
         """The inverse of `packed`; None if the bytes are no attachment."""
         if attachment is None or len(attachment) != _ATTACHMENT.size:
             return None

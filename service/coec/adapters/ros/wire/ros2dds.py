@@ -15,8 +15,8 @@ from coec.adapters.ros.wire.qos import Qos
 SLASH: Final = "§"
 """Stands for `/` in a key or a type that is one chunk of a token."""
 
-_TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
-_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
+_BRIDGE_TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_BRIDGE_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
 
 
 def topic_key(namespace: str, topic: str) -> str:
@@ -61,20 +61,20 @@ class Ros2dds:
 PUBLISHER_TOKENS: Final = "@/*/@ros2_lv/MP/*/*/*"
 """A key expression that matches the tokens of all publishers, of every bridge."""
 
-MAX_TOKEN: Final = 1024
+MAX_BRIDGE_TOKEN: Final = 1024
 """Most characters of a token that is read; tokens of real bridges have some 150."""
 
 
-def publisher_of(token: str, namespace: str) -> Publisher | None:
+def bridge_publisher(token: str, namespace: str) -> Publisher | None:
     """The publisher behind a bridge that a token describes; None if it describes none, one of another namespace, or one
     that is impossible in ROS."""
-    chunks = token.split("/") if len(token) <= MAX_TOKEN else []
+    chunks = token.split("/") if len(token) <= MAX_BRIDGE_TOKEN else []
     if len(chunks) != 7 or chunks[0] != "@" or chunks[2:4] != ["@ros2_lv", "MP"]:
         return None
     key, type_name = (chunk.replace(SLASH, "/") for chunk in chunks[4:6])
     within = topic_key(namespace, "")
     topic = f"/{key}".removeprefix(f"/{within}" if within else "")
-    if not (_TOPIC.fullmatch(topic) and _TYPE.fullmatch(type_name)):
+    if not (_BRIDGE_TOPIC.fullmatch(topic) and _BRIDGE_TYPE.fullmatch(type_name)):
         return None
     return Publisher(topic, type_name, None, None)
 
