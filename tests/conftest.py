@@ -15,8 +15,8 @@ import pytest
 from faults import FaultTable, rows_of_item
 
 if TYPE_CHECKING:
-    from certificates import TestAuthority
     from e2e.processes import Router
+    from support.router import TestAuthority
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 TESTS = REPOSITORY / "tests"
@@ -93,7 +93,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> TestAuthority:
     """Certificates of one authority; skips the test where there is no openssl to make them."""
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl")
-    from certificates import make_authority
+    from support.router import make_authority
 
     return make_authority(tmp_path_factory.mktemp("authority"))
 

@@ -12,17 +12,17 @@ import zenoh
 
 import coec
 from coec import client
-from coec.adapters.zenoh.bus import MSGPACK, Answer, Bus, QueryLane, Request, Route, open_session
-from coec.adapters.zenoh.client import OF_ONE_KEY
 from coec.client import MAX_QUEUED_CHANGES, PairUpdate, Vehicle
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConnectionFailedError, DecodeError, NotFoundError, RemoteError, UsageError
-from coec.schemas.base import to_msgpack
+from coec.io.zenoh.bus import MSGPACK, Answer, Bus, QueryLane, Request, Route, open_session
+from coec.io.zenoh.query_client import OF_ONE_KEY
 from coec.schemas.keys import Keys
+from coec.schemas.message import to_msgpack
 from coec.schemas.replies import HealthReply
 from e2e.processes import Router
-from ports import free_port
-from vehicles import KEYS, PAIR, VEHICLE, serving
+from support.router import free_port
+from support.vehicles import KEYS, PAIR, VEHICLE, serving
 
 PATIENCE_S = 20.0
 """Nothing that comes about waits so long."""

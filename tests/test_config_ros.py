@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from coec.config import Config, RosConfig
-from pair_bench import pair_configuration
+from support.vehicles import pair_configuration
 
 
 def document(ros: dict[str, Any], middleware: str = "rmw_zenoh", *names: str) -> dict[str, Any]:

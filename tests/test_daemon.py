@@ -12,9 +12,6 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from coec.adapters.frames.msgpack_frames import encode_lidar
-from coec.adapters.mcap.windows import read_result, read_window
-from coec.adapters.zenoh.bus import MSGPACK
 from coec.calibration.types import LidarFrame
 from coec.config import (
     CalibrationConfig,
@@ -25,18 +22,19 @@ from coec.config import (
     ZenohConfig,
     load_config,
 )
-from coec.errors import RemoteError
-from coec.exit_codes import ExitCode
+from coec.errors import ExitCode, RemoteError
+from coec.io.mcap.window_reader import read_result, read_window
+from coec.io.msgpack_frames import encode_lidar
+from coec.io.zenoh.bus import MSGPACK
 from coec.reports.commented_yaml import commented_yaml
-from coec.schemas import last_word
-from coec.schemas.base import from_msgpack
+from coec.schemas import heartbeat
+from coec.schemas.message import from_msgpack
 from coec.schemas.replies import HealthReply
 from e2e.drives import SHORT, SHORT_PAIRS, Drive, later, rendered
 from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment, routing, service, write_configuration
 from e2e.ros_listener import listening, speaking_to_ros
-from fakes import wait_until
-from ports import free_port
-from storages import MemoryStorage
+from support.fake_worker import wait_until
+from support.router import MemoryStorage, free_port
 
 SHORT_S = 12
 LATER_S = 60.0
@@ -62,8 +60,8 @@ STUBBORN = (
     sys.executable,
     "-c",
     "import sys\n"
-    "from coec.adapters.zenoh.bus import Bus\n"
-    "from coec.runtime.pair import Pair\n"
+    "from coec.io.zenoh.bus import Bus\n"
+    "from coec.service.camera_lidar_pair import Pair\n"
     "def broken(*_):\n"
     "    raise RuntimeError('broken')\n"
     "Bus.undeclare_inputs = Bus.undeclare_queryables = Pair.finish_window = broken\n"
@@ -176,7 +174,7 @@ def test_a_drive_an_end_and_a_restart(tmp_path: Path, drive: Drive, router: Rout
         assert one == two, "the same window and configuration give the same result"
         with MemoryStorage(router.session, running.keys.last("*")) as storage:
             assert running.terminate() == 0
-    words = {key: last_word.decode_heartbeat(key, kept.payload.to_bytes()) for key, kept in storage.samples.items()}
+    words = {key: heartbeat.decode_heartbeat(key, kept.payload.to_bytes()) for key, kept in storage.samples.items()}
     assert {word.service for word in words.values()} == {"stopping"}, "it takes its leave"
     front = words[running.keys.last(FRONT)]
     assert (front.state, front.provenance, front.windows) == ("healthy", "estimated", 1)

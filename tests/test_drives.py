@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-import drives
 from coec.calibration.types import LidarFrame
-from coec.sources import open_source
+from coec.io.recordings.layouts import open_source
 from e2e.processes import environment
+from support import simulated_drives
 
 TINY = "sim:seconds=0.4&camera_hz=5&lidar_hz=5&camera=fisheye64&lidar=16&depth=yes"
 
 SCRIPT = f"""
 import sys
-from coec.simulation.source import open_sim
-from coec.sources.spec import parse_spec
+from coec_lab.simulation.source import open_sim
+from coec.io.recordings.recording_source import parse_spec
 before = set(sys.modules)
 for _ in open_sim(parse_spec({TINY!r}).query).messages():
     pass
@@ -31,11 +31,11 @@ def test_every_module_that_drawing_loads_is_in_the_fingerprint() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=environment(), check=True)
     loaded = {Path(name) for name in done.stdout.split()}
     assert any(path.name == "render.py" for path in loaded)
-    assert loaded <= drives.modules_behind(drives.SERVICE / "coec" / "simulation" / "drive.py")
+    assert loaded <= simulated_drives.modules_behind(simulated_drives.SERVICE / "coec" / "simulation" / "drive.py")
 
 
 def test_a_drawn_drive_is_the_drive() -> None:
-    drawn, drive = drives.rendered_source(TINY), open_source(TINY)
+    drawn, drive = simulated_drives.rendered_source(TINY), open_source(TINY)
     assert drawn.camera_stamps_ns == drive.camera_stamps_ns
     for ours, theirs in zip(drawn.messages(), drive.messages(), strict=True):
         if isinstance(ours, LidarFrame) and isinstance(theirs, LidarFrame):

@@ -18,21 +18,19 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from certificates import TestAuthority
 from coec import daemon
 from coec.cli import check_config
 from coec.cli.check_config import example, template
 from coec.cli.signals import success_on_sigterm
 from coec.config import Config, StateConfig, ZenohConfig
-from coec.daemon.service import exit_code_of
-from coec.daemon.state_folder import locked
-from coec.errors import CoecError, ConfigError
-from coec.exit_codes import EXIT_CODE_MEANINGS, MAY_BE_CURED, NOT_CURED_BY_RESTART, ExitCode
+from coec.daemon import exit_code_of
+from coec.errors import EXIT_CODE_MEANINGS, MAY_BE_CURED, NOT_CURED_BY_RESTART, CoecError, ConfigError, ExitCode
+from coec.service.process_lifetime import locked
 from conftest import REPOSITORY
 from deploy.written import compose
 from e2e.processes import COMMAND, PATIENCE_S, environment
-from fakes import wait_until
-from ports import free_port
+from support.fake_worker import wait_until
+from support.router import TestAuthority, free_port
 
 pytestmark = pytest.mark.usefixtures("process")
 UNIT = (REPOSITORY / "deploy" / "coec.service").read_text()
@@ -120,7 +118,7 @@ def test_a_disk_that_takes_no_file_may_take_one_later(
 
 
 @pytest.mark.fault("a disk that fills up while the service starts", "exit code 75: the unit tries again")
-@pytest.mark.parametrize("place", ["coec.daemon.service.WindowStore", "coec.daemon.service.StateStore"])
+@pytest.mark.parametrize("place", ["coec.daemon.WindowStore", "coec.daemon.StateStore"])
 def test_a_disk_that_is_full_when_the_state_is_opened_may_have_room_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from certificates import CERTIFICATE_NAMES, MAKE_TEST_CA, TestAuthority
-from coec.adapters.tls.conversation import CommandListener, CommandSender, credentials_of
-from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.config import AuthorityConfig, load_yaml
+from coec.io.zenoh.command_auth import CommandListener, CommandSender, credentials_of
+from coec.io.zenoh.endpoints import credentials_in, read_settings
 from conftest import REPOSITORY
 from deploy.written import stages
+from support.router import CERTIFICATE_NAMES, MAKE_TEST_CA, TestAuthority
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
 

@@ -24,7 +24,7 @@ import pytest
 
 from conftest import REPOSITORY
 from e2e.processes import environment
-from ports import free_port
+from support.router import free_port
 
 PAGES = (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md")))
 LANGUAGES = ("console", "python", "text", "yaml")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from coec.errors import CoecError, DecodeError, RemoteError
 from coec.untrusted import LIMIT, Untrusted, json_printable, printable, printable_lines
-from hostile import HOSTILE, obeyed_characters
+from support.strategies import HOSTILE, obeyed_characters
 
 ANYTHING = st.text(st.characters(codec=None, categories=None))
 """Unpaired surrogates too."""

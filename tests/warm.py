@@ -23,8 +23,8 @@ from coec.config import (
     PairConfig,
     SearchConfig,
 )
-from coec.runtime.worker.tasks import Solver
-from drives import rendered_source
+from coec.service.worker.tasks import Solver
+from support.simulated_drives import rendered_source
 
 
 def small_lens(model: str, **parameters: float) -> CameraIntrinsics:

@@ -13,9 +13,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from coec.config import Config
-from coec.config.pair import OpenPairConfig, PairConfig
+from coec.config.pair import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig, OpenPairConfig, PairConfig
 from coec.config.rig import RigConfig, RigStages
-from coec.config.streams import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig
 from generate.markdown import WRITTEN, code, prose, table
 
 HEAD = """\

@@ -11,11 +11,11 @@ from typing import Any, TypeGuard
 
 import coec
 import coec_lab
-from coec.runtime.api import payloads
-from coec.schemas import commands, last_word, replies, rig_state
+from coec.schemas import commands, heartbeat, replies, rig_state
 from coec.schemas import keys as grammar
-from coec.schemas.export import SENT, schemas
 from coec.schemas.keys import Keys
+from coec.service.api import authorization
+from coec_lab.experiments.schema_export import SENT, schemas
 from generate.markdown import WRITTEN, code, prose, table
 
 KEYS = """\
@@ -79,7 +79,7 @@ RESOURCES: Mapping[str, _Resource] = {
         "the configuration as JSON or msgpack ([configuration](configuration.md))", grammar.parse_selector
     ),
     "rig": _Resource(_model(rig_state.RigReply), grammar.parse_selector),
-    "last": _Resource(_model(last_word.LastWord), grammar.parse_selector),
+    "last": _Resource(_model(heartbeat.LastWord), grammar.parse_selector),
     "extrinsic": _Resource(_model(replies.ExtrinsicReply), grammar.parse_extrinsic_selector),
     "health": _Resource(_model(replies.HealthReply), grammar.parse_selector),
     "history": _Resource(_model(replies.HistoryReply), grammar.parse_history_selector),
@@ -140,7 +140,7 @@ def keys_page() -> str:
             ("command", "also takes", "what it does"),
             [(code(name), _arguments(name), COMMANDS[name]) for name in commands.COMMAND_NAMES],
         ),
-        max_payload=payloads.MAX_PAYLOAD,
+        max_payload=authorization.MAX_PAYLOAD,
         errors=table(
             ("code", "when"), [(code(name), prose("; or: ".join(when))) for name, when in sorted(_errors().items())]
         ),

@@ -6,16 +6,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from coec.calibration.figures import FIGURES
-from coec.calibration.lifecycle.pair_state import SETTLING_NS
-from coec.calibration.lifecycle.states import MEANING, STATES, HealthState, markdown
-from coec.calibration.monitor import change_detector, hypotheses, sensor_faults
+from coec.calibration.monitor import change_detector, sensor_faults, sequential_tests
 from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, Cause
+from coec.calibration.state import SETTLING_NS
+from coec.calibration.state_machine import MEANING, STATES, HealthState, markdown
 from coec.config import MonitorConfig
-from coec.exit_codes import EXIT_CODE_MEANINGS, MAY_BE_CURED, NOT_CURED_BY_RESTART, ExitCode
-from coec.runtime.api.metrics import FAMILIES
-from coec.runtime.api.troubles import PROBLEMS
-from coec.runtime.reload import RELOADED
-from coec.runtime.timings import LONG_S, QUICK_S
+from coec.errors import EXIT_CODE_MEANINGS, MAY_BE_CURED, NOT_CURED_BY_RESTART, ExitCode
+from coec.service.api.metrics import FAMILIES
+from coec.service.api.problems import PROBLEMS
+from coec.service.configuration import RELOADED
+from coec.service.timing import LONG_S, QUICK_S
 from generate.markdown import WRITTEN, code, prose, table
 
 METRICS = """\
@@ -197,7 +197,7 @@ def health_page() -> str:
         "## What the monitor needs\n\n"
         "Evidence is the log-likelihood ratio of a mount that moved, at some past time and to some place, against one\n"
         "that has not moved (`evidence` of a check, nats). A check counts by the share of its pairs that are new,\n"
-        f"between {hypotheses.LEAST_STEP:+g} and {hypotheses.MOST_STEP:+g}. One with faint edges may make a mount "
+        f"between {sequential_tests.LEAST_STEP:+g} and {sequential_tests.MOST_STEP:+g}. One with faint edges may make a mount "
         "suspect, but confirms nothing.\n\n"
         "The threshold follows from how often a right mount may be accused. It is the logarithm of the number of\n"
         f"tests, {change_detector.TESTS_PER_CHECK} at every check, that begin within "

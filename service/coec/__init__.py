@@ -114,8 +114,8 @@ if TYPE_CHECKING:
     from coec.api import calibrate, open
     from coec.calibration_options import CalibrationOptions, SolverOptions
     from coec.config import CalibrationConfig
-    from coec.library.evaluating import evaluate  # until it is an entry point of another package
     from coec.recording import Description, Recording, Result, Window
+    from coec_lab.experiments.evaluation_run import evaluate  # until it is an entry point of another package
 else:  # hidden from type checkers: with this function in sight they would accept every misspelt name
 
     def __getattr__(name: str) -> object:

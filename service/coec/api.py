@@ -10,14 +10,14 @@ from typing import Any, Unpack
 
 from coec.calibration_options import CalibrationOptions
 from coec.errors import UsageError
+from coec.io.recordings.layouts import open_source
 from coec.recording import Recording, Result, Window
-from coec.sources import open_source
 
 GROUP = "coec.api"
 """Group of entry points by which another package adds a function to `coec`: its name, and `module:function`."""
 
 # To be removed when the laboratory is a package of its own and registers its function.
-IN_THIS_PACKAGE = {"evaluate": "coec.library.evaluating"}
+IN_THIS_PACKAGE = {"evaluate": "coec_lab.experiments.evaluation_run"}
 
 
 def open(source: str | PathLike[str]) -> Recording:

@@ -49,7 +49,7 @@ class Flag:
 
 
 def _depth_models() -> Iterable[str]:
-    from coec.adapters.depth.model_cards import built_in_cards
+    from coec.io.depth.model_cards import built_in_cards
 
     return ("stereo", *built_in_cards())
 

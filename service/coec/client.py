@@ -32,10 +32,12 @@ from typing import Any, Self, TypeVar
 import zenoh
 from pydantic import BaseModel
 
-from coec.adapters.tls.conversation import CommandSender
-from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.changes import PairUpdate, subscribed
-from coec.adapters.zenoh.client import (
+from coec.config import Config, ZenohConfig
+from coec.errors import UsageError
+from coec.io.zenoh.bus import MSGPACK
+from coec.io.zenoh.command_auth import CommandSender
+from coec.io.zenoh.endpoints import credentials_in, read_settings
+from coec.io.zenoh.query_client import (
     GRACE_S,
     Replies,
     Reply,
@@ -44,17 +46,15 @@ from coec.adapters.zenoh.client import (
     myself,
     no_reply_error,
     patience_ms,
+    send_authenticated,
     single_key,
     too_late,
 )
-from coec.adapters.zenoh.proven import send_authenticated
-from coec.adapters.zenoh.settings import connected_of
-from coec.adapters.zenoh.settings_file import credentials_in, read_settings
-from coec.config import Config, ZenohConfig
-from coec.errors import UsageError
-from coec.schemas.base import from_msgpack
+from coec.io.zenoh.session import connected_of
+from coec.io.zenoh.subscriptions import PairUpdate, subscribed
 from coec.schemas.commands import COMMAND_NAMES, CommandName
 from coec.schemas.keys import Keys
+from coec.schemas.message import from_msgpack
 from coec.schemas.replies import Acknowledgement, ExtrinsicReply, HealthReply, HistoryReply, StatusReply, WindowsReply
 
 __all__ = ["PairUpdate", "Vehicle"]

@@ -17,33 +17,32 @@ from typing import Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.exports import FORMATS
-from coec.adapters.exports.extrinsic import ExportedExtrinsic
-from coec.adapters.exports.told import ExportFrames, extrinsic_of_result
-from coec.adapters.files import output
-from coec.adapters.files.conversions import matrix_of, result_of
-from coec.adapters.files.rig import intrinsics_config
-from coec.adapters.images.codec import GreyImages
-from coec.calibration import calibrator, ports
+from coec.calibration import pipeline, ports
 from coec.calibration import types as calibration
-from coec.calibration.confidence.lens_limit import require_fit
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
+from coec.calibration.uncertainty.systematic import require_fit
 from coec.calibration_options import CalibrationOptions, Progress, checked, configuration_of
 from coec.config import CalibrationConfig, LimitsConfig, VerdictConfig, WindowConfig
 from coec.errors import NotAcceptedError, SourceError, UsageError
-from coec.evaluation.fitness import Cadence, cadence
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
+from coec.io import user_files
+from coec.io.depth.depth_maps import open_depth
+from coec.io.exports.exported_extrinsic import ExportedExtrinsic, ExportFrames, extrinsic_of_result
+from coec.io.exports.formats import FORMATS
+from coec.io.images import GreyImages
+from coec.io.recordings import window_cutting
+from coec.io.recordings.layouts import RecordingSource as Source
+from coec.io.recordings.recording_source import HasGroundTruth
+from coec.io.recordings.window_cutting import LoadedWindow, NoPairsError
+from coec.io.rig_files import intrinsics_config
+from coec.io.serialise import matrix_of, result_of
+from coec.io.user_files import read_bytes
+from coec.reports.formatting import count
 from coec.reports.overlay import titled
-from coec.reports.page.words import count
-from coec.schemas.base import to_json
+from coec.reports.recording_fitness import Cadence, cadence
+from coec.schemas.message import to_json
 from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Verdict
-from coec.sources import RecordingSource as Source
-from coec.sources import windows
-from coec.sources.reading import read_bytes
-from coec.sources.recording import HasGroundTruth
-from coec.sources.windows import LoadedWindow, NoPairsError
 from coec.untrusted import Untrusted, printable
 
 NS_PER_S = 1e9
@@ -121,12 +120,12 @@ def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: ports.Pro
     configuration = configuration_of(options, options.get("configuration") or loaded.configuration)
     window, perturb, model = loaded.window, options.get("perturb"), options.get("camera_model")
     if perturb is not None:
-        window = windows.with_perturbed_start(window, perturbation_of(perturb))
+        window = window_cutting.with_perturbed_start(window, perturbation_of(perturb))
     window, fit = (window, None) if model is None else fit_camera(window, model)
     depth = open_depth(configuration.depth, LimitsConfig())
     progress.step("prepare", 1, 1)
     images = GreyImages(LimitsConfig())
-    estimate = calibrator.calibrate(window, depth, images, configuration, progress)
+    estimate = pipeline.calibrate(window, depth, images, configuration, progress)
     offset = None
     if options.get("time_offset"):
         offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
@@ -142,8 +141,8 @@ def perturbation_of(perturb: str | Sequence[float]) -> NDArray[np.float64]:
         UsageError: these are not three or six finite numbers, or too large.
     """
     if isinstance(perturb, str):
-        return windows.parse_perturbation("--perturb", perturb)
-    return windows.perturbation_vector(f"perturb={perturb!r}", perturb)
+        return window_cutting.parse_perturbation("--perturb", perturb)
+    return window_cutting.perturbation_vector(f"perturb={perturb!r}", perturb)
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,7 +335,7 @@ class Result:
         extrinsic = extrinsic_of_result(self.document, camera, ExportFrames(parent, child, pose))
         require_accepted(extrinsic, self.document.window_id, "force=True", force=force)
         file = Path(fspath(path))
-        output.replace_output(file, export_text(extrinsic, format, file).encode())
+        user_files.replace_output(file, export_text(extrinsic, format, file).encode())
         return file
 
     def overlay(self, at: Pose = "result") -> NDArray[np.uint8]:
@@ -565,7 +564,7 @@ class Recording:
         """
         if frames is not None and frames < 1:
             raise UsageError(f"frames={frames}: a window has at least one")
-        begin_s, end_s = windows.WHOLE if between_s is None else between_s
+        begin_s, end_s = window_cutting.WHOLE if between_s is None else between_s
         if not 0.0 <= begin_s <= end_s:
             raise UsageError(f"between_s=({begin_s:g}, {end_s:g}): give seconds after the first frame, begin and end")
         stages = CallbackProgress(progress)
@@ -575,9 +574,9 @@ class Recording:
 
         usual = WindowConfig().pairs
         if self.configuration is None:
-            loaded = windows.window_of_recording(self._opened, frames or usual, report, (begin_s, end_s))
+            loaded = window_cutting.window_of_recording(self._opened, frames or usual, report, (begin_s, end_s))
         else:  # a recorded window keeps its pairs
-            loaded = windows.load_window(self._source, frames, usual, report, (begin_s, end_s))
+            loaded = window_cutting.load_window(self._source, frames, usual, report, (begin_s, end_s))
         return Window(self._source, frames, loaded)
 
     def windows(self, *, seconds: float = 60.0, frames: int | None = None) -> Iterator[Window]:

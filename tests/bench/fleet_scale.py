@@ -24,14 +24,13 @@ import numpy as np
 import psutil
 import zenoh
 
-from coec.adapters.zenoh.words import HeartbeatReceiver
-from coec.fleet.roster import FleetState
-from coec.schemas.base import to_msgpack
+from coec.fleet.fleet_state import FleetState
+from coec.io.zenoh.subscriptions import HeartbeatReceiver
+from coec.schemas.heartbeat import decode_heartbeat
 from coec.schemas.keys import Keys
-from coec.schemas.last_word import decode_heartbeat
-from last_words import heartbeat
-from ports import free_port
-from storages import MemoryStorage
+from coec.schemas.message import to_msgpack
+from support.messages import heartbeat
+from support.router import MemoryStorage, free_port
 
 ALL = Keys("coec", "*")
 SPAWN = multiprocessing.get_context("spawn")

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from coec.geometry.cameras import DoubleSphere, build
 from coec.geometry.culling import BUNDLE
 from coec.geometry.mutual_information import BinnedFrames, mutual_information
-from coec.geometry.pixel_lookup import moved
-from coec.geometry.plain_forms import by_numpy, by_scalar_loop
+from coec.geometry.projection import moved
+from coec_lab.bench.reference_kernels import by_numpy, by_scalar_loop
 
 POINTS, BINS, SIZE = 114_000, 32, 512
 

@@ -5,17 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.objective.edges import EdgeCue, build_edges
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import Window
 from coec.config import DepthConfig, LimitsConfig, PairingConfig
-from coec.sources import RecordingSource
-from coec.sources.windows import RECORDED_GAP_S
-from drives import rendered_source
+from coec.io.depth.depth_maps import open_depth
+from coec.io.images import GreyImages
+from coec.io.recordings.layouts import RecordingSource
+from coec.io.recordings.window_cutting import RECORDED_GAP_S
+from support.simulated_drives import rendered_source
 
 STREET = "sim:seed=1&seconds=40&camera_hz=0.2&lidar_hz=0.2&camera=fisheye320&lidar=32&depth=yes"
 SHARP_STREET = "sim:seed=1&seconds=70&camera_hz=0.142857&lidar_hz=0.142857&camera=fisheye700&lidar=32&depth=yes"

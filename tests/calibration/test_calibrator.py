@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.images.codec import GreyImages
-from coec.calibration import calibrator
-from coec.calibration.calibrator import calibrate
-from coec.calibration.confidence.looks import independent_samples_at
+from coec.calibration import pipeline
+from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.types import CameraFrame, Decision, DepthMap, Estimate, StopReason, Window
+from coec.calibration.uncertainty.scatter import independent_samples_at
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
+from coec.io.images import GreyImages
 
 MI = ObjectiveConfig(kind="mi")
 CONFIG = CalibrationConfig(objective=MI)
@@ -168,7 +168,9 @@ def test_frames_that_are_one_look_claim_less_of_where_the_camera_is(
 ) -> None:
     config = CalibrationConfig(search=SearchConfig(dof=6))
     several = solve(sharp_street, stereo, config).sigma
-    monkeypatch.setattr(calibrator, "independent_samples_at", lambda edges, pose: replace(independent_samples_at(edges, pose), count=1.0))
+    monkeypatch.setattr(
+        pipeline, "independent_samples_at", lambda edges, pose: replace(independent_samples_at(edges, pose), count=1.0)
+    )
     one = solve(sharp_street, stereo, config).sigma
     assert (one >= several).all()
     assert (one[3:] > several[3:]).all()

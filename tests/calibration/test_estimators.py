@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.estimators import WindowData, depth_features, runner_up
 from coec.calibration.ports import Silence
+from coec.calibration.solver import WindowData, depth_features, runner_up
 from coec.calibration.types import CameraFrame, DepthMap, Metric, Window
 from coec.config import LimitsConfig
-from coec.geometry.vectors import lengths
+from coec.geometry.points import lengths
+from coec.io.images import GreyImages
 
 BEAMS, FIRINGS = 16, 1_800
 ELEVATION_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], np.float64)

@@ -7,11 +7,12 @@ from functools import partial, reduce
 import numpy as np
 import pytest
 
-from coec.calibration.lifecycle import (
+from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState, Observation
+from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.calibration.state import (
     CalibrationStatus,
     CommandRefusedError,
     ExtrinsicHold,
-    HealthState,
     PairRules,
     PairState,
     Provenance,
@@ -32,8 +33,7 @@ from coec.calibration.lifecycle import (
     time_stepped_back,
     urgent_window_since,
 )
-from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState, Observation
-from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.calibration.state_machine import HealthState
 from coec.calibration.types import (
     Decision,
     Estimate,

@@ -6,8 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from coec.calibration.lifecycle import AlarmRecord, HealthState
-from coec.calibration.lifecycle.alarm_record import GAP_NS
+from coec.calibration.state_machine import GAP_NS, AlarmRecord, HealthState
 
 S = 1_000_000_000
 HEALTHY, SUSPECT, RED = HealthState.HEALTHY, HealthState.SUSPECT, HealthState.MISCALIBRATED

@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 
 from calibration.test_lifecycle import RIG, RULES, check, estimate, moved_within
-from coec.calibration import lifecycle
-from coec.calibration.lifecycle import ExtrinsicHold, HealthState, PairState
+from coec.calibration import state as lifecycle
 from coec.calibration.monitor.change_detector import ACQUITTAL_PERIODS, Observation, holds_at_rest
 from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.calibration.state import ExtrinsicHold, PairState
+from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Decision, Estimate
-from coec.runtime.decisions.progress import CheckProgress
-from coec.runtime.ingest.chooser import SelectionStatistics
-from coec.runtime.ingest.decoder import CAMERA, LIDAR, StreamCounts
-from coec.runtime.ingest.stream_statistics import StreamStatistics
+from coec.service.engine.check_progress import CheckProgress
+from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
+from coec.service.ingest.frame_selector import SelectionStatistics
+from coec.service.ingest.pair_stream import StreamStatistics
 
 S = 1_000_000_000
 PERIOD_S = RULES.monitor.period_s

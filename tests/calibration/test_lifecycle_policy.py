@@ -5,7 +5,7 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.calibration.lifecycle.policy import NS_PER_DAY, AppliedChange, agrees, objection, remembered
+from coec.calibration.state_machine import NS_PER_DAY, AppliedChange, agrees, objection, remembered
 from coec.config import PolicyConfig
 
 LIMITS = PolicyConfig(max_step_deg=2.0, max_step_m=0.1, max_per_day_deg=5.0, max_per_day_m=0.2)

@@ -2,8 +2,7 @@
 
 import pytest
 
-from coec.calibration.lifecycle import MEANING, TRANSITIONS, HealthEvent, HealthState, markdown
-from coec.calibration.lifecycle.states import STATES
+from coec.calibration.state_machine import MEANING, STATES, TRANSITIONS, HealthEvent, HealthState, markdown
 from conftest import REPOSITORY
 from generate.service import health_page
 

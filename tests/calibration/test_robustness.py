@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.depth.maps import CachedDepth, open_depth
-from coec.adapters.images.codec import CachedGreys, GreyImages
-from coec.calibration.calibrator import calibrate
+from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Decision, Estimate, Window
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
-from coec.sources import windows
-from scenarios import DEGRADATIONS, torn_clusters_in_the_cloud
+from coec.io.depth.depth_maps import CachedDepth, open_depth
+from coec.io.images import CachedGreys, GreyImages
+from coec.io.recordings import window_cutting
+from support.degradations import DEGRADATIONS, torn_clusters_in_the_cloud
 
 CONFIGURATION = CalibrationConfig()
 GREY = GreyImages(LimitsConfig())
@@ -114,7 +114,7 @@ def test_a_mutation_is_seeded_and_leaves_its_window_alone(street: Window, scenar
 @pytest.fixture(scope="module", params=["image_00", "image_01"])
 def drive(sample_data: Path, request: pytest.FixtureRequest) -> Window:
     """Ten frames of KITTI-360."""
-    return windows.load_window(
+    return window_cutting.load_window(
         f"kitti360:{sample_data / 'kitti360'}?camera={request.param}", None, 25, lambda *_: None
     ).window
 
@@ -155,7 +155,9 @@ def test_what_takes_evidence_away_lowers_the_confidence(drive: Window, network: 
 )
 def test_frames_of_one_view_do_not_lead_away_from_a_calibration_in_use(sample_data: Path) -> None:
     """Slow traffic under a bridge, six degrees of freedom: 12.6° aside edges stand out a quarter more."""
-    window = windows.load_window(f"kitti-raw:{sample_data / 'kitti_raw_2011_09_26'}", None, 25, lambda *_: None).window
+    window = window_cutting.load_window(
+        f"kitti-raw:{sample_data / 'kitti_raw_2011_09_26'}", None, 25, lambda *_: None
+    ).window
     six = CONFIGURATION.model_copy(update={"search": CONFIGURATION.search.model_copy(update={"dof": 6})})
     estimate = calibrate(window, open_depth(six.depth, LimitsConfig()), GREY, six, Silence())
     assert np.degrees(np.linalg.norm(estimate.correction[:3])) < REFERENCE_DEG

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coec.calibration.steps import METRES_PER_RADIAN, POLISH_METRES_PER_RADIAN, of_both
+from coec.calibration.search.prior import METRES_PER_RADIAN, POLISH_METRES_PER_RADIAN, of_both
 from coec.geometry import se3
 
 

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.looks import IndependentSamples
-from coec.calibration.confidence.loosened import CLOCKS_FREE, LENS_FREE, RelaxedAssumption
-from coec.calibration.objective.curvature import Curvature
+from coec.calibration.objective.derivatives import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
 from coec.calibration.types import (
@@ -22,6 +20,8 @@ from coec.calibration.types import (
     Verdict,
     Window,
 )
+from coec.calibration.uncertainty.nuisance_parameters import CLOCKS_FREE, LENS_FREE, RelaxedAssumption
+from coec.calibration.uncertainty.scatter import IndependentSamples
 from coec.calibration.verdict import (
     change_metric,
     counted_once,

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from coec.adapters.mcap.bag_writer import write_bag
 from coec.calibration.types import Matrix4
 from coec.geometry.se3 import rotation_angle_rad, rotation_from_quaternion_xyzw
-from coec.sources import open_source
+from coec.io.mcap.bag_writer import write_bag
+from coec.io.recordings.layouts import open_source
 from e2e.processes import coec
 
 NS_PER_S = 1_000_000_000

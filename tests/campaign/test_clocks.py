@@ -29,7 +29,7 @@ from campaign.watching import (
     transitions,
     watching,
 )
-from coec.adapters.files.state_file import StateFile
+from coec.io.storage import StateFile
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 pytestmark = pytest.mark.slow

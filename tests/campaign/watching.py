@@ -17,13 +17,13 @@ import psutil
 import zenoh
 
 from campaign.drives import Drive, Truth
-from coec.adapters.frames.msgpack_frames import decode_ego
-from coec.adapters.zenoh.client import query_one
 from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, PolicyConfig, WindowConfig, load_config
 from coec.errors import CoecError
+from coec.io.msgpack_frames import decode_ego
+from coec.io.recordings.layouts import open_source
+from coec.io.zenoh.query_client import query_one
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
-from coec.sources import open_source
 from e2e.processes import (
     COMMAND,
     Service,

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from coec.cli.main import main
-from coec.evaluation import check_run, matrix_run  # noqa: F401  they render themselves, whichever test loads them first
 from coec_lab.commands import drive_bags  # noqa: F401  so does this
-from drives import rendered_drive
+from coec_lab.experiments import check_drives, matrix_drives  # noqa: F401  they render themselves, whichever test loads them first
+from support.simulated_drives import rendered_drive
 
 SMALL = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"
 """Six frames, two seconds apart, with exact depth."""
@@ -22,7 +22,7 @@ SMALL = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lida
 @pytest.fixture(autouse=True)
 def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A simulated drive is drawn by the first command that opens it, and handed to the others as it is."""
-    monkeypatch.setattr("coec.simulation.source.open_sim", rendered_drive)
+    monkeypatch.setattr("coec_lab.simulation.source.open_sim", rendered_drive)
 
 
 @dataclass(frozen=True)

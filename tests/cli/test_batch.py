@@ -9,7 +9,7 @@ import duckdb
 import pytest
 
 from cli.conftest import Coec
-from fleet_windows import recorded_windows
+from support.fleet import recorded_windows
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.files import output
-from coec.adapters.images.codec import encode_png
 from coec.calibration.ports import DepthModel
 from coec.config import DepthConfig, LimitsConfig, VerdictConfig
 from coec.errors import OutputError, UsageError
-from coec.sources.windows import evenly_spread, parse_perturbation
+from coec.io import user_files
+from coec.io.depth.depth_maps import open_depth
+from coec.io.images import encode_png
+from coec.io.recordings.window_cutting import evenly_spread, parse_perturbation
 
 TOLERANCE_DEG = 0.35
 
@@ -77,7 +77,7 @@ def test_a_result_that_cannot_be_written_in_the_end_is_printed(
     def full(path: Path, _: bytes) -> Path:
         raise OutputError(f"cannot write {path}: No space left on device")
 
-    monkeypatch.setattr(output, "write_output", full)
+    monkeypatch.setattr(user_files, "write_output", full)
     arguments = ("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--output", tmp_path)
     outcome = coec(*arguments, "--json")
     assert outcome.status == 1

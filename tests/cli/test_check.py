@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from bags import Bag, drive_messages
 from cli.conftest import SMALL, Coec
+from support.recordings import Bag, drive_messages
 
 
 def test_a_good_recording_is_tabulated_and_tried(coec: Coec) -> None:

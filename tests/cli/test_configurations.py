@@ -8,13 +8,13 @@ import pytest
 from ruamel.yaml import YAML
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.files import output
 from coec.cli.check_config import example, template
 from coec.cli.convert import configuration_for
 from coec.config import Config, config_hash, load_config
 from coec.errors import ConfigError, OutputError
+from coec.io import user_files
 from coec.reports.commented_yaml import commented_yaml, short_yaml
-from coec.simulation.source import open_sim
+from coec_lab.simulation.source import open_sim
 from conftest import REPOSITORY
 
 
@@ -138,7 +138,7 @@ def test_an_edited_file_is_not_overwritten_unless_asked(coec: Coec, tmp_path: Pa
 def test_a_failed_conversion_does_not_refuse_the_next(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    replace = output.replace_output
+    replace = user_files.replace_output
 
     def full_disk(path: Path, data: bytes) -> Path:
         if path.suffix == ".yaml":
@@ -146,7 +146,7 @@ def test_a_failed_conversion_does_not_refuse_the_next(
         return replace(path, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr(output, "replace_output", full_disk)
+        patch.setattr(user_files, "replace_output", full_disk)
         assert coec("convert", SMALL, tmp_path / "coec.yaml").status == 1
     assert list(tmp_path.iterdir()) == []
     assert coec("convert", SMALL, tmp_path / "coec.yaml").status == 0

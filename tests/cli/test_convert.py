@@ -8,8 +8,8 @@ import numpy as np
 
 from cli.conftest import SMALL, Coec
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.sources import open_source
-from readers import read_recording
+from coec.io.recordings.layouts import open_source
+from support.readers import read_recording
 
 
 def test_bag_reads_back_to_the_same_frames(coec: Coec, tmp_path: Path) -> None:

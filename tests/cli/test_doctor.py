@@ -22,22 +22,21 @@ import pytest
 import zenoh
 
 from cli.conftest import Coec
-from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
-from coec.adapters.system import clock
-from coec.adapters.zenoh.bus import MSGPACK, open_session
-from coec.adapters.zenoh.endpoints import Endpoint
-from coec.adapters.zenoh.ros_topics import RosTopicList
-from coec.adapters.zenoh.tls import CertificateError, TlsFiles, host_and_port, read_certificate, tls_files
 from coec.calibration.types import LidarFrame
 from coec.cli import doctor_computer, doctor_connection
 from coec.cli.doctor import examine
 from coec.cli.doctor_streams import StreamSamples, stream_findings
 from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, ZenohConfig, load_config
+from coec.io import system
+from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.io.zenoh.bus import MSGPACK, open_session
+from coec.io.zenoh.endpoints import CertificateError, Endpoint, TlsFiles, host_and_port, read_certificate, tls_files
+from coec.io.zenoh.ros_node import RosTopicList
 from coec.reports.commented_yaml import commented_yaml
-from coec.schemas.doctor import Finding
+from coec.schemas.documents import Finding
 from conftest import REPOSITORY
-from pair_bench import frame_pair_at, pair_configuration
-from ports import free_port
+from support.router import free_port
+from support.vehicles import frame_pair_at, pair_configuration
 
 RATE_HZ = 10.0
 SECONDS = 1.5
@@ -498,19 +497,19 @@ def test_a_cold_cache_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("state", "level"),
     [
-        (clock.ClockState(True, 0.002), "ok"),
-        (clock.ClockState(True, 16.0), "warn"),
-        (clock.ClockState(False, 0.002), "warn"),
+        (system.ClockState(True, 0.002), "ok"),
+        (system.ClockState(True, 16.0), "warn"),
+        (system.ClockState(False, 0.002), "warn"),
         (None, "warn"),
     ],
 )
 def test_a_clock_that_nobody_keeps_is_told(
-    monkeypatch: pytest.MonkeyPatch, state: clock.ClockState | None, level: str
+    monkeypatch: pytest.MonkeyPatch, state: system.ClockState | None, level: str
 ) -> None:
     monkeypatch.setattr(doctor_computer, "clock_state", lambda: state)
     assert doctor_computer.clock_finding().level == level
 
 
 def test_the_kernel_tells_of_its_clock() -> None:
-    told = clock.clock_state()
+    told = system.clock_state()
     assert told is None or told.max_error_s > 0

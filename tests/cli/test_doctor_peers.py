@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 import zenoh
 
-import rmw_zenoh_defaults
 from coec.cli.doctor import examine
-from coec.schemas.doctor import Finding
+from coec.schemas.documents import Finding
 from conftest import REPOSITORY
-from ports import free_port
-from ros_nodes import RosDriver
+from support import ros
+from support.ros import RosDriver
+from support.router import free_port
 
 SECONDS = 0.5
 CAMERA, POINTS = "/camera/image_raw/compressed", "/points"
@@ -51,7 +51,7 @@ def silent_router(endpoint: str) -> AbstractContextManager[zenoh.Session]:
 def sending(endpoint: str) -> Iterator[None]:
     """A node whose camera and LiDAR send until the end of the block."""
     end = threading.Event()
-    with rmw_zenoh_defaults.rmw_node(endpoint) as session:
+    with ros.rmw_node(endpoint) as session:
         drivers = [RosDriver(session, topic, kind, 10 * n) for n, (topic, kind) in enumerate(TOPICS.items(), start=1)]
 
         def send() -> None:
@@ -100,8 +100,8 @@ def of(findings: Sequence[Finding], check: str, where: str | None = None) -> Fin
 @pytest.mark.parametrize(
     ("router", "session"),
     [
-        (rmw_zenoh_defaults.rmw_router, None),
-        (rmw_zenoh_defaults.rmw_router, GOSSIPS),
+        (ros.rmw_router, None),
+        (ros.rmw_router, GOSSIPS),
         (shipped, None),
         (shipped, GOSSIPS),
         (silent_router, None),
@@ -133,7 +133,7 @@ def test_what_the_service_receives_is_in_order(
     ("router", "session", "cause", "way_out"),
     [
         (
-            rmw_zenoh_defaults.rmw_router,
+            ros.rmw_router,
             DEAF,
             "a peer without gossip",
             "`mode`, `listen` and `scouting` out of zenoh.file",
@@ -170,8 +170,8 @@ def test_the_service_that_runs_is_not_disturbed_by_a_second_session_of_its_setti
         "connect/endpoints": [endpoint],
     }
     with (
-        rmw_zenoh_defaults.rmw_router(endpoint) as router,
-        zenoh.open(rmw_zenoh_defaults.rmw_settings(rmw_zenoh_defaults.RMW_SESSION, taken)) as service,
+        ros.rmw_router(endpoint) as router,
+        zenoh.open(ros.rmw_settings(ros.RMW_SESSION, taken)) as service,
         sending(endpoint),
     ):
         findings = found(tmp_path, endpoint, own)

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.ros.wire.publisher import Publisher
-from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.cli.doctor_streams import NAMED, StreamSamples, stream_findings, topic_findings
 from coec.config import IDENTITY, Config
-from coec.runtime.ingest.decoder import StreamCounts
+from coec.io.ros.wire_format import Publisher
+from coec.io.zenoh.ros_node import RosTopicList
+from coec.service.ingest.decoder import StreamCounts
 
 IMAGE, POINTS = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2"
 LEFT, RIGHT = b"l" * 16, b"r" * 16

@@ -11,16 +11,16 @@ import pytest
 from ruamel.yaml import YAML
 
 from cli.conftest import Coec
-from coec.adapters.files.conversions import result_of
-from coec.calibration.lifecycle import PairRules, PairState, after_estimate, initial_state
+from coec.calibration.state import PairRules, PairState, after_estimate, initial_state
 from coec.calibration.types import Decision, Reason, Verdict
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.geometry import cameras, se3
-from coec.runtime.api.extrinsic import extrinsic_of
-from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.decisions.stored_pair import Clocks
-from coec.schemas.base import to_json
-from estimates import ESTIMATE_RIG, estimate
+from coec.io.serialise import result_of
+from coec.schemas.message import to_json
+from coec.service.api.reply_builders import extrinsic_of
+from coec.service.records.state_store import StateStore
+from coec.service.records.stored_pair import Clocks
+from support.estimates import ESTIMATE_RIG, estimate
 
 RULES = PairRules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
 CLOCKS = Clocks(None, None, None)

@@ -16,26 +16,37 @@ import pytest
 import zenoh
 
 from cli.conftest import Coec
-from coec.adapters.images.codec import encode_jpeg
-from coec.adapters.mcap.windows import WindowWriter, write_result
-from coec.adapters.zenoh.bus import Answer
-from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.window_fetch import PIECE_BYTES, SPARE_BYTES, NoSpaceError, RecordingInfo, fetch_window
 from coec.cli import fetch as cli_fetch
 from coec.config import UplinkConfig, ZenohConfig
 from coec.errors import NotFoundError, RemoteError, UsageError
-from coec.runtime.api.uplink import BURST_BYTES
-from coec.runtime.recording.digests import DigestReader
-from coec.schemas.base import to_json
-from coec.schemas.incident import IncidentReport
+from coec.io.images import encode_jpeg
+from coec.io.mcap.window_writer import WindowWriter, write_result
+from coec.io.zenoh.bus import Answer
+from coec.io.zenoh.query_client import connected
+from coec.io.zenoh.window_fetch import PIECE_BYTES, SPARE_BYTES, NoSpaceError, RecordingInfo, fetch_window
+from coec.schemas.documents import IncidentReport
 from coec.schemas.keys import Keys, parse_range_selector
+from coec.schemas.message import to_json
 from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
+from coec.service.api.uplink import BURST_BYTES
+from coec.service.recording.recorder import DigestReader
 from e2e.processes import Router
-from fakes import wait_until
-from last_words import heartbeat, packed_heartbeat
-from pair_bench import BEGIN_S, DRIVE_END_S, NOMINAL, NS_PER_S, PAIR_RIG, PairBench, frame_pair_at
-from storages import MemoryStorage
-from vehicles import KEYS, PAIR, ServingVehicle, serving
+from support.fake_worker import wait_until
+from support.messages import heartbeat, packed_heartbeat
+from support.router import MemoryStorage
+from support.vehicles import (
+    BEGIN_S,
+    DRIVE_END_S,
+    KEYS,
+    NOMINAL,
+    NS_PER_S,
+    PAIR,
+    PAIR_RIG,
+    PairBench,
+    ServingVehicle,
+    frame_pair_at,
+    serving,
+)
 
 VEHICLE = "vehicle"
 DATA = bytes(range(256)) * 6000

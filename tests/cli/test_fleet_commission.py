@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from baselines import a_baseline
 from cli.conftest import Coec
-from coec.adapters.files.baseline_file import load_baseline, save_baseline
+from coec.io.baseline_file import load_baseline, save_baseline
+from support.estimates import a_baseline
 
 
 @pytest.fixture

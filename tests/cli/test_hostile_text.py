@@ -13,17 +13,17 @@ from mcap.writer import Writer
 from pydantic import BaseModel
 
 import coec as coec_library
-from bags import TREE, Bag, camera_info_message, compressed_image_message, drive_messages, transform_message
 from cli.conftest import Coec, Outcome
-from coec.adapters.zenoh.bus import JSON, MSGPACK
-from coec.adapters.zenoh.client import Reply, connected
 from coec.cli import doctor, query
 from coec.cli.doctor_connection import service_findings
 from coec.config import Config
 from coec.errors import DecodeError, RemoteError
+from coec.io.zenoh.bus import JSON, MSGPACK
+from coec.io.zenoh.query_client import Reply, connected
 from coec.reports import console, fleet_board, replies
-from coec.schemas import base, fleet_now, last_word, rig_state
-from coec.schemas.doctor import Finding
+from coec.schemas import fleet as fleet_now
+from coec.schemas import heartbeat, message, rig_state
+from coec.schemas.documents import Finding
 from coec.schemas.keys import Keys
 from coec.schemas.replies import (
     Acknowledgement,
@@ -37,8 +37,16 @@ from coec.schemas.replies import (
     WindowsReply,
 )
 from e2e.processes import Router
-from hostile import HOSTILE, HOSTILE_SHORT, hostile_message, message_texts, obeyed_characters
-from pair_bench import pair_configuration
+from support.recordings import (
+    TREE,
+    Bag,
+    camera_info_message,
+    compressed_image_message,
+    drive_messages,
+    transform_message,
+)
+from support.strategies import HOSTILE, HOSTILE_SHORT, hostile_message, message_texts, obeyed_characters
+from support.vehicles import pair_configuration
 
 KEYS = Keys("coec", "hostile")
 REFUSING = Keys("coec", "refusing")
@@ -75,22 +83,22 @@ def everything() -> dict[str, tuple[bytes, str]]:
     }
     config = json.dumps({HOSTILE: [HOSTILE, {"x": HOSTILE}]}, ensure_ascii=False).encode()
     return {
-        **{key: (base.to_json(model), JSON) for key, model in of_models.items()},
+        **{key: (message.to_json(model), JSON) for key, model in of_models.items()},
         KEYS.config: (config, JSON),
         KEYS.metrics: (f"# HELP {HOSTILE}\n{HOSTILE} 1\n".encode(), "text/plain"),
-        KEYS.last("front"): (base.to_msgpack(a_word()), MSGPACK),
+        KEYS.last("front"): (message.to_msgpack(a_word()), MSGPACK),
     }
 
 
-def a_word() -> last_word.LastWord:
-    return hostile_message(last_word.LastWord, vehicle=KEYS.vehicle, pair="front")
+def a_word() -> heartbeat.LastWord:
+    return hostile_message(heartbeat.LastWord, vehicle=KEYS.vehicle, pair="front")
 
 
 @pytest.fixture(scope="module")
 def vehicle(router: Router) -> Iterator[str]:
     """The endpoint of a router with a vehicle that answers everything with texts that a terminal would obey, and one
     that refuses everything in such words."""
-    refusal = base.to_json(hostile_message(ErrorReply))
+    refusal = message.to_json(hostile_message(ErrorReply))
 
     def answer(key: str, payload: bytes, encoding: str) -> Callable[[zenoh.Query], None]:
         def reply(asked: zenoh.Query) -> None:
@@ -149,7 +157,7 @@ def test_a_reply_steers_no_terminal(coec: Coec, vehicle: str, styled: bool, key:
 def test_whatever_fixed_words_a_reply_has_it_steers_no_terminal(
     capsys: pytest.CaptureFixture[str], styled: bool, kind: str, choice: int
 ) -> None:
-    replies.BY_KIND[kind](base.to_json(hostile_message(MODELS[kind], choice)))
+    replies.BY_KIND[kind](message.to_json(hostile_message(MODELS[kind], choice)))
     captured = capsys.readouterr()
     assert obeyed_characters(captured.out, styled=styled) == ""
     assert captured.out

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags import Bag, drive_messages
 from cli.conftest import Coec
+from support.recordings import Bag, drive_messages
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

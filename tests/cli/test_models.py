@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.depth.maps import open_depth
 from coec.config import DepthConfig, LimitsConfig
-from coec.schemas.evaluation import ModelAssessment
-from tiny_onnx import first_channel_network
+from coec.io.depth.depth_maps import open_depth
+from coec_lab.experiments.evaluation_schema import ModelAssessment
+from support.recordings import first_channel_network
 
 
 def test_lists_the_cards_of_the_contract(coec: Coec) -> None:

@@ -15,14 +15,14 @@ import xxhash
 import zenoh
 from mcap.writer import Writer
 
-from bags import STORE, Bag, drive_messages
 from cli.conftest import SMALL, Coec
-from coec.adapters.ros.incoming import decode
-from coec.adapters.ros.wire.rmw_zenoh import MessageAttachment
-from coec.adapters.zenoh.bus import open_session
 from coec.config import LimitsConfig, ZenohConfig
-from fakes import wait_until
-from ports import free_port
+from coec.io.ros.message_decoding import decode
+from coec.io.ros.wire_format import MessageAttachment
+from coec.io.zenoh.bus import open_session
+from support.fake_worker import wait_until
+from support.recordings import STORE, Bag, drive_messages
+from support.router import free_port
 
 SECONDS = 20.0
 TF_KEY = (

@@ -6,14 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from certificates import TestAuthority
 from cli.conftest import Coec
-from coec.adapters.zenoh.bus import open_session
 from coec.config import SenderConfig, ZenohConfig
-from doors import shipped_router
-from fakes import wait_until
-from ports import free_port
-from vehicles import KEYS, VEHICLE_LIMITS, serving
+from coec.io.zenoh.bus import open_session
+from support.fake_worker import wait_until
+from support.router import TestAuthority, free_port, shipped_router
+from support.vehicles import KEYS, VEHICLE_LIMITS, serving
 
 
 @pytest.mark.fault("`coec query command/...` by somebody without permission", "it says `not_allowed`, and exits with 1")

@@ -16,15 +16,15 @@ import pytest
 import coec as package
 from cli.conftest import SMALL, Coec
 from coec import api
-from coec.adapters.mcap.windows import WindowWriter
 from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig
 from coec.errors import NotAcceptedError, OutputError, SourceError, UsageError
-from coec.schemas.base import to_json
-from coec.schemas.evaluation import EvaluationReport
+from coec.io.mcap.window_writer import WindowWriter
+from coec.schemas.message import to_json
 from coec.schemas.replies import CalibrationResult
+from coec_lab.experiments.evaluation_schema import EvaluationReport
 from conftest import REPOSITORY
-from drives import rendered_drive
 from e2e.processes import environment
+from support.simulated_drives import rendered_drive
 
 HEAVY = ("asyncio", "cv2", "matplotlib", "numba", "numpy", "onnxruntime", "pydantic", "rich", "typing", "zenoh")
 TEN_LINES = REPOSITORY / "docs" / "examples" / "calibrate.py"
@@ -41,7 +41,7 @@ def drive() -> package.Recording:
 def results() -> dict[float, package.Result]:
     """Of the drive, by how far the start is off in yaw: right, and beyond what can be found."""
     with pytest.MonkeyPatch.context() as patch:  # as `drawn_once`, which comes later
-        patch.setattr("coec.simulation.source.open_sim", rendered_drive)
+        patch.setattr("coec_lab.simulation.source.open_sim", rendered_drive)
         window = package.open(SMALL).window()
     return {yaw: window.calibrate(depth="stereo", objective="mi", perturb=(0, yaw, 0)) for yaw in (1.0, 40.0)}
 

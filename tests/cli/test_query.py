@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.zenoh.bus import JSON, Answer, Bus, QueryLane, Request, Route, open_session
 from coec.cli.query import KEYS as HELPED
 from coec.cli.query import PLAIN_KEYS, WITH_ARGUMENT, query
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError
-from coec.schemas.base import Message, to_json
+from coec.io.zenoh.bus import JSON, Answer, Bus, QueryLane, Request, Route, open_session
 from coec.schemas.commands import COMMAND_NAMES, arguments_of
 from coec.schemas.keys import RIG, Keys, parse_command_selector, parse_range_selector
+from coec.schemas.message import Message, to_json
 from coec.schemas.replies import (
     Acknowledgement,
     PairStatus,
@@ -30,8 +30,8 @@ from coec.schemas.replies import (
     WindowsReply,
 )
 from conftest import REPOSITORY
-from ports import free_port
-from statuses import status_reply
+from support.messages import status_reply
+from support.router import free_port
 
 DEADLINE_S = 20.0
 KEYS = Keys("coec", "vehicle")

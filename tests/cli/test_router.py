@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from cli.conftest import Coec
-from coec.adapters.zenoh.client import connected
 from coec.errors import ConfigError, UnavailableError
-from fakes import wait_until
-from ports import free_port
+from coec.io.zenoh.query_client import connected
+from support.fake_worker import wait_until
+from support.router import free_port
 
 
 def written(folder: Path, **settings: object) -> Path:

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from cli.conftest import Coec
-from coec.adapters.system.installed import pinned_hashes
 from coec.cli.sbom import inventory_here
+from coec.io.installed_packages import pinned_hashes
 from coec.reports.bill_of_materials import NOT_STATED, Inventory, cyclonedx, licence_table
 from conftest import REPOSITORY
 

@@ -18,26 +18,26 @@ import pytest
 pytest.importorskip("foxglove", reason="needs the optional extra `foxglove`")
 
 from adapters.foxglove.test_shown import places, projected
-from boards import BOARD_MOVED, BOARD_NOMINAL
 from cli.conftest import SMALL, Coec, Outcome
 from cli.vehicle_on_screen import CANDIDATE, KEYS, PAIR, RIG, Sensors, Service, configuration, extrinsic, health
-from coec.adapters.files.conversions import result_of
-from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.topics import POINTS_TOPICS, TOPIC_DESCRIPTIONS, DisplayedPose
-from coec.adapters.frames.msgpack_frames import encode_lidar
-from coec.adapters.zenoh.bus import MSGPACK
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Rig
 from coec.errors import ConfigError, ConnectionFailedError, SourceError, UnavailableError, UsageError
 from coec.geometry import se3
+from coec.io import viewer_scene
+from coec.io.msgpack_frames import encode_lidar
+from coec.io.recordings.window_cutting import window_of_recording
+from coec.io.serialise import result_of
+from coec.io.viewer_scene import POINTS_TOPICS, TOPIC_DESCRIPTIONS, DisplayedPose
+from coec.io.zenoh.bus import MSGPACK
 from coec.reports import console
-from coec.schemas.base import to_json
-from coec.sources.windows import window_of_recording
-from drives import rendered_source
+from coec.schemas.message import to_json
 from e2e.processes import Router, free_endpoint
-from estimates import estimate
-from fakes import wait_until
-from foxglove_viewer import Viewer
+from support.estimates import estimate
+from support.fake_worker import wait_until
+from support.readers import Viewer
+from support.scenes import BOARD_MOVED, BOARD_NOMINAL
+from support.simulated_drives import rendered_source
 
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""
@@ -97,7 +97,7 @@ def came(message: Any) -> np.ndarray:
 
 def take(stamps: list[int], viewer: Viewer) -> None:
     """The stamp of the next picture; one that rests on the screen is shown again now and then."""
-    stamp = stamp_ns(viewer.next_on(topics.IMAGE_TOPIC))
+    stamp = stamp_ns(viewer.next_on(viewer_scene.IMAGE_TOPIC))
     if not stamps or stamps[-1] != stamp:
         stamps.append(stamp)
 
@@ -133,7 +133,7 @@ def test_a_recording_is_shown_and_stays_to_be_seen(viewing: Callable[..., Outcom
 
     def look(url: str) -> None:
         with Viewer(url) as viewer:
-            viewer.subscribe([topics.IMAGE_TOPIC, topics.HEALTH_TOPIC, *POINTS_TOPICS.values()])
+            viewer.subscribe([viewer_scene.IMAGE_TOPIC, viewer_scene.HEALTH_TOPIC, *POINTS_TOPICS.values()])
             while len(stamps) < len(recording.camera_stamps_ns):
                 take(stamps, viewer)
             picture = synchronised(viewer, set(POINTS_TOPICS.values()))  # the last pair, which stays
@@ -144,12 +144,12 @@ def test_a_recording_is_shown_and_stays_to_be_seen(viewing: Callable[..., Outcom
                 drawn = places(came(picture[POINTS_TOPICS[pose]]))
                 assert len(drawn) > 500
                 assert drawn <= places(projected(rig.camera, T_camera_lidar, xyz_m))
-            moment = viewer.next_on(topics.HEALTH_TOPIC)
+            moment = viewer.next_on(viewer_scene.HEALTH_TOPIC)
         assert (moment["state"], moment["status"], moment["candidate"]) == ("recorded", "accepted", True)
         assert moment["step"]["rx_deg"] == pytest.approx(3.0)
         with Viewer(url) as late:
-            late.subscribe([topics.IMAGE_TOPIC])
-            assert stamp_ns(late.next_on(topics.IMAGE_TOPIC)) == stamps[-1], "who comes late sees the last pair"
+            late.subscribe([viewer_scene.IMAGE_TOPIC])
+            assert stamp_ns(late.next_on(viewer_scene.IMAGE_TOPIC)) == stamps[-1], "who comes late sees the last pair"
 
     outcome = viewing(look, SMALL, "--rate", "20", "--result", result_file(tmp_path, rig, turned))
     assert outcome.status == 0
@@ -165,10 +165,10 @@ def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Out
 
     def look(url: str) -> None:
         with Viewer(url) as viewer:
-            viewer.subscribe([topics.IMAGE_TOPIC, topics.HEALTH_TOPIC])
+            viewer.subscribe([viewer_scene.IMAGE_TOPIC, viewer_scene.HEALTH_TOPIC])
             while len(stamps) < 9:
                 take(stamps, viewer)
-            assert viewer.next_on(topics.HEALTH_TOPIC)["state"] == "recorded", "however fast it is played"
+            assert viewer.next_on(viewer_scene.HEALTH_TOPIC)["state"] == "recorded", "however fast it is played"
 
     assert viewing(look, SMALL, "--rate", "100", "--repeat").status == 0
     recorded = list(rendered_source(SMALL).camera_stamps_ns)
@@ -183,7 +183,7 @@ def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Out
 def until(viewer: Viewer, condition: Callable[[Any], bool], meanwhile: Callable[[], None] = lambda: None) -> Any:
     """The first line of the timeline for which it holds. What is done `meanwhile` may be lost on a busy bus."""
     end_s = time.monotonic() + PATIENCE_S
-    while not condition(moment := viewer.next_on(topics.HEALTH_TOPIC)):
+    while not condition(moment := viewer.next_on(viewer_scene.HEALTH_TOPIC)):
         assert time.monotonic() < end_s, moment
         meanwhile()
     return moment
@@ -195,8 +195,8 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
 ) -> None:
     def look(url: str) -> None:
         with Viewer(url) as viewer, Sensors(router.session) as sensors:
-            viewer.subscribe([topics.HEALTH_TOPIC, topics.LOG_TOPIC])
-            assert viewer.next_on(topics.HEALTH_TOPIC)["state"] == "not_served"
+            viewer.subscribe([viewer_scene.HEALTH_TOPIC, viewer_scene.LOG_TOPIC])
+            assert viewer.next_on(viewer_scene.HEALTH_TOPIC)["state"] == "not_served"
             service = Service(router.session)
             moment = until(viewer, lambda moment: moment["state"] == "healthy" and "provenance" in moment)
             assert (moment["provenance"], moment["level"], moment["candidate"]) == ("estimated", 0, True)
@@ -204,8 +204,8 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
             assert "camera_s" not in moment["ages"]
             assert not sensors.are_heard, "nobody looks at pictures"
 
-            viewer.subscribe([topics.IMAGE_TOPIC, *POINTS_TOPICS.values()])
-            picture = synchronised(viewer, {topics.IMAGE_TOPIC, *POINTS_TOPICS.values()})
+            viewer.subscribe([viewer_scene.IMAGE_TOPIC, *POINTS_TOPICS.values()])
+            picture = synchronised(viewer, {viewer_scene.IMAGE_TOPIC, *POINTS_TOPICS.values()})
             expected = {
                 DisplayedPose.SERVED: BOARD_MOVED,
                 DisplayedPose.NOMINAL: BOARD_NOMINAL,
@@ -232,7 +232,7 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
                 pass
             wait_until(lambda: sensors.are_heard, "frames, still")
         with Viewer(url) as other, Sensors(router.session) as sensors:
-            other.subscribe([topics.HEALTH_TOPIC])
+            other.subscribe([viewer_scene.HEALTH_TOPIC])
             wait_until(lambda: not sensors.are_heard, "the end of the subscriptions")
 
     assert viewing(look, "--config", configuration(tmp_path, router.endpoint)).status == 0
@@ -247,7 +247,7 @@ def test_rubbish_is_counted(
     def look(url: str) -> None:
         service = Service(router.session)
         with Viewer(url) as viewer, Sensors(router.session) as sensors:
-            viewer.subscribe([topics.HEALTH_TOPIC, topics.IMAGE_TOPIC])
+            viewer.subscribe([viewer_scene.HEALTH_TOPIC, viewer_scene.IMAGE_TOPIC])
             until(viewer, lambda moment: moment["state"] == "healthy")
             wait_until(lambda: sensors.are_heard, "subscriptions")
             key = KEYS.extrinsic("front")
@@ -265,7 +265,7 @@ def test_rubbish_is_counted(
             }  # fmt: skip
             moment = until(viewer, lambda moment: refused <= counted(moment), babble)
             assert moment["provenance"] == "estimated", "what was served is served"
-            viewer.next_on(topics.IMAGE_TOPIC)
+            viewer.next_on(viewer_scene.IMAGE_TOPIC)
             record_property("figure", f"{len(refused)} causes")
         service.end()
 

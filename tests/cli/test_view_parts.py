@@ -10,11 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from boards import BOARD_MOVED, BOARD_NOMINAL
 from cli.vehicle_on_screen import PAIR, RIG, configuration, extrinsic, health
-from coec.adapters.foxglove.topics import DisplayedPose
-from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
-from coec.adapters.zenoh.bus import MSGPACK
 from coec.cli import view_vehicle
 from coec.cli.view import ListenAddress, listen_address
 from coec.cli.view_vehicle import (
@@ -27,10 +23,14 @@ from coec.cli.view_vehicle import (
 )
 from coec.config import load_config
 from coec.errors import UsageError
-from coec.schemas.base import from_msgpack
+from coec.io.msgpack_frames import encode_camera, encode_lidar
+from coec.io.viewer_scene import DisplayedPose
+from coec.io.zenoh.bus import MSGPACK
+from coec.schemas.message import from_msgpack
 from coec.schemas.replies import ExtrinsicReply, HealthReply
 from e2e.processes import Router
-from fakes import wait_until
+from support.fake_worker import wait_until
+from support.scenes import BOARD_MOVED, BOARD_NOMINAL
 
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""

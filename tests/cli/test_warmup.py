@@ -14,8 +14,8 @@ from coec.errors import OutputError, UsageError
 from coec.geometry import compiler
 from coec.geometry.cameras.registry import MODELS
 from coec.reports.commented_yaml import commented_yaml
-from coec.runtime.worker.kernels import compiled
-from rig_said import pair_config
+from coec.service.worker.compilation import compiled
+from support.rigs import pair_config
 
 
 def test_kernels_that_are_there_are_not_compiled_again(capsys: pytest.CaptureFixture[str]) -> None:

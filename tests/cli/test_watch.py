@@ -14,11 +14,11 @@ import pytest
 import zenoh
 
 from cli.conftest import Coec
-from coec.adapters.zenoh.bus import MSGPACK
 from coec.errors import ConfigError, ConnectionFailedError
+from coec.io.zenoh.bus import MSGPACK
 from coec.reports import console
-from coec.schemas.base import to_msgpack
 from coec.schemas.keys import Keys
+from coec.schemas.message import to_msgpack
 from coec.schemas.replies import Axes, AxisReply, DataQuality, HealthReply, HealthState, Reason
 from e2e.processes import Router, free_endpoint
 

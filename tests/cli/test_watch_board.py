@@ -15,23 +15,23 @@ import zenoh
 from rich.console import Console
 
 from cli.conftest import Coec
-from coec.adapters.images.codec import encode_jpeg
-from coec.adapters.system import keyboard
-from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.words import HeartbeatReceiver
 from coec.cli.fleet_screen import Board, PairQuery
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import DecodeError
-from coec.fleet.roster import FleetFilter, FleetState
-from coec.reports import half_blocks
-from coec.schemas.base import to_msgpack
+from coec.fleet.fleet_state import FleetFilter, FleetState
+from coec.io import system
+from coec.io.images import encode_jpeg
+from coec.io.zenoh.bus import open_session
+from coec.io.zenoh.query_client import connected
+from coec.io.zenoh.subscriptions import HeartbeatReceiver
+from coec.reports import fleet_board
 from coec.schemas.keys import Keys
+from coec.schemas.message import to_msgpack
 from coec.schemas.replies import HistoryReply
 from e2e.processes import Router, free_endpoint
-from fakes import wait_until
-from last_words import heartbeat, packed_heartbeat
-from storages import MemoryStorage
+from support.fake_worker import wait_until
+from support.messages import heartbeat, packed_heartbeat
+from support.router import MemoryStorage
 
 ALL = Keys("coec", "*")
 
@@ -200,7 +200,7 @@ def test_keys_are_read_as_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> N
     ours, theirs = os.openpty()
     with os.fdopen(theirs) as terminal, os.fdopen(ours, "wb", buffering=0) as hand:
         monkeypatch.setattr(sys, "stdin", terminal)
-        with keyboard.pressed_keys() as poll:
+        with system.pressed_keys() as poll:
             assert poll(0.0) is None
             for sent, key in ((b"\x1b[A", "up"), (b"q", "q"), (b"\xff", None), (b"\x1b[B", "down")):
                 hand.write(sent)
@@ -210,7 +210,7 @@ def test_keys_are_read_as_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.fault("an invalid picture from a vehicle", "refused, the board goes on")
 def test_a_picture_that_is_none_is_refused() -> None:
     with pytest.raises(DecodeError):
-        half_blocks.half_block_text(b"\xff\xd8\xff not a picture", 80, 24)
-    drawn = half_blocks.half_block_text(encode_jpeg(np.zeros((100, 400, 3), np.uint8)), 80, 24).plain
+        fleet_board.half_block_text(b"\xff\xd8\xff not a picture", 80, 24)
+    drawn = fleet_board.half_block_text(encode_jpeg(np.zeros((100, 400, 3), np.uint8)), 80, 24).plain
     rows = drawn.splitlines()
     assert (len(rows), {len(row) for row in rows}) == (10, {80})

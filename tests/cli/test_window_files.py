@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.conversions import result_of
-from coec.adapters.images.codec import GreyImages
-from coec.adapters.mcap.windows import WindowWriter, read_result, read_window, write_result
-from coec.calibration.calibrator import calibrate
+from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import Silence
 from coec.calibration.types import FramePair
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig, WindowConfig
 from coec.errors import SourceError
 from coec.geometry import se3
-from coec.sources import windows
-from coec.sources.between import with_thinned_pairs
-from drives import rendered_source
+from coec.io.depth.depth_maps import open_depth
+from coec.io.images import GreyImages
+from coec.io.mcap.window_reader import read_result, read_window
+from coec.io.mcap.window_writer import WindowWriter, write_result
+from coec.io.recordings import window_cutting
+from coec.io.recordings.window_cutting import with_thinned_pairs
+from coec.io.serialise import result_of
+from support.simulated_drives import rendered_source
 
 LIMITS = LimitsConfig()
 SHARP_STREET = "sim:seed=1&seconds=70&camera_hz=0.142857&lidar_hz=0.142857&camera=fisheye700&lidar=32&depth=yes"
@@ -36,8 +37,8 @@ CONFIGURATION = CalibrationConfig(
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A window with its result, as the service leaves it."""
-    loaded = windows.load_window(SMALL, None, 25, lambda *_: None)
-    window = windows.with_perturbed_start(loaded.window, np.array([0.02, -0.01, 0.01, 0, 0, 0]))
+    loaded = window_cutting.load_window(SMALL, None, 25, lambda *_: None)
+    window = window_cutting.with_perturbed_start(loaded.window, np.array([0.02, -0.01, 0.01, 0, 0, 0]))
     path = tmp_path_factory.mktemp("windows") / f"{window.window_id}.mcap"
     writer = WindowWriter(
         path, window.rig, window.T_camera_lidar_start, window.window_id, CONFIGURATION, {"vehicle": "v7"}
@@ -83,7 +84,7 @@ def test_replay_is_identical(coec: Coec, recorded: Path) -> None:
 
 def test_replay_of_a_window_that_holds_a_knock_dates_it_by_the_same_pairs(coec: Coec, tmp_path: Path) -> None:
     recording = rendered_source(SHARP_STREET)
-    loaded = windows.window_of_recording(recording, 5, lambda *_: None).window
+    loaded = window_cutting.window_of_recording(recording, 5, lambda *_: None).window
     window = with_thinned_pairs(loaded, recording, WindowConfig(between_s=5.0))
     knock_ns = window.between[2].stamp_ns
     back = se3.exp(np.array([0.0, -np.radians(2.0), 0.0, 0.0, 0.0, 0.0])).astype(np.float32)
@@ -130,7 +131,7 @@ def test_replay_names_the_fields_that_differ(coec: Coec, recorded: Path, tmp_pat
 
 
 def test_replay_without_a_result_says_so(coec: Coec, tmp_path: Path) -> None:
-    window = windows.load_window(SMALL, 1, 25, lambda *_: None).window
+    window = window_cutting.load_window(SMALL, 1, 25, lambda *_: None).window
     path = tmp_path / "bare-1.mcap"
     writer = WindowWriter(path, window.rig, window.T_camera_lidar_start, "bare-1", CONFIGURATION, {})
     writer.add(window.pairs[0])
@@ -150,21 +151,21 @@ def test_replay_of_a_damaged_window(coec: Coec, recorded: Path, tmp_path: Path) 
 
 
 def test_slices_of_a_recorded_window_are_counted_from_its_first_pair(recorded: Path) -> None:
-    whole = windows.load_window(str(recorded), None, 25, lambda *_: None).window.pairs
+    whole = window_cutting.load_window(str(recorded), None, 25, lambda *_: None).window.pairs
     span_s = (whole[-1].stamp_ns - whole[0].stamp_ns) * 1e-9
-    half = windows.load_window(str(recorded), None, 25, lambda *_: None, (0.0, span_s / 2)).window.pairs
+    half = window_cutting.load_window(str(recorded), None, 25, lambda *_: None, (0.0, span_s / 2)).window.pairs
     assert [pair.stamp_ns for pair in half] == [
         pair.stamp_ns for pair in whole if (pair.stamp_ns - whole[0].stamp_ns) * 1e-9 <= span_s / 2
     ]
     assert 0 < len(half) < len(whole)
     with pytest.raises(SourceError, match="no pair was recorded"):
-        windows.load_window(str(recorded), None, 25, lambda *_: None, (span_s + 1.0, span_s + 2.0))
+        window_cutting.load_window(str(recorded), None, 25, lambda *_: None, (span_s + 1.0, span_s + 2.0))
 
 
 def test_slices_of_a_recording_choose_among_their_own_frames() -> None:
-    whole = windows.load_window(SMALL, None, 25, lambda *_: None).window.pairs
+    whole = window_cutting.load_window(SMALL, None, 25, lambda *_: None).window.pairs
     # A frame every two seconds.
-    later = windows.load_window(SMALL, 2, 25, lambda *_: None, (3.0, 9.0)).window.pairs
+    later = window_cutting.load_window(SMALL, 2, 25, lambda *_: None, (3.0, 9.0)).window.pairs
     assert [pair.stamp_ns for pair in later] == [whole[2].stamp_ns, whole[4].stamp_ns]
 
 

@@ -10,17 +10,16 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from boards import BOARD_LENSES, BOARD_MOVED, BOARD_NOMINAL, board_frame_pair, board_rig
-from coec.adapters.files.conversions import transform_of
-from coec.adapters.files.rig import intrinsics_config
-from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
-from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.matching import has_subscribers
 from coec.config import Config
 from coec.geometry import se3
+from coec.io.msgpack_frames import encode_camera, encode_lidar
+from coec.io.rig_files import intrinsics_config
+from coec.io.serialise import transform_of
+from coec.io.zenoh.bus import MSGPACK
+from coec.io.zenoh.ros_node import has_subscribers
 from coec.reports.commented_yaml import commented_yaml
-from coec.schemas.base import to_msgpack
 from coec.schemas.keys import Keys
+from coec.schemas.message import to_msgpack
 from coec.schemas.replies import (
     ROS_LEVELS,
     Axes,
@@ -32,6 +31,7 @@ from coec.schemas.replies import (
     HealthState,
     Reason,
 )
+from support.scenes import BOARD_LENSES, BOARD_MOVED, BOARD_NOMINAL, board_frame_pair, board_rig
 
 RIG = board_rig(BOARD_LENSES["double_sphere"])
 PAIR = board_frame_pair(RIG.camera)

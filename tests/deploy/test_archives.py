@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.depth.model_cards import CARDS, built_in_cards
+from coec.io.depth.model_cards import CARDS, built_in_cards
 from conftest import REPOSITORY
 
 PACKAGE = "service/coec/"

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.zenoh.settings import settings_of, unguarded
 from coec.config import config_of, load_config, parse_yaml
 from coec.errors import ConfigError
+from coec.io.zenoh.session import settings_of, unguarded
 from conftest import REPOSITORY
 from deploy.written import DEPLOY, compose, exec_start, shipped_configurations, stages, unit
 

@@ -14,20 +14,17 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from certificates import TestAuthority
-from coec.adapters.zenoh.bus import MSGPACK, Answer
-from coec.adapters.zenoh.client import RouterAddress, connected, connected_by, query_all
-from coec.adapters.zenoh.settings import unguarded
 from coec.config import ZenohConfig
-from coec.schemas import last_word
+from coec.io.zenoh.bus import MSGPACK, Answer
+from coec.io.zenoh.query_client import RouterAddress, connected, connected_by, query_all
+from coec.io.zenoh.session import unguarded
+from coec.schemas import heartbeat as last_word
 from coec.schemas.keys import Keys
 from conftest import REPOSITORY
-from doors import ROUTER_RULES
-from fakes import wait_until
-from last_words import heartbeat, packed_heartbeat
-from ports import free_port
-from storages import MemoryStorage
-from vehicles import KEYS, PAIR, serving
+from support.fake_worker import wait_until
+from support.messages import heartbeat, packed_heartbeat
+from support.router import ROUTER_RULES, MemoryStorage, TestAuthority, free_port
+from support.vehicles import KEYS, PAIR, serving
 
 DEPLOY = REPOSITORY / "deploy"
 FLEET_RULES = DEPLOY / "fleet-router.json5"

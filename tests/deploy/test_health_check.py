@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.http import HttpResponse, HttpServer
-from coec.adapters.system.notify import ServiceManagerNotifier
-from coec.runtime.api.pages import pages
+from coec.io.http_server import HttpResponse, HttpServer
+from coec.io.system import ServiceManagerNotifier
+from coec.service.api.metrics_server import pages
 from deploy.written import DEPLOY, compose, stages
-from ports import free_port
 from runtime.api.test_metrics import a_busy_status, a_health
+from support.router import free_port
 
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""

@@ -6,10 +6,9 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.timeline import timeline_schema
-from coec.adapters.foxglove.topics import POINTS_TOPICS, TOPIC_DESCRIPTIONS, DisplayedPose
 from coec.cli.view import LAYOUT
+from coec.io import viewer_scene
+from coec.io.viewer_scene import POINTS_TOPICS, TOPIC_DESCRIPTIONS, DisplayedPose, timeline_schema
 from conftest import REPOSITORY
 
 
@@ -52,13 +51,13 @@ def test_every_panel_has_a_place_and_every_place_a_panel() -> None:
 def test_every_topic_in_it_is_served_and_every_topic_served_is_in_it() -> None:
     named = {text.partition(".")[0] for text in texts_in(layout()["configById"]) if text.startswith("/")}
     assert named <= set(TOPIC_DESCRIPTIONS), "a topic of the layout is not served"
-    assert set(TOPIC_DESCRIPTIONS) - named == {topics.TRANSFORMS_TOPIC}, (
+    assert set(TOPIC_DESCRIPTIONS) - named == {viewer_scene.TRANSFORMS_TOPIC}, (
         "transforms are taken by every 3D panel, unasked"
     )
 
 
 def test_every_field_in_it_is_one_of_the_timeline() -> None:
-    paths = [text for text in texts_in(layout()["configById"]) if text.startswith(f"{topics.HEALTH_TOPIC}.")]
+    paths = [text for text in texts_in(layout()["configById"]) if text.startswith(f"{viewer_scene.HEALTH_TOPIC}.")]
     assert len(paths) > 5
     for path in paths:
         node = timeline_schema()
@@ -72,7 +71,7 @@ def test_an_image_waits_for_the_points_that_it_shows_and_for_no_others() -> None
     images = [panel["imageMode"] for name, panel in layout()["configById"].items() if name.startswith("Image!")]
     visible = []
     for panel in images:
-        assert (panel["imageTopic"], panel["synchronize"]) == (topics.IMAGE_TOPIC, True)
+        assert (panel["imageTopic"], panel["synchronize"]) == (viewer_scene.IMAGE_TOPIC, True)
         assert set(panel["annotations"]) == set(POINTS_TOPICS.values())
         visible += [topic for topic, one in panel["annotations"].items() if one["visible"]]
     assert visible == [POINTS_TOPICS[DisplayedPose.SERVED], POINTS_TOPICS[DisplayedPose.CANDIDATE]]

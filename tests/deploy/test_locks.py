@@ -14,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from coec.adapters.system.installed import pinned_hashes
+from coec.io.installed_packages import pinned_hashes
 from conftest import REPOSITORY
 
 LOCK, DOCS, CHECKS = LOCKS = tuple(

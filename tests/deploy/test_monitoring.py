@@ -12,8 +12,8 @@ from typing import Any, Final, get_args
 import pytest
 
 from coec.config import MetricsConfig, parse_yaml
-from coec.runtime.api.metrics import FAMILIES
 from coec.schemas.replies import HealthState
+from coec.service.api.metrics import FAMILIES
 from conftest import REPOSITORY
 
 MONITORING = REPOSITORY / "deploy" / "monitoring"

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.ros import messages
-from coec.adapters.ros.diagnostics import DiagnosticLevel
-from coec.adapters.ros.outgoing import MAX_RESIDUAL_PX
 from coec.config import Config, RosConfig, parse_yaml
-from coec.schemas import ros_names
+from coec.io.ros import messages
+from coec.io.ros.message_encoding import MAX_RESIDUAL_PX, DiagnosticLevel
+from coec.schemas import keys
 from coec.schemas.replies import ROS_LEVELS
 from conftest import REPOSITORY
 
@@ -44,7 +43,7 @@ def test_the_aggregator_takes_every_status_of_the_service() -> None:
         if isinstance(value, dict)
     )
     assert analyzer["type"] == "diagnostic_aggregator/GenericAnalyzer"
-    assert analyzer["expected"] == [ros_names.status_name(pair) for pair in pairs()]
+    assert analyzer["expected"] == [keys.status_name(pair) for pair in pairs()]
     assert all(name.startswith(tuple(analyzer["startswith"])) for name in analyzer["expected"])
     assert analyzer["timeout"] == 5.0
 
@@ -54,7 +53,7 @@ def test_autowares_units_name_the_statuses_as_node_and_name() -> None:
     diags = [unit for unit in units.values() if unit["type"] == "diag"]
     (whole,) = (unit for unit in units.values() if unit["type"] == "and")
 
-    assert [f"{unit['node']}: {unit['name']}" for unit in diags] == [ros_names.status_name(pair) for pair in pairs()]
+    assert [f"{unit['node']}: {unit['name']}" for unit in diags] == [keys.status_name(pair) for pair in pairs()]
     assert {child["link"] for child in whole["list"]} == {unit["path"] for unit in diags}
 
 
@@ -67,10 +66,10 @@ def rows(title: str) -> list[list[str]]:
 
 def test_the_page_names_topics_and_types_as_they_are_published() -> None:
     published = {
-        "diagnostics": (ros_names.DIAGNOSTICS, messages.DIAGNOSTICS),
-        "tf_static": (ros_names.TF_STATIC, messages.TF),
-        "camera_info": (ros_names.camera_info_topic("PAIR"), messages.CAMERA_INFO),
-        "overlay": (ros_names.overlay_topic("PAIR"), messages.COMPRESSED_IMAGE),
+        "diagnostics": (keys.DIAGNOSTICS, messages.DIAGNOSTICS),
+        "tf_static": (keys.TF_STATIC, messages.TF),
+        "camera_info": (keys.camera_info_topic("PAIR"), messages.CAMERA_INFO),
+        "overlay": (keys.overlay_topic("PAIR"), messages.COMPRESSED_IMAGE),
     }
     told = {row[0].strip("`"): (row[1].strip("`"), row[2].strip("`")) for row in rows("What it says")}
     assert {name: (topic.replace("<pair>", "PAIR"), kind) for name, (topic, kind) in told.items()} == published
@@ -93,5 +92,5 @@ def test_the_page_says_the_defaults_and_limits() -> None:
     [("shuttle-7", "shuttle_7"), ("7-seater", "_7_seater"), ("front.left--top", "front_left_top"), ("a_b", "a_b")],
 )
 def test_names_become_tokens_of_ros(name: str, token: str) -> None:
-    assert ros_names.ros_name(name) == token
-    assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", ros_names.overlay_topic(name))
+    assert keys.ros_name(name) == token
+    assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", keys.overlay_topic(name))

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.depth.model_cards import CARDS, list_models
+from coec.io.depth.model_cards import CARDS, list_models
 from conftest import REPOSITORY
 from deploy.world import EVERYBODY
 from deploy.written import compose, documented_sockets, shipped_configurations, unit

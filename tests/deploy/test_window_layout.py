@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from adapters.mcap.test_windows import a_result, a_window
-from coec.adapters.mcap.windows import write_result
+from coec.io.mcap.window_writer import write_result
 from conftest import REPOSITORY
 from deploy.test_layout import panels_in, texts_in
-from readers import RecordingContents, read_recording
+from support.readers import RecordingContents, read_recording
 
 LAYOUT = REPOSITORY / "deploy" / "foxglove-window-layout.json"
 

@@ -22,11 +22,11 @@ from typing import Any
 import psutil
 
 from coec import geometry
-from coec.adapters.zenoh.client import connected, connected_by, query_all, query_one
 from coec.cli.options import service_address
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig, load_config
 from coec.errors import RemoteError
 from coec.geometry.compiler import kernel_cache_directory
+from coec.io.zenoh.query_client import connected, connected_by, query_all, query_one
 from coec.reports.commented_yaml import commented_yaml
 from conftest import REPOSITORY
 from deploy.container import Container, enter_copy_of_root, forget, take_steps, use_interpreter_as_image_does
@@ -35,7 +35,7 @@ from deploy.world import NAME_SERVER, leave_for_another, open_sockets, watched
 from deploy.written import DEPLOY, compose, exec_start, stages
 from e2e.drives import SHORT, SHORT_PAIRS, rendered
 from e2e.processes import PATIENCE_S, Service, write_configuration
-from fakes import wait_until
+from support.fake_worker import wait_until
 
 GATEWAY = "192.0.2.1"
 """The host, as a container on a network of its own knows it."""

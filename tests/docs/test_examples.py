@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.depth.model_cards import ModelCard
 from coec.calibration.figures import FIGURES
 from coec.calibration.types import INTRINSICS_OFF, MOVED
 from coec.config import config_of
-from coec.config.yaml_text import parse_yaml
-from coec.sources.manifest import ManifestDocument
+from coec.config.loading import parse_yaml
+from coec.io.depth.model_cards import ModelCard
+from coec.io.recordings.manifest import ManifestDocument
 from conftest import REPOSITORY
 
 READERS: dict[str, Callable[[Any], object]] = {

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 import coec
-from coec.errors import CoecError
-from coec.exit_codes import EXIT_CODE_MEANINGS, ExitCode
-from coec.runtime.api.troubles import PROBLEMS
-from coec.runtime.edges.plan import NOT_INSTALLED
+from coec.errors import EXIT_CODE_MEANINGS, CoecError, ExitCode
+from coec.service.api.problems import PROBLEMS
+from coec.service.engine.lidar_pairs import NOT_INSTALLED
 from conftest import REPOSITORY
 from generate.__main__ import PAGES
 
@@ -86,6 +85,6 @@ def _called(function: ast.expr) -> str:
 def test_every_trouble_is_in_the_table_with_what_to_do() -> None:
     made = reasons_made() - OF_A_JOB - {"internal_error"}
     assert made | COMPOSED | {NOT_INSTALLED.code} == set(PROBLEMS), (
-        "a row of coec.runtime.api.troubles for each, and none for others"
+        "a row of coec.service.api.problems for each, and none for others"
     )
     assert all(trouble.meaning and trouble.advice for trouble in PROBLEMS.values())

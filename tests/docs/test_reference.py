@@ -14,11 +14,10 @@ from pydantic import BaseModel
 
 from coec.cli.main import application
 from coec.config import Config
-from coec.config.pair import OpenPairConfig
+from coec.config.pair import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig, OpenPairConfig
 from coec.config.rig import RigConfig, RigStages
-from coec.config.streams import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig
-from coec.schemas.export import MESSAGES
 from coec.schemas.keys import Keys
+from coec_lab.experiments.schema_export import MESSAGES
 from conftest import REPOSITORY
 
 DOCS = REPOSITORY / "docs"

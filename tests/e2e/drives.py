@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coec.adapters.zenoh.player import Frame
 from coec.calibration.types import CameraFrame
 from coec.config import CalibrationConfig, DepthConfig, MonitorConfig, PolicyConfig, WindowConfig
 from coec.geometry.se3 import inverse, rotation_angle_rad
-from coec.simulation.source import open_sim
-from coec.sources.spec import parse_spec
-from drives import rendered_source
+from coec.io.recordings.recording_source import parse_spec
+from coec.io.zenoh.player import Frame
+from coec_lab.simulation.source import open_sim
 from e2e.processes import Router, write_configuration
+from support.simulated_drives import rendered_source
 
 if TYPE_CHECKING:
-    from coec.simulation.drive import SimulatedDrive
+    from coec_lab.simulation.drive import SimulatedDrive
 
 NS_PER_S = 1_000_000_000
 

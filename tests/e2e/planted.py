@@ -9,11 +9,11 @@ from pathlib import Path
 import zenoh
 from mcap.reader import make_reader
 
-from certificates import TestAuthority
 from coec.config import SenderConfig, load_config
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
 from e2e.processes import PATIENCE_S, Router, Service
+from support.router import TestAuthority
 
 IN_FILE, REACHED, AWAY, USER = (f"PLANTED{name}c2VjcmV0" for name in ("File", "Reached", "Away", "User"))
 

@@ -21,18 +21,17 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from coec.adapters.files.rig import mask_to_png
-from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.cadence import Played
-from coec.adapters.zenoh.client import connected, query_one
-from coec.adapters.zenoh.player import CAMERA, Frame, Player, StreamKeys, stream_of
 from coec.cli.convert import configuration_for
 from coec.config import BudgetConfig, Config, LimitsConfig, StateConfig, ZenohConfig, load_config
 from coec.errors import NotFoundError
 from coec.geometry.se3 import Array, perturb
+from coec.io.recordings.layouts import RecordingSource
+from coec.io.rig_files import mask_to_png
+from coec.io.zenoh.bus import open_session
+from coec.io.zenoh.player import CAMERA, Frame, Played, Player, StreamKeys, stream_of
+from coec.io.zenoh.query_client import connected, query_one
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
-from coec.sources import RecordingSource
 from conftest import REPOSITORY
 
 COMMAND: Sequence[str] = [sys.executable, "-m", "coec"]

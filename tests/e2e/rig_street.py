@@ -9,16 +9,14 @@ from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 
-from coec.adapters.zenoh.player import Frame
 from coec.calibration.types import Matrix4
-from coec.evaluation.rig_looks import ROWS
-from coec.simulation.faults import SensorFault, StepFault
-from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigDrive, RigDriveConfig
-from coec.simulation.rig_instants import instants
-from coec.simulation.rigs import FOUR_FISHEYES, RigLayout
-from coec.simulation.schedule import Arrival
-from drives import cached_messages
+from coec.io.zenoh.player import Frame
+from coec_lab.experiments.rig_drives import ROWS
+from coec_lab.simulation.drive import Arrival
+from coec_lab.simulation.faults import SensorFault, StepFault
+from coec_lab.simulation.journey import START_NS
+from coec_lab.simulation.rig_drive import FOUR_FISHEYES, RigDrive, RigDriveConfig, RigLayout, instants
+from support.simulated_drives import cached_messages
 
 NS_PER_S = 1_000_000_000
 

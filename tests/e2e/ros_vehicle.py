@@ -17,11 +17,11 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_humble as ros
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
-from bags import transform_message
-from coec.adapters.ros import outgoing
-from coec.adapters.zenoh.player import Frame
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.geometry import cameras
+from coec.io.ros import message_encoding
+from coec.io.zenoh.player import Frame
+from support.recordings import transform_message
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -125,11 +125,11 @@ def message_of(frame: Frame) -> tuple[str, bytes]:
     """The topic of a frame, and its message."""
     match frame:
         case CameraFrame():
-            return CAMERA, outgoing.encode_image(frame)[1]
+            return CAMERA, message_encoding.encode_image(frame)[1]
         case LidarFrame():
-            return POINTS, outgoing.encode_cloud(frame)
+            return POINTS, message_encoding.encode_cloud(frame)
         case EgoMotion():
-            return EGO, outgoing.encode_motion(replace(frame, frame_id="base_link"))[1]
+            return EGO, message_encoding.encode_motion(replace(frame, frame_id="base_link"))[1]
 
 
 def camera_info(camera: cameras.Camera, frame_id: str) -> bytes:

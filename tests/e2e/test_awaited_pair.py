@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import zenoh
 
-import rmw_zenoh_defaults
-from coec.adapters.zenoh.client import query_one
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.errors import RemoteError
 from coec.geometry import se3
+from coec.io.zenoh.query_client import query_one
 from e2e.drives import Drive, rendered
 from e2e.processes import PATIENCE_S, Router, Service, free_endpoint, service
 from e2e.ros_vehicle import (
@@ -35,6 +34,7 @@ from e2e.ros_vehicle import (
     message_of,
     transforms,
 )
+from support import ros
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -62,14 +62,14 @@ def drive() -> Drive:
 @pytest.fixture(scope="module")
 def router() -> Iterator[Router]:
     endpoint = free_endpoint()
-    with rmw_zenoh_defaults.rmw_router(endpoint) as session:
+    with ros.rmw_router(endpoint) as session:
         yield Router(session, endpoint)
 
 
 @pytest.fixture
 def driver(router: Router) -> Iterator[zenoh.Session]:
     """A session of the vehicle's own."""
-    with rmw_zenoh_defaults.rmw_node(router.endpoint) as session:
+    with ros.rmw_node(router.endpoint) as session:
         yield session
 
 

@@ -14,10 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coec.adapters.mcap.windows import read_window
-from coec.adapters.zenoh.cadence import repeated
-from coec.adapters.zenoh.client import is_alive
-from coec.adapters.zenoh.player import Player, StreamKeys, shifted
 from coec.config import (
     CalibrationConfig,
     Config,
@@ -27,10 +23,13 @@ from coec.config import (
     WindowConfig,
     load_config,
 )
+from coec.io.mcap.window_reader import read_window
+from coec.io.zenoh.player import Player, StreamKeys, repeated, shifted
+from coec.io.zenoh.query_client import is_alive
 from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, STEPPED, Drive, rendered
 from e2e.processes import PATIENCE_S, Router, Service, service, write_configuration
-from fakes import wait_until
+from support.fake_worker import wait_until
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

@@ -11,8 +11,8 @@ import pytest
 
 from adapters.mcap.test_windows import a_pair, a_window
 from coec.config import StateConfig
-from coec.runtime.recording.digests import DigestReader
-from coec.runtime.recording.window_store import WindowStore
+from coec.service.recording.recorder import DigestReader
+from coec.service.recording.window_store import WindowStore
 from e2e.processes import Router, Service, service
 from soak.vehicle import configured
 

@@ -11,11 +11,11 @@ import numpy as np
 import psutil
 import pytest
 
-from coec.adapters.frames.msgpack_frames import encode_lidar
 from coec.calibration.types import LidarFrame
+from coec.io.msgpack_frames import encode_lidar
 from e2e.processes import Router, service
-from fakes import wait_until
 from soak.vehicle import CAMERA, LIDAR, Vehicle, configured
+from support.fake_worker import wait_until
 
 MIB = 2**20
 BURST_S = 15.0

@@ -15,19 +15,17 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from certificates import TestAuthority, make_authority
-from coec.adapters.tls.conversation import CommandSender
-from coec.adapters.zenoh.bus import JSON, open_session
-from coec.adapters.zenoh.client import query_one
-from coec.adapters.zenoh.proven import send_authenticated
 from coec.cli.check_config import template
 from coec.cli.doctor import examine
 from coec.config import LimitsConfig, SenderConfig, ZenohConfig, load_config
 from coec.errors import NotProvenError, RemoteError
+from coec.io.zenoh.bus import JSON, open_session
+from coec.io.zenoh.command_auth import CommandSender
+from coec.io.zenoh.query_client import query_one, send_authenticated
 from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment
-from fakes import wait_until
-from open_metrics import parse_open_metrics
-from ports import free_port
+from support.fake_worker import wait_until
+from support.readers import parse_open_metrics
+from support.router import TestAuthority, free_port, make_authority
 
 PAIR = "front"
 

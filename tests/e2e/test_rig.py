@@ -19,11 +19,11 @@ import zenoh
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.adapters.zenoh.player import Frame, Player, SensorKeys
-from coec.cli.rig_configuration import document_of
 from coec.geometry.se3 import inverse, rotation_angle_rad
-from coec.schemas.base import from_msgpack
+from coec.io.zenoh.player import Frame, Player, SensorKeys
+from coec.schemas.message import from_msgpack
 from coec.schemas.rig_state import RigCorrection, RigReply
+from coec_lab.commands.rig_play import document_of
 from e2e.processes import PATIENCE_S, Router, Service, service
 from e2e.rig_street import FOUR_AND_ONE, LIDAR, TWO_AND_THREE, Knock, Street, second_of
 

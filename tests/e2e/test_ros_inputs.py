@@ -13,8 +13,8 @@ import pytest
 from coec.calibration.types import CameraFrame
 from e2e.drives import SHORT, Drive, rendered
 from e2e.processes import Router, Service, by_topics, coec, service, write_configuration
-from fakes import wait_until
-from ros_nodes import HASHES, RosDriver, cdr_message
+from support.fake_worker import wait_until
+from support.ros import HASHES, RosDriver, cdr_message
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

@@ -26,7 +26,7 @@ from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import SHORT, SHORT_PAIRS, Drive, rendered
 from e2e.processes import PATIENCE_S, Router, service, write_configuration
 from e2e.ros_listener import listening, speaking_to_ros
-from fakes import wait_until
+from support.fake_worker import wait_until
 
 OK, WARN, ERROR, STALE = range(4)
 NS_PER_S = 1_000_000_000

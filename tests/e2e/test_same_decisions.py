@@ -11,8 +11,6 @@ import numpy as np
 import psutil
 import pytest
 
-from coec.adapters.mcap.bag_writer import write_bag
-from coec.adapters.zenoh.player import Frame
 from coec.config import (
     CalibrationConfig,
     DepthConfig,
@@ -20,6 +18,8 @@ from coec.config import (
     SearchConfig,
     WindowConfig,
 )
+from coec.io.mcap.bag_writer import write_bag
+from coec.io.zenoh.player import Frame
 from e2e.drives import (
     NS_PER_S,
     SECONDS,
@@ -33,8 +33,8 @@ from e2e.drives import (
     without_depth,
 )
 from e2e.processes import Router, Service, by_topics, coec, service, write_configuration
-from ros_nodes import RosSensors
-from tiny_onnx import MODEL_CARD, first_channel_network
+from support.recordings import MODEL_CARD, first_channel_network
+from support.ros import RosSensors
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

@@ -11,13 +11,13 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 from ruamel.yaml import YAML
 
-from bags import converted
-from coec.adapters.mcap.bag_writer import write_bag
-from coec.adapters.ros.topics import PairTopics
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig
+from coec.io.mcap.bag_writer import write_bag
+from coec.io.ros.topics import PairTopics
 from e2e.drives import STEPPED, Drive, rendered, without_depth
 from e2e.processes import Router, coec, service, write_configuration
 from e2e.test_same_decisions import CERTAIN_S, ENDED_S, SLICE_S, WORKSHOP, decisions
+from support.recordings import converted
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

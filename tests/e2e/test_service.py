@@ -15,14 +15,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from coec.adapters.mcap.windows import read_result, read_window
-from coec.adapters.zenoh.player import Frame
 from coec.cli import play
 from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig, WindowConfig
-from coec.sources import open_source
+from coec.io.mcap.window_reader import read_result, read_window
+from coec.io.recordings.layouts import open_source
+from coec.io.zenoh.player import Frame
 from e2e.drives import NS_PER_S, SHORT, SHORT_PAIRS, Drive, later, rendered
 from e2e.processes import Router, Service, coec, free_endpoint, service, write_configuration
-from fakes import wait_until
+from support.fake_worker import wait_until
 
 SHORT_S = 12
 PERTURBATION = np.array([*np.radians([2.0, -1.5, 1.0]), 0.0, 0.0, 0.0])

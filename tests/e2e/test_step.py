@@ -10,18 +10,17 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from certificates import TestAuthority
-from coec.adapters.tls.conversation import CommandSender, Credentials
-from coec.adapters.zenoh.client import JSON, Reply, query_one
-from coec.adapters.zenoh.proven import send_authenticated
-from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.config import Config, DepthConfig, SnippetsConfig, UplinkConfig, load_config
 from coec.errors import RemoteError
+from coec.io.zenoh.command_auth import CommandSender, Credentials
+from coec.io.zenoh.query_client import JSON, Reply, query_one, send_authenticated
+from coec.io.zenoh.window_fetch import fetch_window
 from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
 from e2e.planted import plant, said, written
 from e2e.processes import PATIENCE_S, Router, Service, service
-from readers import read_recording
+from support.readers import read_recording
+from support.router import TestAuthority
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

@@ -12,18 +12,16 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
-from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.inputs import on_key
-from coec.adapters.zenoh.matching import has_subscribers
-from coec.adapters.zenoh.settings import settings_of
 from coec.config import LimitsConfig, ZenohConfig
+from coec.io.msgpack_frames import encode_camera, encode_lidar
+from coec.io.zenoh.bus import MSGPACK, on_key
+from coec.io.zenoh.query_client import connected
+from coec.io.zenoh.ros_node import has_subscribers
+from coec.io.zenoh.session import settings_of
 from coec.schemas.replies import StreamStatus
-from fakes import wait_until
-from pair_bench import BEGIN_S, NS_PER_S, frame_pair_at
-from ports import free_port
-from vehicles import serving
+from support.fake_worker import wait_until
+from support.router import free_port
+from support.vehicles import BEGIN_S, NS_PER_S, frame_pair_at, serving
 
 PATIENCE_S = 20.0
 TOO_LARGE = 100_000_000

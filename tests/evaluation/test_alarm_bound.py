@@ -9,8 +9,8 @@ from math import exp
 import numpy as np
 import pytest
 
-from coec.evaluation.alarm_bound import MIN_PLACES, PlaceChecks, bound, tail
-from coec.schemas.checks import Judged
+from coec_lab.experiments.check_statistics import MIN_PLACES, PlaceChecks, bound, tail
+from coec_lab.experiments.simulation_schemas import Judged
 from evaluation.test_check_statistics import judged
 
 PLACE_RAD = 0.001

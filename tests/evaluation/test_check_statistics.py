@@ -6,11 +6,11 @@ from math import radians
 
 import pytest
 
-from coec.calibration.commissioning.quantiles import poisson_most
-from coec.evaluation import check_drives
-from coec.evaluation.check_statistics import report
-from coec.schemas.checks import CheckedDrive, CheckedPose, Judged, MovedStatistics
+from coec.calibration.baseline import poisson_most
 from coec.schemas.replies import Vector6
+from coec_lab.experiments import check_drives
+from coec_lab.experiments.check_statistics import report
+from coec_lab.experiments.simulation_schemas import CheckedDrive, CheckedPose, Judged, MovedStatistics
 
 
 def judged(

@@ -11,10 +11,10 @@ import pytest
 
 from coec.calibration.types import Matrix4, Rig
 from coec.errors import UsageError
-from coec.evaluation.closure import Between, FrameChoice, Relation, Solve, between, close
-from coec.evaluation.statistics import SolveOutcome, Trial, score
 from coec.geometry import se3
 from coec.geometry.cameras import build
+from coec_lab.experiments.closure import Between, FrameChoice, Relation, Solve, between, close
+from coec_lab.experiments.solve_statistics import SolveOutcome, Trial, score
 from evaluation.test_statistics import _estimate, _xi
 
 T_A = se3.exp(np.array([1.2, -1.2, 1.2, 0.1, -0.3, 0.8]))

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from coec.calibration.types import DepthMap, Rig
 from coec.config import ObjectiveConfig
-from coec.evaluation.depth_quality import (
+from coec.geometry.cameras import build
+from coec_lab.experiments.depth_quality import (
     GOOD_RANK,
     USABLE_BIAS_RAD,
     DepthQuality,
@@ -24,8 +25,7 @@ from coec.evaluation.depth_quality import (
     spearman,
     suitability,
 )
-from coec.evaluation.profiles import Scan
-from coec.geometry.cameras import build
+from coec_lab.experiments.objective_scans import Scan
 
 RIG = Rig(
     pair="front",

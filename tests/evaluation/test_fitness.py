@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
-from coec.evaluation.fitness import cadence, fitness_of, in_view, passes
 from coec.geometry.cameras import build
-from coec.sources.recording import FramewiseRecording, RecordedFrame
+from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame
+from coec.reports.recording_fitness import cadence, fitness_of, in_view, passes
 
 FORWARD = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 RIG = Rig(

@@ -8,14 +8,14 @@ from math import radians
 import numpy as np
 import pytest
 
-import posts
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.config import LimitsConfig
 from coec.errors import CalibrationError
-from coec.evaluation.local_shifts import LocalShifts, local_shifts
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
+from coec.io.images import GreyImages
+from coec.reports.residual_map import LocalShifts, local_shifts
+from support import scenes
 
 POSTS_DEG = tuple(np.arange(-36.0, 37.0, 4.0).tolist())
 """Range edges in every part of the image."""
@@ -30,7 +30,7 @@ def _several(window: Window, pairs: int = 4) -> Window:
 
 
 def test_at_the_truth_range_edges_lie_where_they_belong() -> None:
-    window = _several(posts.post_window(POSTS_DEG))
+    window = _several(scenes.post_window(POSTS_DEG))
     shifts = _shifts(window, window.T_camera_lidar_start)
     assert shifts.known.sum() >= 4
     assert np.abs(shifts.shift_px[shifts.known][:, 0]).max() < 0.8
@@ -41,7 +41,7 @@ def test_at_the_truth_range_edges_lie_where_they_belong() -> None:
 
 @pytest.mark.parametrize("yaw_deg", [-0.5, 0.4])
 def test_a_turn_shifts_all_parts_alike(yaw_deg: float) -> None:
-    window = _several(posts.post_window(POSTS_DEG))
+    window = _several(scenes.post_window(POSTS_DEG))
     moved = se3.perturb(window.T_camera_lidar_start, np.array([0, radians(yaw_deg), 0, 0, 0, 0]))
     shifts = _shifts(window, moved)
     right = shifts.shift_px[shifts.known][:, 0]
@@ -52,7 +52,7 @@ def test_a_turn_shifts_all_parts_alike(yaw_deg: float) -> None:
 
 
 def test_a_wrong_lens_shifts_the_rim_and_not_the_middle() -> None:
-    window = _several(posts.post_window(POSTS_DEG))
+    window = _several(scenes.post_window(POSTS_DEG))
     stretched = window.rig.camera._replace(fx=405.0)
     shifts = _shifts(replace(window, rig=replace(window.rig, camera=stretched)), window.T_camera_lidar_start)
     rows, columns = np.nonzero(shifts.known)
@@ -63,13 +63,13 @@ def test_a_wrong_lens_shifts_the_rim_and_not_the_middle() -> None:
 
 
 def test_beyond_what_is_tried_nothing_is_told() -> None:
-    window = _several(posts.post_window((-20.0, 20.0)))
+    window = _several(scenes.post_window((-20.0, 20.0)))
     moved = se3.perturb(window.T_camera_lidar_start, np.array([0, radians(3.0), 0, 0, 0, 0]))
     assert not _shifts(window, moved).known.any()
 
 
 def test_few_range_edges_tell_nothing_and_none_are_no_error() -> None:
-    window = posts.post_window((0.0,))
+    window = scenes.post_window((0.0,))
     assert not _shifts(window, window.T_camera_lidar_start).known.any()
     (pair,) = window.pairs
     empty = LidarFrame(0, "lidar", np.zeros((0, 3), np.float32))
@@ -79,7 +79,7 @@ def test_few_range_edges_tell_nothing_and_none_are_no_error() -> None:
 
 
 def test_an_image_of_another_size_is_refused() -> None:
-    window = posts.post_window((0.0,))
+    window = scenes.post_window((0.0,))
     camera: Camera = build("pinhole", width=640, height=300, fx=400.0, fy=400.0, cx=319.5, cy=149.5)
     with pytest.raises(CalibrationError, match="640 x 360 px, the camera model 640 x 300 px"):
         _shifts(replace(window, rig=replace(window.rig, camera=camera)), window.T_camera_lidar_start)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from coec.config import CalibrationConfig
-from coec.evaluation import matrix, matrix_drives, matrix_run
-from coec.evaluation.matrix_drives import FIRST_SEED, SEEDS
-from coec.schemas.matrix import MatrixRow, SolvedWindow, Watched
+from coec.io.recordings.recording_source import parse_spec
 from coec.schemas.replies import Maybe6
-from coec.simulation.faults import parse_fault
-from coec.simulation.lidar import LIDARS
-from coec.simulation.source import NUMBERS, TEXT_KEYS
-from coec.sources.spec import parse_spec
+from coec_lab.experiments import matrix_drives, matrix_statistics
+from coec_lab.experiments.matrix_drives import FIRST_SEED, SEEDS
+from coec_lab.experiments.simulation_schemas import MatrixRow, SolvedWindow, Watched
+from coec_lab.simulation.faults import parse_fault
+from coec_lab.simulation.lidar_model import LIDARS
+from coec_lab.simulation.source import NUMBERS, TEXT_KEYS
 
 DRIVES = matrix_drives.drives(1)
 NOTHING: Maybe6 = (None,) * 6
@@ -31,7 +31,7 @@ def solved(
 ) -> SolvedWindow:
     rotation, translation = (math.hypot(*(value or 0.0 for value in part)) for part in (error[:3], error[3:]))
     return SolvedWindow(
-        pairs=10, start_deg=5.0, start_m=0.0, accepted=accepted, hit=matrix.is_hit(rotation, translation, dof),
+        pairs=10, start_deg=5.0, start_m=0.0, accepted=accepted, hit=matrix_statistics.is_hit(rotation, translation, dof),
         rotation_deg=rotation, translation_m=translation, error=error, sigma=sigma, reasons=reasons, evaluations=100,
         failure=None,
     )  # fmt: skip
@@ -61,16 +61,16 @@ def watch(moved: str, alarms: int, *, flagged: int = 0, blind: int = 0, delay: i
 
 
 def test_a_hit_counts_the_translation_only_where_it_was_searched() -> None:
-    assert matrix.is_hit(0.5, 9.0, 3)
-    assert not matrix.is_hit(0.51, 0.0, 3)
-    assert matrix.is_hit(0.5, 0.1, 6)
-    assert not matrix.is_hit(0.1, 0.11, 6)
+    assert matrix_statistics.is_hit(0.5, 9.0, 3)
+    assert not matrix_statistics.is_hit(0.51, 0.0, 3)
+    assert matrix_statistics.is_hit(0.5, 0.1, 6)
+    assert not matrix_statistics.is_hit(0.1, 0.11, 6)
 
 
 def test_errors_are_held_against_the_sigmas_of_accepted_windows() -> None:
     windows = [solved((e, 0.0, 0.0, None, None, None)) for e in (0.1, -0.1, 0.15, -0.25)]
     refused = solved((30.0, 0.0, 0.0, None, None, None), accepted=False, reasons=("runner_up",))
-    (figures,) = matrix.report([row("a", *windows, refused, UNSOLVED)]).solves
+    (figures,) = matrix_statistics.report([row("a", *windows, refused, UNSOLVED)]).solves
     pitch = figures.axes[0]
     assert (figures.windows, figures.hits, figures.accepted, figures.accepted_hits) == (6, 4, 4, 4)
     assert (pitch.axis, pitch.windows) == ("rx", 4)
@@ -87,7 +87,7 @@ def test_errors_are_held_against_the_sigmas_of_accepted_windows() -> None:
 
 def test_an_axis_without_a_sigma_says_nothing_of_coverage() -> None:
     blind = solved((0.1, 0.0, 0.0, None, 0.02, 0.0), (0.1, 0.1, 0.1, None, 0.01, None), dof=6)
-    (figures,) = matrix.report([row("a", blind, dof=6)]).solves
+    (figures,) = matrix_statistics.report([row("a", blind, dof=6)]).solves
     assert [axis.windows for axis in figures.axes] == [1, 1, 1, 0, 1, 0]
     assert figures.axes[3].within_3 is None
     assert figures.axes[4].within_1 == 0.0
@@ -99,16 +99,16 @@ def test_an_axis_without_a_sigma_says_nothing_of_coverage() -> None:
 )
 def test_wrong_is_beyond_the_limit_and_beyond_four_sigma(error: float, sigma: float | None, wrong: bool) -> None:
     window = solved((0.0, error, 0.0, None, None, None), (0.1, sigma, 0.1, None, None, None))
-    (figures,) = matrix.report([row("a", solved(), window)]).solves
+    (figures,) = matrix_statistics.report([row("a", solved(), window)]).solves
     assert figures.accepted_wrong == int(wrong)
     assert [text.split(" ± ")[0] for text in figures.wrong] == ([f"a#2 ry {error:+.3f}"] if wrong else [])
     refused = window.model_copy(update={"accepted": False})
-    assert matrix.wrong_axes("a", refused) == []
+    assert matrix_statistics.wrong_axes("a", refused) == []
 
 
 def test_groups_add_up_to_the_whole() -> None:
     rows = [row("a", solved(), solved()), row("b", solved(accepted=False), light="night"), row("c", failure="no file")]
-    report = matrix.report(rows)
+    report = matrix_statistics.report(rows)
     (figures,) = report.solves
     lights = {group.value: group for group in figures.groups if group.of == "light"}
     assert {value: (group.windows, group.accepted) for value, group in lights.items()} == {
@@ -123,7 +123,7 @@ def test_alarms_at_the_right_pose_are_false_and_elsewhere_wanted() -> None:
         row("a", solved(), watched=(watch("right", 0, flagged=1), watch("1 deg", 1, flagged=5, delay=3))),
         row("b", solved(), watched=(watch("right", 1, flagged=3, delay=4, blind=1), watch("1 deg", 0))),
     ]
-    right, off = matrix.report(rows).watched
+    right, off = matrix_statistics.report(rows).watched
     assert (right.moved, right.drives, right.checks, right.alarmed) == ("right", 2, 10, 1)
     assert right.flagged == pytest.approx(4 / 9)
     assert (right.hours, right.alarms_per_hour, right.names) == (1.0, 1.0, ("b",))
@@ -131,9 +131,9 @@ def test_alarms_at_the_right_pose_are_false_and_elsewhere_wanted() -> None:
 
 
 def test_nothing_is_no_division_by_it() -> None:
-    report = matrix.report([row("a", failure="no file")])
+    report = matrix_statistics.report([row("a", failure="no file")])
     assert (report.solves, report.watched) == ((), ())
-    (figures,) = matrix.report([row("a", UNSOLVED)]).solves
+    (figures,) = matrix_statistics.report([row("a", UNSOLVED)]).solves
     assert figures.axes[0].rms is None
 
 
@@ -173,8 +173,8 @@ def test_drives_are_chosen_by_their_name() -> None:
 
 
 def test_a_start_is_off_by_what_is_searched_and_what_is_held_by_what_the_budget_says() -> None:
-    held = np.array([matrix_run.sampled_start(drive.name, 0, 3, 0.01) for drive in DRIVES])
-    searched = np.array([matrix_run.sampled_start(drive.name, 0, 6, 0.01) for drive in DRIVES])
+    held = np.array([matrix_drives.sampled_start(drive.name, 0, 3, 0.01) for drive in DRIVES])
+    searched = np.array([matrix_drives.sampled_start(drive.name, 0, 6, 0.01) for drive in DRIVES])
     for drawn in (held, searched):
         turned = np.degrees(np.linalg.norm(drawn[:, :3], axis=1))
         assert (turned >= 2.0).all()
@@ -183,4 +183,4 @@ def test_a_start_is_off_by_what_is_searched_and_what_is_held_by_what_the_budget_
     shifted = np.linalg.norm(searched[:, 3:], axis=1)
     assert shifted.max() <= 0.1
     assert shifted.mean() > 0.03
-    np.testing.assert_array_equal(held[0], matrix_run.sampled_start(DRIVES[0].name, 0, 3, 0.01))
+    np.testing.assert_array_equal(held[0], matrix_drives.sampled_start(DRIVES[0].name, 0, 3, 0.01))

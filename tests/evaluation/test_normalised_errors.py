@@ -8,19 +8,21 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.evaluation.normalised_errors import (
+from coec.geometry import se3
+from coec_lab.experiments.solve_statistics import (
     BIN_EDGES,
     CONFIDENCES,
     Claims,
+    SolveOutcome,
+    Trial,
     carried,
     gathered,
     normalise,
     of_differences,
     of_outcomes,
+    score,
     within,
 )
-from coec.evaluation.statistics import SolveOutcome, Trial, score
-from coec.geometry import se3
 from evaluation.test_statistics import FAR, REFERENCE, _estimate, _xi
 
 

@@ -8,16 +8,15 @@ from math import radians
 import numpy as np
 import pytest
 
-import posts
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.errors import CalibrationError
-from coec.evaluation.outlines import outlines_of
-from coec.evaluation.places import DifferenceRegions, difference_regions, shift_px
 from coec.geometry import se3
 from coec.geometry.cameras import build
 from coec.geometry.projection import project
+from coec.io.images import GreyImages
+from coec.reports.difference_regions import DifferenceRegions, difference_regions, outlines_of, shift_px
+from support import scenes
 
 SIZE_PX = (90, 60)
 
@@ -34,12 +33,12 @@ def _places(window: Window, T_one: Matrix4, T_other: Matrix4) -> DifferenceRegio
 def _column_of(azimuth_deg: float) -> float:
     """Of a post, in the true picture."""
     angle = radians(azimuth_deg)
-    uv_px, _ = project(posts.POST_CAMERA, np.array([[-np.sin(angle), 0.0, np.cos(angle)]]))
+    uv_px, _ = project(scenes.POST_CAMERA, np.array([[-np.sin(angle), 0.0, np.cos(angle)]]))
     return float(uv_px[0, 0])
 
 
 def test_a_post_has_an_outline_on_each_side() -> None:
-    window = posts.post_window((8.0,))
+    window = scenes.post_window((8.0,))
     outlines = outlines_of(window.pairs[0], window.rig, compensated=True)
     azimuth_deg = np.degrees(np.arctan2(outlines.xyz_m[:, 1], outlines.xyz_m[:, 0]))
     sides = [
@@ -53,7 +52,7 @@ def test_a_post_has_an_outline_on_each_side() -> None:
 
 def test_the_place_is_where_the_two_differ() -> None:
     """A step ahead moves what is aside, and not what is ahead."""
-    window = posts.post_window((0.0, 25.0))
+    window = scenes.post_window((0.0, 25.0))
     moved = se3.perturb(window.T_camera_lidar_start, np.array([0.0, 0.0, 0.0, 0.0, 0.0, -0.3]))
     part = _places(window, moved, window.T_camera_lidar_start).regions[0].part
     assert part.left <= _column_of(25.0) < part.left + part.width
@@ -62,7 +61,7 @@ def test_the_place_is_where_the_two_differ() -> None:
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_the_image_tells_which_is_right(sign: float) -> None:
-    window = posts.post_window((-10.0, 0.0, 12.0))
+    window = scenes.post_window((-10.0, 0.0, 12.0))
     truth = window.T_camera_lidar_start
     wrong = _turned(truth, (0.0, 1.0, 0.0), 0.5 * sign)
     seen, turned = _places(window, wrong, truth), _places(window, truth, wrong)
@@ -72,7 +71,7 @@ def test_the_image_tells_which_is_right(sign: float) -> None:
 
 
 def test_places_lie_in_the_image_and_apart() -> None:
-    window = posts.post_window((-36.0, -20.0, -18.0, 0.0, 3.0, 37.0))
+    window = scenes.post_window((-36.0, -20.0, -18.0, 0.0, 3.0, 37.0))
     found = _places(
         window, _turned(window.T_camera_lidar_start, (0.0, 1.0, 0.0), 0.3), window.T_camera_lidar_start
     ).regions
@@ -81,8 +80,8 @@ def test_places_lie_in_the_image_and_apart() -> None:
         part = place.part
         assert part.left >= 0
         assert part.top >= 0
-        assert part.left + part.width <= posts.POST_CAMERA.width
-        assert part.top + part.height <= posts.POST_CAMERA.height
+        assert part.left + part.width <= scenes.POST_CAMERA.width
+        assert part.top + part.height <= scenes.POST_CAMERA.height
         apart = [max(abs(part.left - other.part.left) / 90, abs(part.top - other.part.top) / 60) for other in found]
         assert sorted(apart)[1] > 0.4  # their outlines are others; the rectangles are moved to the middle of theirs
 
@@ -90,7 +89,7 @@ def test_places_lie_in_the_image_and_apart() -> None:
 def test_masked_outlines_are_no_place() -> None:
     mask = np.ones((360, 640), np.bool_)
     mask[:, 320:] = False  # the post on the right
-    window = posts.post_window((-18.0, 18.0), mask=mask)
+    window = scenes.post_window((-18.0, 18.0), mask=mask)
     found = _places(
         window, _turned(window.T_camera_lidar_start, (0.0, 1.0, 0.0), 0.3), window.T_camera_lidar_start
     ).regions
@@ -99,7 +98,7 @@ def test_masked_outlines_are_no_place() -> None:
 
 
 def test_without_a_range_edge_there_is_no_place() -> None:
-    window = posts.post_window(())
+    window = scenes.post_window(())
     found = _places(window, _turned(window.T_camera_lidar_start, (0.0, 1.0, 0.0), 0.3), window.T_camera_lidar_start)
     assert found.regions == ()
     assert np.isnan(found.strength).all()
@@ -107,7 +106,7 @@ def test_without_a_range_edge_there_is_no_place() -> None:
 
 
 def test_the_shift_of_a_turn_is_its_angle_in_pixels() -> None:
-    window = posts.post_window((0.0,))
+    window = scenes.post_window((0.0,))
     one = window.T_camera_lidar_start
     told = shift_px(window, one, _turned(one, (0.0, 1.0, 0.0), 1.0), compensated=True)
     assert told is not None
@@ -116,7 +115,7 @@ def test_the_shift_of_a_turn_is_its_angle_in_pixels() -> None:
 
 
 def test_an_image_of_another_size_is_refused() -> None:
-    window = posts.post_window((0.0,))
+    window = scenes.post_window((0.0,))
     camera = build("pinhole", width=600, height=360, fx=400.0, fy=400.0, cx=299.5, cy=179.5)
     other = replace(window, rig=replace(window.rig, camera=camera))
     with pytest.raises(CalibrationError, match="640 x 360 px, the camera model 600 x 360 px"):

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.types import Matrix4
-from coec.evaluation.profiles import NARROW, WIDE, ScanSpan, scan, views
 from coec.geometry import se3
+from coec_lab.experiments.objective_scans import NARROW, WIDE, ScanSpan, scan, views
 
 REFERENCE = se3.exp(np.array([1.2, -1.2, 1.2, 0.1, -0.3, 0.8]))
 

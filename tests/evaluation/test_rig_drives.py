@@ -11,18 +11,26 @@ import pytest
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from coec.calibration.types import Matrix4
-from coec.evaluation import knocked_drive
-from coec.evaluation.check_drives import CHECK_PAIRS
-from coec.evaluation.knocked_drive import FIRST_SEED, LIDAR, DisplacedRigDrive
-from coec.evaluation.rig_drive_statistics import DISPLACEMENTS, SensorDisplacement, moves_of, report
-from coec.evaluation.rig_drive_windows import answer_ns, request_stamps_ns, variant
-from coec.evaluation.rig_drives import driven
-from coec.evaluation.rig_looks import PERIOD_S, TURN_S, due
 from coec.geometry import se3
 from coec.schemas.replies import Vector6
-from coec.schemas.rig import Mounts, RigDriveRow, RigLook, RigWindow
-from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigDrive
+from coec_lab.experiments import rig_drives
+from coec_lab.experiments.check_drives import CHECK_PAIRS
+from coec_lab.experiments.rig_drive_statistics import DISPLACEMENTS, SensorDisplacement, moves_of, report
+from coec_lab.experiments.rig_drives import (
+    FIRST_SEED,
+    LIDAR,
+    PERIOD_S,
+    TURN_S,
+    DisplacedRigDrive,
+    answer_ns,
+    driven,
+    due,
+    request_stamps_ns,
+    variant,
+)
+from coec_lab.experiments.simulation_schemas import Mounts, RigDriveRow, RigLook, RigWindow
+from coec_lab.simulation.journey import START_NS
+from coec_lab.simulation.rig_drive import RigDrive
 
 CAMERA = "fisheye1400"
 NOISE = np.array([radians(0.05)] * 3 + [0.015] * 3)
@@ -168,8 +176,8 @@ def test_where_looks_are_too_faint_an_accepted_window_names_the_camera(rows: lis
 @pytest.mark.slow
 def test_a_drive_is_drawn_and_looked_at_pair_by_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """As small and short as it goes: what the looks say of so few pixels is of no interest."""
-    monkeypatch.setattr(knocked_drive, "AT_S", (6.5, 6.6))
-    monkeypatch.setattr(knocked_drive, "AFTER_S", 2.0)
+    monkeypatch.setattr(rig_drives, "AT_S", (6.5, 6.6))
+    monkeypatch.setattr(rig_drives, "AFTER_S", 2.0)
     drive = DisplacedRigDrive(0, "fisheye64")
     row = driven(drive)
     assert row.failure is None

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.rig import lidar_looks
-from coec.evaluation.rig_evidence import (
+from coec.calibration.rig import edge_observations
+from coec.geometry import se3
+from coec_lab.experiments.rig_evidence import (
     FULL,
     LIDAR_CHECK,
     LIDAR_LATE_S,
@@ -22,7 +23,6 @@ from coec.evaluation.rig_evidence import (
     simulate_checks,
     windows,
 )
-from coec.geometry import se3
 
 STILL = Happening(FULL.poses, FULL.poses, None, 0.0, 1500.0)
 
@@ -43,7 +43,7 @@ def test_looks_at_two_lidars_come_in_their_time_and_scatter_as_those_on_streets(
     np.testing.assert_allclose(spaced, np.round(spaced))
     offsets = np.concatenate([scattered(heard, name) for name in sorted(FULL.graph.of_lidars)])
     middle = np.median(np.abs(offsets), axis=0) / 0.6745  # of a normal variable, its standard deviation
-    expected = np.hypot(LIDAR_CHECK, lidar_looks.PLACE)
+    expected = np.hypot(LIDAR_CHECK, edge_observations.PLACE)
     assert ((middle > 0.6 * expected) & (middle < 1.5 * expected)).all()
     assert np.abs(offsets).max() > 20.0 * expected.max(), "some are bad"
 

@@ -6,9 +6,19 @@ from math import radians
 
 import numpy as np
 
-from coec.evaluation.rig_evidence import FOUR, NS_PER_S, Happening, Lasting, TimedEvidence, moved, simulate_checks
-from coec.evaluation.rig_windows import SLICE_S, TAKES_S, urgent_evidence
 from coec.geometry import se3
+from coec_lab.experiments.rig_evidence import (
+    FOUR,
+    NS_PER_S,
+    SLICE_S,
+    TAKES_S,
+    Happening,
+    Lasting,
+    TimedEvidence,
+    moved,
+    simulate_checks,
+    urgent_evidence,
+)
 
 AT_S, UNTIL_S = 100.0, 1000.0
 DRIVES = 12

@@ -8,8 +8,7 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.evaluation.split_halves import compare, split
-from coec.evaluation.statistics import SolveOutcome, Trial, score
+from coec_lab.experiments.solve_statistics import SolveOutcome, Trial, compare, score, split
 from evaluation.test_statistics import FAR, REFERENCE, _estimate, _xi
 
 

@@ -7,7 +7,8 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.evaluation.starts import (
+from coec.geometry import se3
+from coec_lab.experiments.solve_experiments import (
     frame_counts,
     frame_subset,
     perturbations,
@@ -15,7 +16,6 @@ from coec.evaluation.starts import (
     start_poses,
     translation_partners,
 )
-from coec.geometry import se3
 
 COUNTS = [1, 2, 3, 5, 8, 30, 97, 200, 1400]
 """With the primes, the Fibonacci numbers and the sizes of the papers among them."""

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.types import Decision, Estimate, Optimum, StopReason, Uncertainty, Verdict
-from coec.evaluation.statistics import (
+from coec.geometry import se3
+from coec_lab.experiments.solve_statistics import (
     NOT_SOLVED,
     SolveOutcome,
     Trial,
@@ -20,7 +21,6 @@ from coec.evaluation.statistics import (
     summarise,
     worst,
 )
-from coec.geometry import se3
 
 REFERENCE = se3.exp(np.array([1.2, -1.2, 1.2, 0.1, -0.3, 0.8]))
 FAR = se3.perturb(REFERENCE, np.array([0.0, radians(10.0), 0.0, 0.0, 0.0, 0.0]))

@@ -28,10 +28,10 @@ from coec.calibration.types import (
 )
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
-from coec.evaluation import steps
-from coec.evaluation.steps import MountStep, MountStepRow, MountStepTrial, try_mount_steps
 from coec.geometry import se3
-from estimates import ESTIMATE_RIG, estimate
+from coec_lab.experiments import mount_steps
+from coec_lab.experiments.mount_steps import MountStep, MountStepRow, MountStepTrial, try_mount_steps
+from support.estimates import ESTIMATE_RIG, estimate
 
 CONFIG = CalibrationConfig()
 
@@ -81,7 +81,7 @@ def refused(window: Window, first_late: int) -> Estimate:
 def tried(
     monkeypatch: pytest.MonkeyPatch, street: Window, solver: Solver, *knocks: MountStep, trials: int = 3
 ) -> list[MountStepTrial]:
-    monkeypatch.setattr(steps, "calibrate", solver)
+    monkeypatch.setattr(mount_steps, "calibrate", solver)
     unused: Any = None
     return try_mount_steps(street, unused, unused, CONFIG, trials, knocks, lambda _: None)
 
@@ -127,8 +127,8 @@ def test_the_time_of_a_step_is_known_where_its_place_is(street: Window, monkeypa
         first_late = round((1.0 - one.late) * len(street.pairs))
         assert one.off_s is not None
         assert abs(one.off_s - (first_late - 1) * spacing_s) <= spacing_s / 2 + 1e-6
-    (row,) = steps.table(told)
-    assert row.time_known == np.mean([one.off_s is not None and one.off_s <= steps.KNOWN_TO_S for one in told])
+    (row,) = mount_steps.table(told)
+    assert row.time_known == np.mean([one.off_s is not None and one.off_s <= mount_steps.KNOWN_TO_S for one in told])
 
 
 def test_the_table_has_a_row_for_each_knock_in_their_order() -> None:
@@ -138,7 +138,7 @@ def test_the_table_has_a_row_for_each_knock_in_their_order() -> None:
 
     told = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0, told_s=2.5, holds=True)]
     told += [one("1 deg", accepted=True, wrong=True), one("1 deg, slowly", moved=True)]
-    assert steps.table(told) == (
+    assert mount_steps.table(told) == (
         MountStepRow("none", 1, 1.0, 0.0, 0.0, None, None, None, None),
         MountStepRow("1 deg", 2, 0.5, 0.5, 0.5, 0.5, 1.0, 2.5, 1.0),
         MountStepRow("1 deg, slowly", 1, 0.0, 0.0, 1.0, None, None, None, None),

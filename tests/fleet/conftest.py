@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_windows import recorded_windows
+from support.fleet import recorded_windows
 
 
 @pytest.fixture(scope="session")

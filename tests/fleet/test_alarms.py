@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from coec.fleet.alarms import false_alarms
-from coec.schemas.last_word import LastWord
+from coec.fleet.report import false_alarms
+from coec.schemas.heartbeat import LastWord
 from coec.schemas.replies import Alarms
-from last_words import heartbeat
+from support.messages import heartbeat
 
 
 def _told(vehicle: str, hours: float, confirmed: int, withdrawn: int) -> LastWord:

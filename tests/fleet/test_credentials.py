@@ -10,8 +10,16 @@ import fsspec
 import pytest
 
 from coec.errors import SourceError
-from coec.fleet.credentials import GOOGLE, MAX_FILE_BYTES, StoreCredentials, redacted
-from coec.fleet.places import Job, StoreError, fetched_window, stores_of
+from coec.fleet.jobs import (
+    GOOGLE,
+    MAX_FILE_BYTES,
+    Job,
+    StoreCredentials,
+    StoreError,
+    fetched_window,
+    redacted,
+    stores_of,
+)
 
 SECRET = "wJalrXUtnFEMI/K7MDENG"
 AWS = {"AWS_ACCESS_KEY_ID": "AKIDEXAMPLE", "AWS_SECRET_ACCESS_KEY": SECRET, "AWS_REGION": "eu-central-1"}

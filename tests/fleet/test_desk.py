@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.mcap.windows import read_result, read_vehicle
 from coec.config import CalibrationConfig
 from coec.errors import ConfigError, UsageError
-from coec.fleet.desk import WindowEvaluator
-from coec.fleet.places import Job
-from coec.fleet.terms import ReplaySettings, load_settings
-from coec.schemas.base import to_json
-from fleet_windows import WINDOW_CONFIGURATION
+from coec.fleet.evaluator import WindowEvaluator
+from coec.fleet.jobs import Job
+from coec.fleet.replay_settings import ReplaySettings, load_settings
+from coec.io.mcap.window_reader import read_result, read_vehicle
+from coec.schemas.message import to_json
+from support.fleet import WINDOW_CONFIGURATION
 
 
 @pytest.fixture
@@ -58,8 +58,8 @@ def test_a_configuration_that_does_not_know_the_pair_is_an_error_of_the_window(w
 
 
 def test_another_rig_decides_for_its_pair(window: Path, tmp_path: Path) -> None:
-    from coec.adapters.files.rig import rig_to_json
-    from coec.adapters.mcap.windows import read_window
+    from coec.io.mcap.window_reader import read_window
+    from coec.io.rig_files import rig_to_json
 
     rig = read_window(window)[0].rig
     document = rig_to_json(rig)
@@ -113,7 +113,7 @@ def test_a_fault_of_ours_is_a_row_as_well(window: Path, monkeypatch: pytest.Monk
     def broken(*_: object) -> None:
         raise ZeroDivisionError("no such thing")
 
-    monkeypatch.setattr("coec.fleet.desk.calibrate", broken)
+    monkeypatch.setattr("coec.fleet.evaluator.calibrate", broken)
     row = WindowEvaluator(ReplaySettings()).row(Job(str(window)))
     assert (row.error_code, row.error) == ("internal", "ZeroDivisionError: no such thing")
     assert row.sha256 is not None

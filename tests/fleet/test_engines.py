@@ -12,12 +12,12 @@ from pathlib import Path
 import psutil
 import pytest
 
-from coec.adapters.mcap.windows import read_result
-from coec.fleet.engines.engine import DEADLINE, PROCESS_DIED, TOO_LARGE, Engine, WorkerLimits
-from coec.fleet.engines.local import LocalEngine
-from coec.fleet.places import Job
-from coec.fleet.terms import ReplaySettings
-from coec.schemas.base import to_json
+from coec.fleet.jobs import Job
+from coec.fleet.local_engine import LocalEngine
+from coec.fleet.replay_settings import ReplaySettings
+from coec.fleet.worker_pool import DEADLINE, PROCESS_DIED, TOO_LARGE, Engine, WorkerLimits
+from coec.io.mcap.window_reader import read_result
+from coec.schemas.message import to_json
 
 MIB = 2**20
 BOUNDS = WorkerLimits(120.0, 4096 * MIB)
@@ -96,7 +96,7 @@ def test_no_windows_need_no_process() -> None:
 @pytest.mark.slow
 def test_a_cluster_of_ray_decides_the_same(recorded: Path, poisoned: str) -> None:
     pytest.importorskip("ray", reason="needs the optional extra `ray`")
-    from coec.fleet.engines.ray import RayEngine
+    from coec.fleet.ray_engine import RayEngine
 
     want = expected(recorded)
     one, two = want

@@ -10,7 +10,7 @@ import fsspec
 import pytest
 
 from coec.errors import SourceError, UsageError
-from coec.fleet.places import Job, fetched_window, jobs_of
+from coec.fleet.jobs import Job, fetched_window, jobs_of
 
 DATA = b"a window"
 SHA256 = hashlib.sha256(DATA).hexdigest()

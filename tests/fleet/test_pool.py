@@ -10,19 +10,22 @@ from dataclasses import dataclass, field
 import pytest
 
 from coec.errors import ModelError
-from coec.fleet.engines.engine import DEADLINE, NODE_LOST, PROCESS_DIED, FleetError, WorkerLimits
-from coec.fleet.engines.pool import (
+from coec.fleet.jobs import Job, StoreError, empty_row, lost_row
+from coec.fleet.worker_pool import (
+    DEADLINE,
+    MAX_LOSSES,
+    NODE_LOST,
+    PROCESS_DIED,
     START_S,
+    FleetError,
     PoolWorker,
     WindowEvaluated,
     WorkerEvent,
+    WorkerLimits,
     WorkerPool,
     WorkerStarted,
     WorkerStopped,
 )
-from coec.fleet.engines.queue import MAX_LOSSES
-from coec.fleet.places import Job, StoreError
-from coec.fleet.trouble import empty_row, lost_row
 from coec.schemas.fleet import WindowRow
 
 BOUNDS = WorkerLimits(600.0, 2**30)

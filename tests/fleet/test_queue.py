@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from coec.fleet.engines.queue import WINDOWS_PER_WORKER, WindowQueue
-from coec.fleet.places import Job
+from coec.fleet.jobs import Job
+from coec.fleet.worker_pool import WINDOWS_PER_WORKER, WindowQueue
 
 TROUBLE = ("process_died", "it ended")
 

@@ -16,13 +16,11 @@ import pytest
 
 from coec import __version__
 from coec.errors import SourceError
-from coec.fleet.credentials import StoreCredentials
-from coec.fleet.engines import ray as engine_module
-from coec.fleet.engines.engine import NODE_LOST, NOT_ON_NODE, FleetError, WorkerLimits
-from coec.fleet.engines.ray import NODE_DIED, SILENCE_S, RayEngine
-from coec.fleet.places import Job
-from coec.fleet.terms import ReplaySettings
-from coec.fleet.trouble import empty_row, failed_row
+from coec.fleet import ray_engine as engine_module
+from coec.fleet.jobs import Job, StoreCredentials, empty_row, failed_row
+from coec.fleet.ray_engine import NODE_DIED, SILENCE_S, RayEngine
+from coec.fleet.replay_settings import ReplaySettings
+from coec.fleet.worker_pool import NODE_LOST, NOT_ON_NODE, FleetError, WorkerLimits
 
 BOUNDS = WorkerLimits(600.0, 2**30)
 GIB = 2.0**30

@@ -9,18 +9,17 @@ import duckdb
 import numpy as np
 import pytest
 
-from coec.adapters.mcap.windows import read_result
 from coec.errors import UsageError
-from coec.fleet import questions, tables
+from coec.fleet import tables
 from coec.fleet.report import report
+from coec.io.mcap.window_reader import read_result
 from coec.reports import fleet_page
 from coec.reports.page import VerdictBanner, render
 from coec.reports.provenance import Provenance
-from coec.schemas.fleet import FleetReport, WindowRow
-from coec.schemas.fleet_now import FleetNow, PairNow
+from coec.schemas.fleet import FleetNow, FleetReport, PairNow, WindowRow
 from coec.schemas.replies import Alarms, CalibrationResult
-from fleets import FAILED_SHARE, REFUSED_SHARE, WINDOW_SIGMA, fleet_rows
-from last_words import heartbeat
+from support.fleet import FAILED_SHARE, REFUSED_SHARE, WINDOW_SIGMA, fleet_rows
+from support.messages import heartbeat
 
 VEHICLES, WINDOWS = 12, 40
 DRIFTS = {3: (1, 1.2), 7: (3, 0.15)}
@@ -138,18 +137,18 @@ def test_what_another_batch_decided_otherwise(results: Path, rows: list[WindowRo
 
 
 def test_every_example_of_a_query_answers(results: Path) -> None:
-    connection = questions.connect(results)
-    for question, query in questions.EXAMPLE_QUERIES.items():
+    connection = tables.connect(results)
+    for question, query in tables.EXAMPLE_QUERIES.items():
         rows = connection.execute(query).fetchall()
         assert rows or "otherwise" in question, question
-    assert dict(questions.columns(results))["correlation"] == "DOUBLE[]"
+    assert dict(tables.columns(results))["correlation"] == "DOUBLE[]"
 
 
 def test_the_view_that_is_printed_is_the_one_that_is_asked(rows: list[WindowRow], tmp_path: Path) -> None:
     """A vehicle whose name is a number keeps its zeros."""
     tables.write_tables(tmp_path, [row.model_copy(update={"vehicle": "007"}) for row in rows[:2]], "part-1")
     connection = duckdb.connect()
-    connection.execute(questions.view_statement("mine", tmp_path))
+    connection.execute(tables.view_statement("mine", tmp_path))
     assert connection.execute("SELECT DISTINCT vehicle FROM mine").fetchall() == [("007",)]
 
 

@@ -10,15 +10,14 @@ from typing import Any
 import duckdb
 import pytest
 
-from coec.adapters.files import durable
 from coec.errors import OutputError, SourceError, UsageError
-from coec.fleet import batch, results, tables
-from coec.fleet.desk import WindowEvaluator
-from coec.fleet.engines.engine import FleetError
-from coec.fleet.places import Job
-from coec.fleet.results import BatchFolder
-from coec.fleet.terms import ReplaySettings
-from coec.fleet.trouble import empty_row, lost_row
+from coec.fleet import batch, tables
+from coec.fleet.batch import BatchFolder
+from coec.fleet.evaluator import WindowEvaluator
+from coec.fleet.jobs import Job, empty_row, lost_row
+from coec.fleet.replay_settings import ReplaySettings
+from coec.fleet.worker_pool import FleetError
+from coec.io import storage
 from coec.schemas.fleet import WindowRow
 
 
@@ -29,7 +28,7 @@ def row(recorded: Path) -> WindowRow:
 
 @pytest.fixture(autouse=True)
 def small_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(results, "ROWS_A_FILE", 4)
+    monkeypatch.setattr(batch, "ROWS_A_FILE", 4)
 
 
 def rows(count: int) -> Iterator[WindowRow]:
@@ -106,7 +105,7 @@ def test_tables_that_were_made_before_the_journal_was_emptied_are_not_made_twice
         def gone(*_: object) -> None:
             raise KeyboardInterrupt
 
-        patch.setattr(durable.LineLog, "renew", gone)
+        patch.setattr(storage.LineLog, "renew", gone)
         *before, last = rows(4)
         for row in before:
             first.add(row)
@@ -122,7 +121,7 @@ def test_a_torn_or_damaged_line_of_the_journal_costs_its_own_window(tmp_path: Pa
     first = BatchFolder(tmp_path, ReplaySettings(), resume=False)
     for row in rows(3):
         first.add(row)
-    journal = tmp_path / results.JOURNAL_FILE
+    journal = tmp_path / batch.JOURNAL_FILE
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(lines[0] + b'{"url": 3}\n' + lines[2][:-20])
     assert BatchFolder(tmp_path, ReplaySettings(), resume=True).urls == {"0.mcap"}
@@ -195,7 +194,7 @@ def test_what_cannot_be_read_or_written_is_told(tmp_path: Path) -> None:
     table.write_bytes(b"PAR1 rubbish PAR1")
     with pytest.raises(SourceError, match="judged again"):
         BatchFolder(tmp_path / "batch", ReplaySettings(), resume=True)
-    (tmp_path / "batch" / results.SETTINGS_FILE).write_text("[")
+    (tmp_path / "batch" / batch.SETTINGS_FILE).write_text("[")
     with pytest.raises(UsageError, match="another folder"):
         BatchFolder(tmp_path / "batch", ReplaySettings(), resume=True)
     (tmp_path / "file").write_text("")

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coec.errors import UsageError
-from coec.fleet.roster import RANKS, FleetFilter, FleetState, parse_states
+from coec.fleet.fleet_state import RANKS, FleetFilter, FleetState, parse_states
 from coec.schemas.keys import Keys
-from last_words import SENT_NS, heartbeat, packed_heartbeat
+from support.messages import SENT_NS, heartbeat, packed_heartbeat
 
 S = 1_000_000_000
 
@@ -112,7 +112,7 @@ def test_who_floods_takes_no_more_memory_than_a_fleet_does() -> None:
 @pytest.mark.fault("a flood of words of the largest size", "their bytes are bounded as their number is")
 def test_words_of_the_largest_size_take_no_more_memory_than_a_fleet_does(monkeypatch: pytest.MonkeyPatch) -> None:
     size = len(packed_heartbeat(heartbeat("v0", "front")))
-    monkeypatch.setattr("coec.fleet.roster.MAX_WORD_BYTES", 3 * size)
+    monkeypatch.setattr("coec.fleet.fleet_state.MAX_WORD_BYTES", 3 * size)
     roster = FleetState()
     for index in range(10):
         said(roster, 0.0, f"v{index}")

@@ -17,8 +17,8 @@ import msgpack
 from mcap.opcode import Opcode
 from ruamel.yaml import YAML
 
-from coec.adapters.mcap.files import MAGIC
-from coec.runtime.decisions.chain import GENESIS
+from coec.io.mcap.reader import MAGIC
+from coec.service.records.history import GENESIS
 from fuzz.mutate import deepened, mutated_bytes, mutated_value
 
 Part = tuple[int, bytes]

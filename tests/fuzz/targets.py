@@ -19,26 +19,8 @@ import numpy as np
 import zenoh
 from mcap.opcode import Opcode
 
-from baselines import a_baseline
-from cloud_files import npy, npz, pcd
-from coec.adapters.depth.model_cards import CARDS, read_card
-from coec.adapters.files.baseline_file import baseline_to_json, load_baseline
-from coec.adapters.files.conversions import estimate_of, result_of
-from coec.adapters.files.rig import camera_of, rig_of, rig_to_json
-from coec.adapters.frames.msgpack_frames import decode_camera, decode_ego, decode_lidar
-from coec.adapters.images.codec import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
-from coec.adapters.mcap.files import McapMessage, read_records
-from coec.adapters.mcap.snippet_file import salvage_snippet
-from coec.adapters.mcap.windows import PART_SUFFIX, is_window, read_result, read_window, salvage
-from coec.adapters.ros import incoming, messages, outgoing
-from coec.adapters.ros.camera_info import decode_info, intrinsics_of_info
-from coec.adapters.ros.images import ENCODINGS
-from coec.adapters.ros.moving_frames import MovingFrame, frames_in
-from coec.adapters.ros.static_transforms import StaticTransforms, decode_static_transforms
-from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.settings import mode_of, settings_of
-from coec.calibration.lidar_to_lidar.types import RangeBias
-from coec.calibration.lifecycle import PairRules, after_estimate, initial_state, restored
+from coec.calibration.rig.lidar_sampling import RangeBias
+from coec.calibration.state import PairRules, after_estimate, initial_state, restored
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.config import (
     CalibrationConfig,
@@ -55,26 +37,48 @@ from coec.config import (
 )
 from coec.errors import SourceError, UsageError
 from coec.geometry.cameras import build, project_point
-from coec.runtime.api import payloads
-from coec.runtime.api.extrinsic import extrinsic_of
-from coec.runtime.decisions.pair_store import PairStore
-from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.decisions.stored_pair import Clocks
-from coec.runtime.nominal.findings import DiscoveredPair
-from coec.runtime.nominal.kept import NOMINAL_FILE, DiscoveryStore
-from coec.runtime.recording.window_store import WindowStore
-from coec.runtime.worker.answers import MalformedAnswerError, number_of, pack_answer, read_answer
-from coec.runtime.worker.jobs import Kind, Registered, RenderedImage, Solved
-from coec.runtime.worker.link import Link, MalformedMessageError
+from coec.io.baseline_file import baseline_to_json, load_baseline
+from coec.io.depth.model_cards import CARDS, read_card
+from coec.io.images import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
+from coec.io.logs import LossCounter
+from coec.io.mcap.bag_writer import salvage_snippet
+from coec.io.mcap.reader import McapMessage, read_records
+from coec.io.mcap.window_reader import PART_SUFFIX, is_window, read_result, read_window
+from coec.io.mcap.window_writer import salvage
+from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar
+from coec.io.recordings.cloud_files import load_cloud
+from coec.io.recordings.kitti import read_numbers, read_stamps
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import RecordingSource
+from coec.io.rig_files import camera_of, rig_of, rig_to_json
+from coec.io.ros import message_decoding, message_encoding, messages
+from coec.io.ros.camera_info import decode_info, intrinsics_of_info
+from coec.io.ros.message_decoding import ENCODINGS
+from coec.io.ros.transforms import MovingFrame, StaticTransforms, decode_static_transforms, frames_in
+from coec.io.serialise import estimate_of, result_of
+from coec.io.zenoh.session import mode_of, settings_of
 from coec.schemas import keys
-from coec.schemas.base import to_json
 from coec.schemas.commands import COMMAND_NAMES
+from coec.schemas.message import to_json
 from coec.schemas.replies import CalibrationResult
-from coec.sources import open_source
-from coec.sources.clouds import load_cloud
-from coec.sources.kitti_files import read_numbers, read_stamps
-from coec.sources.recording import RecordingSource
-from estimates import ESTIMATE_RIG, estimate
+from coec.service.api import authorization
+from coec.service.api.reply_builders import extrinsic_of
+from coec.service.discovery import NOMINAL_FILE, DiscoveredPair, DiscoveryStore
+from coec.service.recording.window_store import WindowStore
+from coec.service.records.pair_store import PairStore
+from coec.service.records.state_store import StateStore
+from coec.service.records.stored_pair import Clocks
+from coec.service.worker.child_process import Link, MalformedMessageError
+from coec.service.worker.worker_jobs import (
+    Kind,
+    MalformedAnswerError,
+    Registered,
+    RenderedImage,
+    Solved,
+    number_of,
+    pack_answer,
+    read_answer,
+)
 from fuzz.formats import (
     attachment,
     behind,
@@ -94,8 +98,9 @@ from fuzz.formats import (
     with_checksum,
 )
 from fuzz.loop import Target
-from pair_bench import InstantDiskWriter
-from ros_messages import (
+from support.estimates import ESTIMATE_RIG, a_baseline, estimate
+from support.recordings import npy, npz, pcd
+from support.ros import (
     JPEG,
     STAMP_NS,
     Columns,
@@ -110,6 +115,7 @@ from ros_messages import (
     twist,
     twist_with_covariance,
 )
+from support.vehicles import InstantDiskWriter
 
 LOG = logging.getLogger(__name__)
 LIMITS = LimitsConfig()
@@ -178,7 +184,7 @@ def _cdr(data: bytes, folder: Path) -> None:
     del folder
     kind = data[0] if data else 0
     said = TIME_SAID if kind >= 2**7 else None
-    _inspected(incoming.decode(MESSAGES[kind % 2**7 % len(MESSAGES)], data[1:], LIMITS, point_time=said))
+    _inspected(message_decoding.decode(MESSAGES[kind % 2**7 % len(MESSAGES)], data[1:], LIMITS, point_time=said))
 
 
 def _transforms(data: bytes, folder: Path) -> None:
@@ -462,7 +468,7 @@ def _window_seeds() -> list[bytes]:
         (
             "/coec/front/camera/depth/compressed",
             messages.COMPRESSED_IMAGE,
-            compressed_image(DEPTH, outgoing.DEPTH_FORMAT),
+            compressed_image(DEPTH, message_encoding.DEPTH_FORMAT),
         ),
         ("/coec/front/camera/image/compressed", messages.COMPRESSED_IMAGE, compressed_image()),
     ]
@@ -525,11 +531,11 @@ def _command(data: bytes, folder: Path) -> None:
     del folder
     name = (*COMMAND_NAMES, "other")[data[0] % (len(COMMAND_NAMES) + 1) if data else 0]
     cut = 2 + data[1] if len(data) > 1 else 2
-    sender = payloads.sender_of(data[2:cut])
+    sender = authorization.sender_of(data[2:cut])
     assert sender.isascii()
     assert sender.isprintable()
-    assert len(sender) <= payloads.MAX_SENDER
-    for told in payloads.parse_payload(name, data[cut:]).values():
+    assert len(sender) <= authorization.MAX_SENDER
+    for told in authorization.parse_payload(name, data[cut:]).values():
         to_json_of(told)
 
 

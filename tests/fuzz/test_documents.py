@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from fuzz.formats import canonical, with_checksum
 from fuzz.loop import tried
 from fuzz.targets import TARGETS
-from strategies import documents
+from support.strategies import documents
 
 WRITERS: dict[str, Callable[[Any], bytes]] = {
     "camera": msgpack.packb,

@@ -12,10 +12,10 @@ from random import Random
 import numpy as np
 import pytest
 
-from coec.adapters.files.state_file import StateFile
-from coec.adapters.mcap.files import McapDamagedError, read_records
 from coec.errors import SourceError
-from coec.runtime.decisions.chain import HashChain
+from coec.io.mcap.reader import McapDamagedError, read_records
+from coec.io.storage import StateFile
+from coec.service.records.history import HashChain
 from fuzz import loop
 from fuzz.formats import chained, checksummed, in_archive, in_json, in_records, in_yaml
 from fuzz.loop import Finding, Fuzzer, Report, Target, smallest_with_all_arcs, tried

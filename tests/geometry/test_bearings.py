@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from coec.geometry.bearings import bearings, grid_counts
+from coec.geometry.sweep_kernels import bearings, grid_counts
 
 
 def test_are_those_of_numpy_in_every_direction() -> None:

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from coec.geometry import cameras
 from coec.geometry.cameras import Camera, in_image, project_point, unproject_point
-from coec.geometry.cameras.formulas import polar_angle
+from coec.geometry.cameras.base import polar_angle
 from coec.geometry.projection import project, unproject
-from oracles import CAMERA_PIXELS
-from strategies import angles_rad, points_m
+from support.oracles import CAMERA_PIXELS
+from support.strategies import angles_rad, points_m
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from coec.geometry import se3
-from coec.geometry.cover import moved_by, unit_ball
+from coec.geometry.edges.charts import moved_by, unit_ball
 
 POSE = se3.perturbation(np.array([0.4, -0.3, 1.2, 0.5, -1.0, 2.0]))
 

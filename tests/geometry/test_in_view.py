@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boards import BOARD_LENSES, BOARD_NOMINAL
 from coec.geometry.cameras import Camera, in_image
-from coec.geometry.in_view import points_in_view
-from coec.geometry.projection import project
+from coec.geometry.projection import points_in_view, project
+from support.scenes import BOARD_LENSES, BOARD_NOMINAL
 
 NEAREST_M = 2.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.geometry.linear import congruent, eigen, inverted, solved
+from coec.geometry.linalg import congruent, eigen, inverted, solved
 
 
 @pytest.mark.parametrize("size", [1, 3, 6, 7])

@@ -16,7 +16,7 @@ from coec.geometry.mutual_information import (
     mutual_information,
 )
 from coec.geometry.projection import project
-from oracles import entropy, mutual_information_of_frame
+from support.oracles import entropy, mutual_information_of_frame
 
 WIDTH, HEIGHT = 96, 64
 SENSOR = {"width": WIDTH, "height": HEIGHT, "fx": 30.0, "fy": 31.0, "cx": 47.2, "cy": 30.9}

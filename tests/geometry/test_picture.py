@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coec.geometry.picture import level_counts, neighbour_differences, square_sums
+from coec.geometry.images import level_counts, neighbour_differences, square_sums
 
 GREY = np.random.default_rng(6).integers(0, 256, (47, 70), np.uint8)
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build, in_image
-from coec.geometry.pixel_lookup import NOT_IN_IMAGE, UNSURE, certain_pixels, exact_pixel, filter_of
-from coec.geometry.projection import project, unproject
+from coec.geometry.projection import NOT_IN_IMAGE, UNSURE, certain_pixels, exact_pixel, filter_of, project, unproject
 
 SENSOR = {"width": 640, "height": 480, "fx": 200.0, "fy": 190.0, "cx": 321.3, "cy": 239.6}
 CAMERAS = {

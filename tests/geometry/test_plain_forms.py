@@ -7,9 +7,9 @@ import pytest
 
 from coec.geometry.cameras import build
 from coec.geometry.mutual_information import BinnedFrames
-from coec.geometry.plain_forms import by_numpy, by_scalar_loop
 from coec.geometry.projection import project
-from oracles import mutual_information_of_frame
+from coec_lab.bench.reference_kernels import by_numpy, by_scalar_loop
+from support.oracles import mutual_information_of_frame
 
 WIDTH, HEIGHT, BINS, POINTS = 90, 70, 8, 4000
 CAMERA = build("double_sphere", width=WIDTH, height=HEIGHT, fx=30.0, fy=31.0, cx=44.0, cy=35.0, xi=-0.2, alpha=0.6)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from coec.geometry.planes import planes_through
+from coec.geometry.sweep_kernels import planes_through
 
 
 def test_planes_are_those_of_a_singular_value_decomposition() -> None:

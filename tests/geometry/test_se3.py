@@ -8,7 +8,7 @@ from hypothesis import example, given
 from numpy.typing import NDArray
 
 from coec.geometry import se3
-from strategies import rotation_vectors, twists
+from support.strategies import rotation_vectors, twists
 
 Array = NDArray[np.float64]
 

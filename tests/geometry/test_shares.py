@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.geometry.shares import share_of_pixels
+from coec.geometry.mutual_information import share_of_pixels
 
 
 @pytest.mark.parametrize(("edges", "narrow"), [(1, np.uint8), (31, np.uint8), (254, np.uint8), (255, np.uint16)])

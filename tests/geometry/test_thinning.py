@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coec.geometry.thinning import thinned
+from coec.geometry.points import thinned
 
 BEAMS = 16
 

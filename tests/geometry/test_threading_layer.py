@@ -13,7 +13,7 @@ import coec
 
 LAUNCH = """
 import numba, numpy
-from coec.geometry.shares import share_of_pixels
+from coec.geometry.mutual_information import share_of_pixels
 values = numpy.ones((8, 8), numpy.float32)
 share_of_pixels(values, values > 0.0, numpy.ones(1, numpy.float32))
 print(numba.threading_layer(), *numba.config.THREADING_LAYER_PRIORITY)
@@ -22,7 +22,7 @@ print(numba.threading_layer(), *numba.config.THREADING_LAYER_PRIORITY)
 
 POOL = f"""
 from concurrent.futures import ProcessPoolExecutor
-from coec.simulation.parallel import SPAWN
+from coec_lab.simulation.parallel import SPAWN
 if __name__ == "__main__":
     with ProcessPoolExecutor(1, mp_context=SPAWN) as pool:
         pool.submit(exec, {LAUNCH!r}, {{}}).result()
@@ -30,7 +30,7 @@ if __name__ == "__main__":
 
 ENTRIES = {
     "program, command or judge of a fleet": "import coec",
-    "worker": "import coec.runtime.worker.process",
+    "worker": "import coec.service.worker.worker_main",
     "program that imported numba before": "import numba; import coec",
 }
 

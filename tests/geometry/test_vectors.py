@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coec.geometry.vectors import lengths, random_direction
+from coec.geometry.points import lengths, random_direction
 
 
 def test_lengths_are_those_of_numpy_to_the_bit() -> None:

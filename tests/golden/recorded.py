@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 import coec
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.conversions import result_of
-from coec.adapters.images.codec import GreyImages
-from coec.adapters.mcap.windows import WindowWriter, read_window, write_result
-from coec.calibration.calibrator import calibrate
+from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import Silence
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.geometry import se3
+from coec.io.depth.depth_maps import open_depth
+from coec.io.images import GreyImages
+from coec.io.mcap.window_reader import read_window
+from coec.io.mcap.window_writer import WindowWriter, write_result
+from coec.io.serialise import result_of
 from golden.reference import DATA, plain
 from golden.scene import Drive, write
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from oracles import CAMERA_PIXELS
+from support.oracles import CAMERA_PIXELS
 
 Array = NDArray[np.float64]
 

@@ -11,17 +11,16 @@ from typing import Any
 import numpy as np
 
 from calibration.rig.test_objections import EDGE, RIG
-from coec.adapters.files.baseline_file import BASELINES, baseline_hash, load_baselines, save_baseline
-from coec.adapters.files.rig import rig_from_json
-from coec.calibration.rig.types import RigGraph
+from coec.calibration.rig.graph import RigGraph
 from coec.config import Config
-from coec.runtime.decisions.history import PairHistory
-from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.nominal.kept import DiscoveryStore
-from coec.runtime.rig.rig_file import RigStore
-from driven_rig import RigDrive
+from coec.io.baseline_file import BASELINES, baseline_hash, load_baselines, save_baseline
+from coec.io.rig_files import rig_from_json
+from coec.service.discovery import DiscoveryStore
+from coec.service.records.history import PairHistory
+from coec.service.records.rig_store import RigStore
+from coec.service.records.state_store import StateStore
 from golden.reference import DATA, plain, read
-from rigs import POSES, moved_poses
+from support.rigs import POSES, RigDrive, moved_poses
 from upgrade import read_state, write_state
 
 STATE, EXPECTED, VALUES = DATA / "state", DATA / "state_expected.json", DATA / "state_values.json"

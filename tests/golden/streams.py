@@ -11,15 +11,13 @@ import numpy as np
 
 from calibration.rig.test_objections import EDGE, RIG
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.rig.objections import rig_alarms
+from coec.calibration.rig.rig_estimator import rig_alarms
 from coec.calibration.types import Matrix4
-from driven_rig import RigDrive
 from golden.reference import plain
-from lidar_bench import LidarBench
-from pair_bench import BEGIN_S, DRIVE_END_S, OracleWorker, PairBench
-from rigs import POSES, moved_poses
 from runtime import test_pair_disturbed as pair_drive
 from runtime.edges.test_stream import KNOCKED_S, knocked
+from support.rigs import POSES, LidarBench, RigDrive, moved_poses
+from support.vehicles import BEGIN_S, DRIVE_END_S, OracleWorker, PairBench
 
 LIDARS = ("roof", "bumper")
 

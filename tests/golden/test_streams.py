@@ -9,9 +9,9 @@ import pytest
 
 from golden import streams
 from golden.reference import DATA, Tolerance, check_lines, write_lines
-from lidar_bench import with_extra
 from runtime import test_pair_disturbed as pair_drive
 from runtime.test_pair_disturbed import Clock, clock
+from support.rigs import with_extra
 
 __all__ = ["clock", "with_extra"]
 

@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from coec.adapters.system.cores import ONE_THREAD
+from coec.io.system import ONE_THREAD
 
 
 def made(number: int, times: int) -> tuple[int, int, dict[str, str | None]]:

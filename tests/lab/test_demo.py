@@ -26,7 +26,7 @@ from coec_lab.demo.pair_client import Moment, PairOutcome, Snapshot, outcome_of,
 from coec_lab.demo.pair_drive import LEAD_NS, NS_PER_S, STEP_NS, Pace, at_rest, paced
 from coec_lab.demo.pair_report import demo_page
 from reports.pages import MADE
-from statuses import status_reply
+from support.messages import status_reply
 
 KNOCK_S, MAX_ERROR_DEG = pair_drive.KNOCK_S, pair_drive.MAX_ERROR_DEG
 
@@ -206,7 +206,7 @@ def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
     pytest.importorskip("embreex", reason="needs ray casting")
-    from coec.simulation.drive import SimulatedDrive
+    from coec_lab.simulation.drive import SimulatedDrive
 
     drive = SimulatedDrive(replace(pair_drive.drive_config(), seconds=2.0))
     config = pair_drive.service_config(drive.rig, Path("mask.png"), "tcp/127.0.0.1:1")
@@ -221,7 +221,7 @@ def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
 
 def test_there_is_something_to_look_at_before_the_service_says_anything(tmp_path: Path) -> None:
     pytest.importorskip("embreex", reason="needs ray casting")
-    from coec.simulation.drive import SimulatedDrive
+    from coec_lab.simulation.drive import SimulatedDrive
 
     drive = SimulatedDrive(replace(pair_drive.drive_config(), seconds=2.0, camera="fisheye160", lidar="16"))
     picture, page = pair_report.write_first(tmp_path, drive)
@@ -250,7 +250,7 @@ def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_no
     """Everything but the knock, in pictures as small as `fused` can do with: the service, the vehicle, the view, the
     pictures, the page."""
     pytest.importorskip("embreex", reason="needs ray casting")
-    from coec.simulation.drive import DriveConfig
+    from coec_lab.simulation.drive import DriveConfig
 
     # So long that it cannot be over before the window has been judged: see `pace.LEAD_NS`.
     quiet = DriveConfig(

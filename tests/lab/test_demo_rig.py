@@ -16,11 +16,8 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 from dataclasses import replace
 
 from cli.conftest import Coec
-from coec.reports.rig_plot import PlottedEdge
-from coec.simulation import drawing
-from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigDrive, RigDriveConfig
 from coec_lab.demo import rig
+from coec_lab.demo.demo_plots import PlottedEdge
 from coec_lab.demo.pair_drive import NS_PER_S
 from coec_lab.demo.rig_drive import (
     AHEAD,
@@ -35,8 +32,11 @@ from coec_lab.demo.rig_drive import (
     outcome_of,
     snapshot_of,
 )
-from rig_replies import moved_lidar_reply, reply_before_checks
+from coec_lab.simulation import parallel
+from coec_lab.simulation.journey import START_NS
+from coec_lab.simulation.rig_drive import RigDrive, RigDriveConfig
 from runtime.api.test_metrics import a_health
+from support.messages import moved_lidar_reply, reply_before_checks
 
 LIDAR, CAMERA = SCENARIO.acts
 SENSORS = ("front", "left", "rear", "right", "roof")
@@ -69,8 +69,8 @@ class AtOnce(Executor):
 
 
 def vehicle_of(executor: Executor, scenario: Scenario) -> RigVehicle:
-    drawing.prepare_process(tuple(scenario.drive_config(act) for act in (None, *scenario.acts)))
-    return RigVehicle(drawing.FrameRenderers(executor), scenario)
+    parallel.prepare_process(tuple(scenario.drive_config(act) for act in (None, *scenario.acts)))
+    return RigVehicle(parallel.FrameRenderers(executor), scenario)
 
 
 QUIET, NAMED = told(KNOCK_S - 9.0), told(KNOCK_S + 14.0, "left")

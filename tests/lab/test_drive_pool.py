@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.cores import ONE_THREAD
+from coec.io.system import ONE_THREAD
 from coec_lab.commands.drive_pool import DrivesError, finished
 from lab.made_drives import died, made
 

@@ -17,15 +17,15 @@ import pytest
 from numpy.typing import NDArray
 
 from cli.conftest import SMALL, Coec
-from coec.calibration.commissioning import learning
+from coec.calibration import commissioning
 from coec.calibration.types import LidarFrame
-from coec.evaluation import experiments, steps
-from coec.evaluation.starts import perturbations
-from coec.evaluation.statistics import SolveOutcome
 from coec.geometry import se3
-from coec.schemas.evaluation import ClosureReport, ComparisonReport, EvaluationReport
-from coec.sources.recording import FramewiseRecording
-from drives import rendered_drive
+from coec.io.recordings.recording_source import FramewiseRecording
+from coec_lab.experiments import mount_steps, solve_experiments
+from coec_lab.experiments.evaluation_schema import ClosureReport, ComparisonReport, EvaluationReport
+from coec_lab.experiments.solve_experiments import perturbations
+from coec_lab.experiments.solve_statistics import SolveOutcome
+from support.simulated_drives import rendered_drive
 
 CONTRACT = {
     "starts", "hits", "hit_rate", "rotation_deg", "translation_m", "bias", "std", "solve_s", "classified_correctly",
@@ -140,7 +140,7 @@ def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
 
 
 def test_methods_side_by_side_in_words(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.simulation.source.open_sim", lambda query: without_intensity(rendered_drive(query)))
+    monkeypatch.setattr("coec_lab.simulation.source.open_sim", lambda query: without_intensity(rendered_drive(query)))
     outcome = coec(
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--frames", "2",
         "--objective", "all", "--halves", "1",
@@ -214,14 +214,14 @@ def test_fitted_camera_and_uncompensated_clouds(coec: Coec) -> None:
 def test_what_was_finished_before_ctrl_c_is_printed_and_written(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    solve, solved = experiments.Bench.solve, count()
+    solve, solved = solve_experiments.Bench.solve, count()
 
-    def interrupted(self: experiments.Bench, *arguments: Any) -> SolveOutcome:
+    def interrupted(self: solve_experiments.Bench, *arguments: Any) -> SolveOutcome:
         if next(solved) == 3:  # of the reference, and two starts
             raise KeyboardInterrupt
         return solve(self, *arguments)
 
-    monkeypatch.setattr(experiments.Bench, "solve", interrupted)
+    monkeypatch.setattr(solve_experiments.Bench, "solve", interrupted)
     options = ("--depth", "stereo", "--objective", "mi", "--rotation-deg", "1", "--directions", "50")
     outcome = coec("evaluate", SMALL, *options, "--halves", "2", "--output", tmp_path, "--json")
     assert outcome.status == 130
@@ -238,7 +238,7 @@ def test_ctrl_c_before_the_first_result_leaves_none(coec: Coec, monkeypatch: pyt
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(experiments, "inferred", interrupted)
+    monkeypatch.setattr(solve_experiments, "inferred", interrupted)
     outcome = coec("evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "1", "--json")
     assert outcome.status == 130
     assert outcome.document["error"]["code"] == "interrupted"
@@ -251,8 +251,8 @@ def test_needs_a_radius(coec: Coec) -> None:
 
 def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("CHECKS", "FAR_CHECKS", "HALVES"):
-        monkeypatch.setattr(learning, name, 3)
-    monkeypatch.setattr(experiments, "CHECKS", 2)
+        monkeypatch.setattr(commissioning, name, 3)
+    monkeypatch.setattr(solve_experiments, "CHECKS", 2)
     arguments = (SMALL.replace("seconds=12", "seconds=18"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
     diagnosed = coec("diagnose", *arguments, "--checks", "2", "--json").document
@@ -263,7 +263,11 @@ def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.Monk
 
 
 def test_knocks_are_laid_into_the_recording(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(experiments, "MOUNT_STEPS", (steps.MountStep("none", 0.0), steps.MountStep("3 deg", radians(3.0))))
+    monkeypatch.setattr(
+        solve_experiments,
+        "MOUNT_STEPS",
+        (mount_steps.MountStep("none", 0.0), mount_steps.MountStep("3 deg", radians(3.0))),
+    )
     outcome = coec("evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--steps", "2")
     assert outcome.status == 0
     assert "accepted and wrong" in " ".join(outcome.out.split())
@@ -301,7 +305,7 @@ def test_a_simulated_drive_is_held_against_its_truth(coec: Coec, monkeypatch: py
         recording = rendered_drive(query)
         return Known(recording.name, recording.rig, recording.T_camera_lidar_start, recording.frames, recording.motions)
 
-    monkeypatch.setattr("coec.simulation.source.open_sim", known)
+    monkeypatch.setattr("coec_lab.simulation.source.open_sim", known)
     arguments = (SMALL, "--depth", "stereo", "--rotation-deg", "1", "--directions", "1", "--objective", "mi")
     found = coec("evaluate", *arguments, "--nees", "1", "--json").document["normalised"][0]
     assert found["against"] == "the simulated truth"

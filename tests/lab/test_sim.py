@@ -11,11 +11,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from cli.conftest import Coec
-from coec.adapters.files import output
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.errors import OutputError
-from coec.sources import open_source
-from coec.sources.lidars import open_lidars
+from coec.io import user_files
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.lidar_recordings import open_lidars
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -102,7 +102,7 @@ def test_a_failed_drive_of_a_rig_does_not_refuse_the_next(
     def full_disk(path: Path, data: bytes) -> Path:
         if path.name == "rear.yaml":
             raise OutputError(f"cannot write {path}: No space left on device")
-        return output.write_output(path, data)
+        return user_files.write_output(path, data)
 
     with monkeypatch.context() as patch:
         patch.setattr("coec_lab.commands.drive_bags.write_output", full_disk)

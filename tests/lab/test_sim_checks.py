@@ -10,9 +10,9 @@ import pytest
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from cli.conftest import Coec
-from coec.evaluation import check_drives, check_run
-from coec.evaluation.check_drives import CheckDrive
-from coec.schemas.checks import CheckedDrive
+from coec_lab.experiments import check_drives
+from coec_lab.experiments.check_drives import CheckDrive
+from coec_lab.experiments.simulation_schemas import CheckedDrive
 from evaluation.test_check_statistics import driven, judged
 
 
@@ -30,8 +30,8 @@ def test_a_drive_that_has_a_result_is_not_checked_again(
         ]
 
     monkeypatch.setattr(check_drives, "PLACES", {"street": "", "highway": "scene=highway"})
-    monkeypatch.setattr(check_run, "run", run)
-    monkeypatch.setattr(check_run, "commissioned", lambda _: None)
+    monkeypatch.setattr(check_drives, "run", run)
+    monkeypatch.setattr(check_drives, "commissioned", lambda _: None)
     first = coec("sim", "checks", "--output", tmp_path, "--rounds", 1, "--jobs", 1, "--hours", 0.1, "--json")
     assert (first.status, first.document["drives"], len(checked)) == (0, len(checked), len(set(checked)))
     (tmp_path / "drives" / f"{checked[0]}.json").write_text("half of a fi")
@@ -44,16 +44,16 @@ def test_a_drive_that_has_a_result_is_not_checked_again(
 def test_a_single_look_at_a_highway_is_faint(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where guard rails, markings and horizon fit nearly as well most of a degree beside."""
     monkeypatch.setitem(check_drives.RIGS, "wide", "lidar=64&camera=pinhole640x400")
-    monkeypatch.setattr(check_run, "CHECKS", 1)
-    (row,) = check_run.run([CheckDrive("wide", "highway", 700_001)], {})
+    monkeypatch.setattr(check_drives, "CHECKS", 1)
+    (row,) = check_drives.run([CheckDrive("wide", "highway", 700_001)], {})
     assert row.failure is None
-    assert row.poses[0].moved == check_run.RIGHT
+    assert row.poses[0].moved == check_drives.RIGHT
     (check,) = row.poses[0].uncommissioned
     assert (check.faint, check.causes) == (("looks",), ())  # one frame says what the other says
 
 
 def test_a_drive_that_cannot_be_drawn_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(check_drives.RIGS, "box", "camera=box")
-    (row,) = check_run.run([CheckDrive("box", "street", 1)], {})
+    (row,) = check_drives.run([CheckDrive("box", "street", 1)], {})
     assert row.failure is not None
     assert "unknown camera 'box'" in row.failure

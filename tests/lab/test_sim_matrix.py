@@ -9,10 +9,9 @@ import pytest
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from cli.conftest import Coec
-from coec.evaluation import matrix_drives, matrix_run
-from coec.evaluation.matrix_drives import MatrixDrive
-from coec.evaluation.matrix_run import Settings
-from coec.schemas.matrix import MatrixRow
+from coec_lab.experiments import matrix_drives
+from coec_lab.experiments.matrix_drives import MatrixDrive, Settings
+from coec_lab.experiments.simulation_schemas import MatrixRow
 from evaluation.test_matrix import row, solved, watch
 
 PAIR = "street_wide_64_day_*_s1"
@@ -29,7 +28,7 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         made = row(drive.name, watched=(watch("right", 0), watch("1 deg", 1, flagged=4, delay=3)))
         return made.model_copy(update={"settings": settings.fingerprint, "windows": windows})
 
-    monkeypatch.setattr(matrix_run, "run", run)
+    monkeypatch.setattr(matrix_drives, "run", run)
     return names
 
 
@@ -58,7 +57,7 @@ def test_a_drive_is_drawn_solved_and_watched(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(matrix_drives.LENSES, "tiny", "camera=pinhole240x120")
     settings = Settings((3, 6), 2, "stereo")
     drive = MatrixDrive("room-empty", "tiny", "32", "day", "none", matrix_drives.FIRST_SEED)
-    found = matrix_run.run(drive, settings)
+    found = matrix_drives.run(drive, settings)
     assert found.failure is None
     assert [len(found.windows[key]) for key in ("3", "6")] == [2, 2]
     for window in (*found.windows["3"], *found.windows["6"]):
@@ -75,7 +74,7 @@ def test_a_drive_is_drawn_solved_and_watched(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_drive_that_cannot_be_drawn_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(matrix_drives.LENSES, "box", "camera=box")
     drive = MatrixDrive("street", "box", "32", "day", "none", matrix_drives.FIRST_SEED)
-    found = matrix_run.run(drive, Settings((3,), 2, "stereo"))
+    found = matrix_drives.run(drive, Settings((3,), 2, "stereo"))
     assert found.failure is not None
     assert "unknown camera 'box'" in found.failure
     assert found.windows == {}

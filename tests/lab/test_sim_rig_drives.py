@@ -9,9 +9,9 @@ import pytest
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from cli.conftest import Coec
-from coec.evaluation import rig_drives
-from coec.evaluation.knocked_drive import FIRST_SEED, DisplacedRigDrive
-from coec.schemas.rig import RigDriveRow, RigDrivesReport
+from coec_lab.experiments import rig_drives
+from coec_lab.experiments.rig_drives import FIRST_SEED, DisplacedRigDrive
+from coec_lab.experiments.simulation_schemas import RigDriveRow, RigDrivesReport
 
 
 def test_what_was_drawn_is_kept_and_what_is_damaged_is_drawn_again(

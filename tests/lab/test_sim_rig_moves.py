@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from cli.conftest import Coec
-from coec.evaluation import rig_moves
-from coec.evaluation.rig_evidence import FOUR
-from coec.evaluation.rig_moves import RigFault
-from coec.schemas.rig import RigMovesReport
+from coec_lab.experiments import rig_moves
+from coec_lab.experiments.rig_evidence import FOUR
+from coec_lab.experiments.rig_moves import RigFault
+from coec_lab.experiments.simulation_schemas import RigMovesReport
 
 
 def test_a_knocked_camera_is_named_on_drawn_drives_and_told_in_tables(

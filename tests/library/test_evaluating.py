@@ -7,7 +7,7 @@ import pytest
 from coec.calibration_options import SolverOptions
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
-from coec.library.evaluating import MARGIN_DEG, MARGIN_M, Plan, configuration_of
+from coec_lab.experiments.evaluation_run import MARGIN_DEG, MARGIN_M, Plan, configuration_of
 
 
 def test_search_box_holds_the_starts() -> None:

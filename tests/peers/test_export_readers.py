@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from coec.adapters.exports import FORMATS
-from exported import exported_extrinsic
+from coec.io.exports.formats import FORMATS
 from peers.environments import Peer, peer
+from support.estimates import exported_extrinsic
 
 TOLERANCE = 1e-12
 

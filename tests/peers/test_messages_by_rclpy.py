@@ -13,14 +13,14 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
-from coec.adapters.mcap.windows import WindowWriter
-from coec.adapters.ros import incoming, messages, outgoing
-from coec.adapters.ros.diagnostics import DiagnosticLevel, DiagnosticStatus
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry.cameras import MODELS, build
+from coec.io.mcap.window_writer import WindowWriter
+from coec.io.ros import message_decoding, message_encoding, messages
+from coec.io.ros.message_encoding import DiagnosticLevel, DiagnosticStatus
 from peers.environments import Peer, peer
-from ros_messages import JPEG, STAMP_NS
+from support.ros import JPEG, STAMP_NS
 
 LIMITS = LimitsConfig()
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -82,14 +82,14 @@ def rig(model: str) -> Rig:
 def written() -> list[tuple[str, bytes]]:
     """One or more of each type that coec writes."""
     return [
-        *(outgoing.encode_image(CameraFrame(STAMP_NS, "camera", image)) for image in IMAGES),
-        (messages.COMPRESSED_IMAGE, outgoing.encode_depth(STAMP_NS, "camera", IMAGES[0])),
-        (messages.POINT_CLOUD, outgoing.encode_cloud(SWEEP)),
-        *(outgoing.encode_motion(motion) for motion in (MOTION, replace(MOTION, linear_mps=None))),
-        *((messages.CAMERA_INFO, outgoing.encode_camera_info(rig(model), STAMP_NS)) for model in MODELS),
-        (messages.TF, outgoing.encode_tf_static(rig("pinhole"), T_CAMERA_LIDAR, STAMP_NS)),
-        (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP_NS, STATUSES)),
-        (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP_NS, [])),
+        *(message_encoding.encode_image(CameraFrame(STAMP_NS, "camera", image)) for image in IMAGES),
+        (messages.COMPRESSED_IMAGE, message_encoding.encode_depth(STAMP_NS, "camera", IMAGES[0])),
+        (messages.POINT_CLOUD, message_encoding.encode_cloud(SWEEP)),
+        *(message_encoding.encode_motion(motion) for motion in (MOTION, replace(MOTION, linear_mps=None))),
+        *((messages.CAMERA_INFO, message_encoding.encode_camera_info(rig(model), STAMP_NS)) for model in MODELS),
+        (messages.TF, message_encoding.encode_tf_static(rig("pinhole"), T_CAMERA_LIDAR, STAMP_NS)),
+        (messages.DIAGNOSTICS, message_encoding.encode_diagnostics(STAMP_NS, STATUSES)),
+        (messages.DIAGNOSTICS, message_encoding.encode_diagnostics(STAMP_NS, [])),
     ]
 
 
@@ -128,11 +128,11 @@ def test_what_is_written_is_read_by_rclpy(rclpy: Peer, type_name: str, payload: 
 
 
 def test_values_arrive_where_a_node_looks_for_them(rclpy: Peer) -> None:
-    cloud = told_by(rclpy, messages.POINT_CLOUD, outgoing.encode_cloud(SWEEP))
+    cloud = told_by(rclpy, messages.POINT_CLOUD, message_encoding.encode_cloud(SWEEP))
     x = next(field for field in cloud["fields"] if field["name"] == "x")
     assert (x["offset"], x["datatype"], x["count"]) == (0, 7, 1)
     assert bytes(cloud["data"][:12]) == SWEEP.xyz_m[0].tobytes()
-    odometry = told_by(rclpy, messages.ODOMETRY, outgoing.encode_motion(MOTION)[1])
+    odometry = told_by(rclpy, messages.ODOMETRY, message_encoding.encode_motion(MOTION)[1])
     assert odometry["twist"]["twist"]["linear"] == {"x": 12.5, "y": -1e-9, "z": 0.0}
 
 
@@ -142,7 +142,9 @@ def test_what_rclpy_writes_coec_reads(rclpy: Peer, type_name: str, payload: byte
     theirs = bytes.fromhex(rclpy.ask(do="write", type=type_name, fields=fields_of)["cdr"])
     assert plain(STORE.deserialize_cdr(theirs, type_name)) == plain(STORE.deserialize_cdr(payload, type_name))
     if type_name in FRAMES:
-        assert plain(incoming.decode(type_name, theirs, LIMITS)) == plain(incoming.decode(type_name, payload, LIMITS))
+        assert plain(message_decoding.decode(type_name, theirs, LIMITS)) == plain(
+            message_decoding.decode(type_name, payload, LIMITS)
+        )
 
 
 @pytest.mark.parametrize("type_name", sorted({value for value in vars(messages).values() if "/msg/" in str(value)}))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import zenoh
 
-from coec.adapters.ros import messages
+from coec.io.ros import messages
 from e2e.processes import routing
 from peers.nodes import Inbox, Topic, node, relay
-from ros_messages import compressed_image, twist
+from support.ros import compressed_image, twist
 
 IMAGE, SPEED = "/front/image/compressed", "/speed"
 WITHIN_S = 60.0

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from coec.adapters.ros import messages
-from coec.adapters.ros.topics import FrameTopics, PairTopics
-from coec.adapters.zenoh.player import Frame, stream_of
 from coec.calibration.types import EgoMotion
 from coec.geometry import se3
-from coec.schemas.ros_names import TF_STATIC
+from coec.io.ros import messages
+from coec.io.ros.topics import FrameTopics, PairTopics
+from coec.io.zenoh.player import Frame, stream_of
+from coec.schemas.keys import TF_STATIC
 from e2e.drives import SECONDS, STEP_S, STEPPED, Drive, rendered
 from e2e.processes import Router, Service, portions, service
 from peers.environments import peer

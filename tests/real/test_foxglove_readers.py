@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.mcap.windows import read_window
-from fleet_windows import recorded_windows
+from coec.io.mcap.window_reader import read_window
+from support.fleet import recorded_windows
 
 pytestmark = pytest.mark.slow
 

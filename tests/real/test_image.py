@@ -20,10 +20,10 @@ import pytest
 from ruamel.yaml import YAML
 
 from coec.cli.check_config import template
-from coec.exit_codes import ExitCode
+from coec.errors import ExitCode
 from conftest import REPOSITORY
 from deploy.written import DEPLOY, compose, stages
-from fakes import wait_until
+from support.fake_worker import wait_until
 
 pytestmark = pytest.mark.slow
 

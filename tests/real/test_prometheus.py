@@ -19,8 +19,8 @@ from ruamel.yaml import YAML
 from coec.cli.check_config import template
 from conftest import REPOSITORY
 from e2e.processes import COMMAND, PATIENCE_S, environment
-from fakes import wait_until
-from ports import free_port
+from support.fake_worker import wait_until
+from support.router import free_port
 
 pytestmark = pytest.mark.slow
 

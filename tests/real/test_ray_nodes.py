@@ -14,8 +14,7 @@ import duckdb
 import psutil
 import pytest
 
-from fleet_windows import recorded_windows
-from ray_cluster import RAY_MISSING, RayNodes, batch_command, two_nodes
+from support.fleet import RAY_MISSING, RayNodes, batch_command, recorded_windows, two_nodes
 
 pytestmark = pytest.mark.slow
 

@@ -16,14 +16,14 @@ from typing import Any
 
 import pytest
 
-import rmw_zenoh_defaults
-from coec.adapters.zenoh.player import Frame
 from coec.config import load_config
+from coec.io.zenoh.player import Frame
 from e2e.drives import Drive, rendered, without_depth
 from e2e.processes import COMMAND, PATIENCE_S, Service, environment, free_endpoint
 from e2e.ros_vehicle import CAMERA, EGO, INFO, POINTS, TF, camera_info, message_of
 from e2e.test_awaited_pair import said
-from fakes import wait_until
+from support import ros as rmw_zenoh_defaults
+from support.fake_worker import wait_until
 
 pytestmark = pytest.mark.slow
 

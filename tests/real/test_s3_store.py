@@ -20,8 +20,7 @@ import duckdb
 import psutil
 import pytest
 
-from fleet_windows import recorded_windows
-from ray_cluster import STORE_CREDENTIALS, batch_command, two_nodes
+from support.fleet import STORE_CREDENTIALS, batch_command, recorded_windows, two_nodes
 
 pytestmark = pytest.mark.slow
 

@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from certificates import make_authority
 from coec.cli.check_config import template
 from conftest import REPOSITORY
 from deploy.written import DEPLOY, unit
+from support.router import make_authority
 
 pytestmark = pytest.mark.slow
 

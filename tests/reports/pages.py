@@ -11,9 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from baselines import a_baseline
-from coec.adapters.files.conversions import result_of
-from coec.calibration.commissioning.equation_2 import PaperLimits
+from coec.calibration.baseline import PaperLimits
 from coec.calibration.figures import FIGURES
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.sensor_faults import LENS_DIRTY
@@ -28,36 +26,18 @@ from coec.calibration.types import (
     Reason,
     Window,
 )
-from coec.evaluation import paper_published
-from coec.evaluation.paper import MOVES_DEG, FailureFigures
-from coec.evaluation.profiles import Scan, Views
-from coec.evaluation.starts import sphere_directions
-from coec.evaluation.statistics import HIT_RAD, SolveOutcome, Trial
-from coec.reports import evaluation_charts, evaluation_page, fleet_page, incident_page, paper_charts
+from coec.io.serialise import result_of
+from coec.reports import fleet_page, incident_page
 from coec.reports.baseline_page import baselines_page
-from coec.reports.bullseye import bullseye
-from coec.reports.calibration_page import calibration_page
-from coec.reports.check_page import check_page, detection_page
+from coec.reports.calibration import calibration_page
+from coec.reports.diagnosis import check_page, detection_page
 from coec.reports.incident_page import FetchedIncident
 from coec.reports.page import Compare, Page, Pictures
 from coec.reports.page_parts import file_picture
-from coec.reports.paper_page import Plots, paper_page
 from coec.reports.pictures import slid_pictures
 from coec.reports.provenance import Provenance
-from coec.schemas.evaluation import (
-    ComparisonReport,
-    DetectionReport,
-    DetectionRow,
-    EvaluationReport,
-    FramesPoint,
-    HalvesReport,
-    NormalisedErrorsReport,
-    Spread,
-    StepRow,
-    VerdictCounts,
-)
+from coec.schemas.documents import Absent, FetchedWindow
 from coec.schemas.fleet import DayOfPair, FalseAlarms, FigureOfFleet, FleetReport, PairOfFleet
-from coec.schemas.incident import Absent, FetchedWindow
 from coec.schemas.replies import (
     CalibrationReport,
     CalibrationResult,
@@ -72,7 +52,25 @@ from coec_lab.demo import rig as rig_of_demo
 from coec_lab.demo import rig_drive
 from coec_lab.demo.pair_client import Moment, outcome_of
 from coec_lab.demo.pair_report import demo_page
-from estimates import ESTIMATE_RIG, estimate
+from coec_lab.experiments import evaluation_charts, evaluation_page, paper_figures
+from coec_lab.experiments.evaluation_charts import bullseye
+from coec_lab.experiments.evaluation_schema import (
+    ComparisonReport,
+    DetectionReport,
+    DetectionRow,
+    EvaluationReport,
+    FramesPoint,
+    HalvesReport,
+    NormalisedErrorsReport,
+    Spread,
+    StepRow,
+    VerdictCounts,
+)
+from coec_lab.experiments.objective_scans import Scan, Views
+from coec_lab.experiments.paper_figures import MOVES_DEG, FailureFigures, Plots, paper_page
+from coec_lab.experiments.solve_experiments import sphere_directions
+from coec_lab.experiments.solve_statistics import HIT_RAD, SolveOutcome, Trial
+from support.estimates import ESTIMATE_RIG, a_baseline, estimate
 
 EVIL = "<script>alert(1)</script>'\"><img src=http://evil/x onerror=alert(2)>"
 MADE = Provenance("coec calibrate window.mcap --output out", 1_760_000_000 * 10**9, {"coec": "0.1.0"}, "Linux x86_64")
@@ -233,16 +231,16 @@ def paper(folder: Path) -> Page:
             "moves": [{"moved_deg": moved, "checks": 100, "flagged": moved / 3} for moved in (0.0, 1.0, 3.0)]
         },
         "bullseye": {"start_deg": 25.0, **figures},
-        "drive": [{"start_deg": radius, **figures} for radius in paper_published.ERRORS_DEG],
+        "drive": [{"start_deg": radius, **figures} for radius in paper_figures.ERRORS_DEG],
         "run_times": [{"frames": frames, "mi_ms": 1.23, "solve_ms": 200.0} for frames in (5, 8)],
     }
     del folder
     rng = np.random.default_rng(4)
     figures_at = [FailureFigures(moved, *rng.normal(5.0 - moved, 1.0, 3)) for moved in MOVES_DEG for _ in range(20)]
     plots = Plots(
-        paper_charts.failure_figures(figures_at, PaperLimits(3.0, 4.0, 5.0)),
+        evaluation_charts.failure_figures(figures_at, PaperLimits(3.0, 4.0, 5.0)),
         ENDS,
-        paper_charts.drive({"from 5°": [(float(second), outcome) for second, outcome in enumerate(OUTCOMES)]}),
+        evaluation_charts.drive({"from 5°": [(float(second), outcome) for second, outcome in enumerate(OUTCOMES)]}),
     )
     return paper_page(document, plots, MADE)
 

@@ -7,8 +7,8 @@ from math import inf
 import pytest
 
 from coec.config import MonitorConfig
-from coec.evaluation.alarms import AlarmExperiments, Creep, Delay, FalseAlarmCount, FromStart
-from coec.reports import alarm_reports
+from coec_lab.experiments import alarm_statistics
+from coec_lab.experiments.alarm_statistics import AlarmExperiments, Creep, Delay, FalseAlarmCount, FromStart
 
 ALARMS = AlarmExperiments(
     MonitorConfig(),
@@ -20,18 +20,18 @@ ALARMS = AlarmExperiments(
 
 
 def test_what_was_not_noticed_in_time_has_no_figure() -> None:
-    report = alarm_reports.document_of(ALARMS)
+    report = alarm_statistics.document_of(ALARMS)
     assert report.delays[0].confirmed_s.median is None
     assert (report.delays[1].confirmed_s.median, report.delays[1].confirmed_s.p95) == (15.0, 20.0)
     assert (report.creep_confirmed_h.median, report.creep_confirmed_h.max) == (4.0, None)
 
 
 def test_the_curve_is_drawn() -> None:
-    assert alarm_reports.delay_curve(alarm_reports.document_of(ALARMS)).startswith(b"\x89PNG")
+    assert alarm_statistics.delay_curve(alarm_statistics.document_of(ALARMS)).startswith(b"\x89PNG")
 
 
 def test_the_tables_say_what_is_stated_and_what_was(capsys: pytest.CaptureFixture[str]) -> None:
-    alarm_reports.show(alarm_reports.document_of(ALARMS))
+    alarm_statistics.show(alarm_statistics.document_of(ALARMS))
     told = capsys.readouterr().out
     assert "10 h" in told
     assert "75 %" in told

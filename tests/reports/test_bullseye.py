@@ -7,10 +7,10 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.evaluation.starts import sphere_directions
-from coec.evaluation.statistics import SolveOutcome, Trial
-from coec.reports.bullseye import bullseye, end_places, rim_of, start_places
 from coec.reports.page import Page, Section, render
+from coec_lab.experiments.evaluation_charts import bullseye, end_places, rim_of, start_places
+from coec_lab.experiments.solve_experiments import sphere_directions
+from coec_lab.experiments.solve_statistics import SolveOutcome, Trial
 
 
 def outcome(pitch_deg: float, yaw_deg: float, *, accepted: bool) -> SolveOutcome:

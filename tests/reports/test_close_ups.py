@@ -8,13 +8,13 @@ from math import radians
 import numpy as np
 import pytest
 
-import posts
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.config import LimitsConfig
-from coec.evaluation.places import difference_regions, shift_px
 from coec.geometry import se3
+from coec.io.images import GreyImages
 from coec.reports.close_ups import COLOURS, Caption, close_ups, sentences
+from coec.reports.difference_regions import difference_regions, shift_px
+from support import scenes
 
 TURN = np.array([0.0, radians(0.5), 0.0, 0.0, 0.0, 0.0])
 SIGMA = np.array([radians(0.02), radians(0.03), radians(0.04), np.nan, np.nan, np.nan])
@@ -33,7 +33,7 @@ def _share_of(picture: np.ndarray, colour: str) -> float:
 
 
 def test_the_words_tell_time_difference_spread_and_network() -> None:
-    window = posts.post_window((-8.0, 8.0))
+    window = scenes.post_window((-8.0, 8.0))
     truth = window.T_camera_lidar_start
     moved = se3.perturb(truth, TURN)
     lines = _said(window, moved, truth, Caption("start", "accepted", SIGMA, "tiny.onnx"))
@@ -43,20 +43,20 @@ def test_the_words_tell_time_difference_spread_and_network() -> None:
 
 
 def test_a_stamp_that_is_no_date_is_told_in_seconds() -> None:
-    window = posts.post_window((0.0,), stamp_ns=20_000_000_000)
+    window = scenes.post_window((0.0,), stamp_ns=20_000_000_000)
     truth = window.T_camera_lidar_start
     assert _said(window, se3.perturb(truth, TURN), truth, Caption())[0].startswith("front, 20.000 s:")
 
 
 def test_equal_extrinsics_are_said_to_be_equal() -> None:
-    window = posts.post_window((0.0,))
+    window = scenes.post_window((0.0,))
     truth = window.T_camera_lidar_start
     assert "no difference between before and after" in _said(window, truth, truth, Caption())[0]
     assert close_ups(window, truth, truth).shape[2] == 3
 
 
 def test_a_cloud_without_points_is_a_picture_with_words() -> None:
-    window = posts.post_window((0.0,))
+    window = scenes.post_window((0.0,))
     (pair,) = window.pairs
     empty = LidarFrame(pair.lidar.stamp_ns, "lidar", np.zeros((0, 3), np.float32))
     window = replace(window, pairs=(replace(pair, lidar=empty),))
@@ -69,9 +69,9 @@ def test_a_cloud_without_points_is_a_picture_with_words() -> None:
     assert all(_share_of(picture, colour) == 0.0 for colour in COLOURS)
 
 
-@pytest.mark.parametrize("model", posts.POST_LENSES)
+@pytest.mark.parametrize("model", scenes.POST_LENSES)
 def test_outlines_are_found_through_every_camera(model: str) -> None:
-    window = posts.post_window((-14.0, 10.0), posts.POST_LENSES[model])
+    window = scenes.post_window((-14.0, 10.0), scenes.POST_LENSES[model])
     truth = window.T_camera_lidar_start
     before, after = _said(window, se3.perturb(truth, TURN), truth, Caption())[-1].split("shown: ")[1].split(", ")
     before_sigma, after_sigma = (float(said.split()[1].replace("−", "-")) for said in (before, after))
@@ -80,7 +80,7 @@ def test_outlines_are_found_through_every_camera(model: str) -> None:
 
 @pytest.mark.parametrize("model", ["pinhole", "double_sphere"])
 def test_each_extrinsic_is_drawn_in_its_colour_on_its_side(model: str) -> None:
-    window = posts.post_window((-14.0, 10.0), posts.POST_LENSES[model])
+    window = scenes.post_window((-14.0, 10.0), scenes.POST_LENSES[model])
     truth = window.T_camera_lidar_start
     picture = close_ups(window, se3.perturb(truth, TURN), truth)
     assert picture.dtype == np.uint8

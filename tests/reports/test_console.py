@@ -15,7 +15,7 @@ import coec
 from coec.reports import console
 from coec.reports.progress import Bars, PlainColumn
 from coec.schemas.replies import MetricReply
-from hostile import HOSTILE, obeyed_characters
+from support.strategies import HOSTILE, obeyed_characters
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from coec.evaluation.profiles import Scan, Views
-from coec.evaluation.statistics import FrameCountStatistics, SliceStatistics, SpreadStatistics
-from coec.reports import curves
+from coec_lab.experiments import plots
+from coec_lab.experiments.objective_scans import Scan, Views
+from coec_lab.experiments.solve_statistics import FrameCountStatistics, SliceStatistics, SpreadStatistics
 
 FLAT = SpreadStatistics(0.01, 0.02, 0.03)
 EXACT = SpreadStatistics(0.0, 0.0, 0.0)
@@ -28,28 +28,28 @@ def _views(axes: int) -> Views:
 
 
 def test_landscape_has_a_second_pair_of_rows_for_translations() -> None:
-    turned = curves.landscape(dict.fromkeys(("fused", "mi", "edges"), _views(3)), "title")
-    moved = curves.landscape(dict.fromkeys(("fused", "mi", "edges"), _views(6)), "title")
+    turned = plots.landscape(dict.fromkeys(("fused", "mi", "edges"), _views(3)), "title")
+    moved = plots.landscape(dict.fromkeys(("fused", "mi", "edges"), _views(6)), "title")
     assert _size(moved)[1] > 1.8 * _size(turned)[1]
 
 
 def test_flat_landscape() -> None:
     flat = tuple(Scan(axis, np.linspace(-1.0, 1.0, 5), np.zeros(5)) for axis in range(3))
-    _size(curves.landscape({"mi": Views(flat, flat)}, "title"))
+    _size(plots.landscape({"mi": Views(flat, flat)}, "title"))
 
 
 @pytest.mark.parametrize("with_translation", [False, True])
 @pytest.mark.parametrize("errors", [FLAT, EXACT])
 def test_error_against_frames(with_translation: bool, errors: SpreadStatistics) -> None:
     points = [FrameCountStatistics(frames, 5, 0.8, errors, errors, np.nan) for frames in (1, 2, 5)]
-    _size(curves.error_against_frames(points, with_translation, "title"))
+    _size(plots.error_against_frames(points, with_translation, "title"))
 
 
 def test_error_against_one_number_of_frames() -> None:
-    _size(curves.error_against_frames([FrameCountStatistics(1, 1, 1.0, FLAT, FLAT, 0.01)], False, "title"))
+    _size(plots.error_against_frames([FrameCountStatistics(1, 1, 1.0, FLAT, FLAT, 0.01)], False, "title"))
 
 
 @pytest.mark.parametrize("with_translation", [False, True])
 def test_error_against_slice(with_translation: bool) -> None:
     points = [SliceStatistics(length, 5, 2.0, 20, 0.8, FLAT, FLAT, 0.02) for length in (7.5, 15.0, 120.0)]
-    _size(curves.error_against_slice(points, with_translation, "title"))
+    _size(plots.error_against_slice(points, with_translation, "title"))

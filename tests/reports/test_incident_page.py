@@ -13,9 +13,8 @@ import pytest
 from coec.cli.fetch import chain_holds
 from coec.reports.incident_page import FetchedIncident, page, sentences
 from coec.reports.page import render
-from coec.runtime.decisions.chain import GENESIS
-from coec.schemas.base import to_json
-from coec.schemas.incident import Absent, FetchedWindow
+from coec.schemas.documents import Absent, FetchedWindow
+from coec.schemas.message import to_json
 from coec.schemas.replies import (
     ChainedEntry,
     EvidenceEvent,
@@ -28,9 +27,10 @@ from coec.schemas.replies import (
     StatusReply,
     Transform,
 )
-from hostile import HOSTILE, hostile_message, obeyed_characters
+from coec.service.records.history import GENESIS
 from reports.pages import EVIL, MADE, png
 from reports.test_page import Read
+from support.strategies import HOSTILE, hostile_message, obeyed_characters
 
 S = 1_000_000_000
 IDENTITY = Transform(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coec.reports.instants import day, instant, second
+from coec.reports.formatting import day, instant, second
 
 
 @pytest.mark.parametrize(

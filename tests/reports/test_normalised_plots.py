@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from coec.evaluation.normalised_errors import Claims, gathered, normalise
-from coec.reports.normalised_plots import normalised
+from coec_lab.experiments.plots import normalised
+from coec_lab.experiments.solve_statistics import Claims, gathered, normalise
 from reports.test_plots import _size
 
 ERRORS = np.random.default_rng(1).normal(size=(40, 6))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.adapters.images.range_colours import WHOLE_SCALE, RangeScale
 from coec.geometry.cameras import build
+from coec.io.images import WHOLE_SCALE, RangeScale
 from coec.reports.overlay import LINE_SHARE, render_points, titled
 
 WIDTH, HEIGHT = 960, 540

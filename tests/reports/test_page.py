@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 
 from coec.calibration.figures import FIGURES
 from coec.errors import DecodeError
-from coec.reports import fleet_page
-from coec.reports.page import Chart, Ground, Mark, Page, Section, Series, Text, charts, render, ticks
-from coec.reports.page.embedding import embedded
-from coec.reports.page.words import NONE, number, percent, significant
+from coec.reports import charts, fleet_page
+from coec.reports.charts import Chart, Ground, Mark, Series
+from coec.reports.formatting import NONE, number, percent, significant
+from coec.reports.page import Page, Section, Text, embedded, render
 from coec.reports.page_parts import CAPTIONS, figures_block
 from coec.schemas.fleet import DayOfPair, FleetReport, PairOfFleet
 from coec.schemas.replies import MetricReply
@@ -107,16 +107,16 @@ def test_what_is_no_picture_is_refused() -> None:
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(3, 10))
 def test_ticks_are_round_within_and_not_too_many(low: float, length: float, most: int) -> None:
     high = low + length
-    found = ticks.linear_ticks(low, high, most)
+    found = charts.linear_ticks(low, high, most)
     assert 1 <= len(found) <= most
     assert all(low - 1e-6 * length <= tick <= high + 1e-6 * length for tick in found)
     assert found == sorted(set(found))
 
 
 def test_logarithmic_ticks_are_of_one_two_three_and_five() -> None:
-    assert ticks.logarithmic_ticks(0.02, 20.0) == pytest.approx([0.1, 1.0, 10.0])
-    assert ticks.logarithmic_ticks(0.04, 1.0) == pytest.approx([0.1, 0.3, 1.0])
-    assert ticks.logarithmic_ticks(0.3, 0.9) == pytest.approx([0.5])
+    assert charts.logarithmic_ticks(0.02, 20.0) == pytest.approx([0.1, 1.0, 10.0])
+    assert charts.logarithmic_ticks(0.04, 1.0) == pytest.approx([0.1, 0.3, 1.0])
+    assert charts.logarithmic_ticks(0.3, 0.9) == pytest.approx([0.5])
 
 
 @pytest.mark.parametrize("log", [False, True])

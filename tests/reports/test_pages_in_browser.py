@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, sync_playwright
 from playwright.sync_api import Page as Tab
 
 from coec.cli.main import main
-from coec.reports import page as pages_room
+from coec.reports import page
 from reports import pages
 
 PHONE_PX = 360
@@ -82,7 +82,7 @@ def opened(browser: Browser, path: Path, **context: Any) -> tuple[Tab, list[str]
 
 @pytest.mark.parametrize("kind", sorted(set(pages.KINDS) - ALIKE))
 def test_a_page_fits_every_screen_and_loads_nothing(browser: Browser, tmp_path: Path, kind: str) -> None:
-    path = pages_room.write(tmp_path / "report.html", pages.KINDS[kind](tmp_path))
+    path = page.write(tmp_path / "report.html", pages.KINDS[kind](tmp_path))
     assert path.stat().st_size <= MOST_BYTES
     tab, wrong = opened(browser, path)
     for width in WIDTHS_PX:
@@ -107,7 +107,7 @@ def test_a_page_fits_every_screen_and_loads_nothing(browser: Browser, tmp_path: 
 
 
 def test_buttons_copy_every_digit(browser: Browser, tmp_path: Path) -> None:
-    path = pages_room.write(tmp_path / "report.html", pages.calibration(tmp_path))
+    path = page.write(tmp_path / "report.html", pages.calibration(tmp_path))
     tab, wrong = opened(browser, path, permissions=["clipboard-read", "clipboard-write"])
     exact = pages.calibration_report().camera_from_lidar
     buttons = tab.locator("button[data-copy]")
@@ -127,7 +127,7 @@ def test_buttons_copy_every_digit(browser: Browser, tmp_path: Path) -> None:
 @pytest.mark.parametrize("refuses", [False, True])
 def test_buttons_work_without_permission(browser: Browser, tmp_path: Path, refuses: bool) -> None:
     """By the older way, which asks for none; where that is refused, too, the text is left to be taken."""
-    path = pages_room.write(tmp_path / "report.html", pages.calibration(tmp_path))
+    path = page.write(tmp_path / "report.html", pages.calibration(tmp_path))
     tab, wrong = opened(browser, path)
     tab.evaluate(
         """refuses => {
@@ -154,7 +154,7 @@ def test_buttons_work_without_permission(browser: Browser, tmp_path: Path, refus
 
 
 def test_the_slider_moves_between_both_pictures_by_the_keyboard(browser: Browser, tmp_path: Path) -> None:
-    path = pages_room.write(tmp_path / "report.html", pages.calibration(tmp_path))
+    path = page.write(tmp_path / "report.html", pages.calibration(tmp_path))
     tab, _ = opened(browser, path)
     cut = "getComputedStyle(document.querySelector('.compare .after img')).clipPath"
     slider = tab.locator(".compare input[type=range]")
@@ -174,7 +174,7 @@ def test_the_slider_moves_between_both_pictures_by_the_keyboard(browser: Browser
 
 
 def test_a_page_is_dark_where_that_is_asked_for(browser: Browser, tmp_path: Path) -> None:
-    path = pages_room.write(tmp_path / "report.html", pages.calibration(tmp_path))
+    path = page.write(tmp_path / "report.html", pages.calibration(tmp_path))
     light_of = "getComputedStyle(document.body).{}.match(/\\d+/g).slice(0, 3).reduce((a, b) => a + Number(b), 0) / 765"
     tab, _ = opened(browser, path)
     for scheme in ("light", "dark"):
@@ -186,7 +186,7 @@ def test_a_page_is_dark_where_that_is_asked_for(browser: Browser, tmp_path: Path
 
 
 def test_a_page_says_everything_without_a_script(browser: Browser, tmp_path: Path) -> None:
-    path = pages_room.write(tmp_path / "report.html", pages.calibration(tmp_path))
+    path = page.write(tmp_path / "report.html", pages.calibration(tmp_path))
     tab, wrong = opened(browser, path, java_script_enabled=False)
     boxes = [tab.locator(f".compare .{side} img").bounding_box() for side in ("before", "after")]
     assert boxes[0] != boxes[1]
@@ -197,7 +197,7 @@ def test_a_page_says_everything_without_a_script(browser: Browser, tmp_path: Pat
 
 
 def test_the_keyboard_comes_to_the_content_at_once(browser: Browser, tmp_path: Path) -> None:
-    path = pages_room.write(tmp_path / "report.html", pages.calibration(tmp_path))
+    path = page.write(tmp_path / "report.html", pages.calibration(tmp_path))
     tab, _ = opened(browser, path)
     tab.keyboard.press("Tab")
     assert tab.evaluate("document.activeElement.textContent") == "To the content"

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-import posts
 from coec.geometry import se3
 from coec.reports.close_ups import Caption
 from coec.reports.page import Compare, Pictures, Text
 from coec.reports.pictures import Comparison, write_comparison
+from support import scenes
 
-WINDOW = posts.post_window((-8.0, 8.0))
+WINDOW = scenes.post_window((-8.0, 8.0))
 WINDOW = replace(WINDOW, pairs=WINDOW.pairs * 4)
 
 

@@ -7,9 +7,9 @@ from math import radians
 import cv2
 import numpy as np
 
-from coec.evaluation.starts import sphere_directions
-from coec.evaluation.statistics import SolveOutcome, Trial
-from coec.reports import plots
+from coec_lab.experiments import plots
+from coec_lab.experiments.solve_experiments import sphere_directions
+from coec_lab.experiments.solve_statistics import SolveOutcome, Trial
 
 
 def _outcome(angle_deg: float, accepted: bool) -> SolveOutcome:

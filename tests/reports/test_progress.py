@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from coec.geometry import compile_news
+from coec.geometry import compilation_events
 from coec.reports.progress import COMPILING, COMPILING_S, LINE_S, Bars
 
 
@@ -76,17 +76,17 @@ def test_a_download_says_how_much_is_there(clock: Clock, said: list[str]) -> Non
 
 def test_a_compiler_at_work_is_said_once_and_then_now_and_then(bars: Bars, clock: Clock, said: list[str]) -> None:
     with bars:
-        compile_news.notify("first")
+        compilation_events.notify("first")
         assert not said
         clock.now_s += COMPILING_S
-        compile_news.notify("second")
-        compile_news.notify("second")
+        compilation_events.notify("second")
+        compilation_events.notify("second")
         assert said == [f"coec: {COMPILING}: 2 so far"]
         clock.now_s += LINE_S
-        compile_news.notify("third")
+        compilation_events.notify("third")
         assert said[1:] == [f"coec: {COMPILING}: 3 so far"]
     clock.now_s += LINE_S
-    compile_news.notify("fourth")
+    compilation_events.notify("fourth")
     assert len(said) == 2, "who has ended hears no more"
 
 
@@ -98,7 +98,7 @@ def test_kernels_from_the_cache_are_no_news() -> None:
 
     heard: list[str] = []
     kernel: Any = njit(twice)
-    with compile_news.listening(heard.append):
+    with compilation_events.listening(heard.append):
         assert kernel(2.0) == 4.0
         assert any("twice" in name for name in heard)
         heard.clear()

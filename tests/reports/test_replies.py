@@ -6,8 +6,8 @@ from typing import Literal
 
 import pytest
 
-from coec.reports import console, replies, service_status
-from coec.schemas.base import to_json
+from coec.reports import console, replies
+from coec.schemas.message import to_json
 from coec.schemas.replies import (
     BudgetShare,
     BudgetStatus,
@@ -19,8 +19,8 @@ from coec.schemas.replies import (
     StreamStatus,
 )
 from coec.schemas.rig_state import RigReply
-from rig_replies import joint_reply, moved_lidar_reply, reply_before_checks
 from runtime.api.test_metrics import a_busy_status
+from support.messages import joint_reply, moved_lidar_reply, reply_before_checks
 
 
 @pytest.mark.parametrize(
@@ -34,9 +34,9 @@ def test_a_configuration_that_is_not_in_force_is_said(
     capsys: pytest.CaptureFixture[str], told: dict[str, object], line: str
 ) -> None:
     configuration = ConfigurationStatus.model_validate({"read_ns": 1, **told})
-    service_status.status(to_json(a_busy_status()))
+    replies.status(to_json(a_busy_status()))
     assert line not in capsys.readouterr().out
-    service_status.status(to_json(a_busy_status().model_copy(update={"configuration": configuration})))
+    replies.status(to_json(a_busy_status().model_copy(update={"configuration": configuration})))
     assert line in capsys.readouterr().out
 
 
@@ -85,12 +85,12 @@ def test_a_budget_that_does_not_suffice_is_said(capsys: pytest.CaptureFixture[st
     budget = BudgetStatus(
         cores=0.5, spent=0.5, wanted=0.8, stretched_by=1.6, in_store_s=0.0, spent_s={}, pairs={"front": share}
     )
-    service_status.status(to_json(a_busy_status().model_copy(update={"budget": budget})))
+    replies.status(to_json(a_busy_status().model_copy(update={"budget": budget})))
     said = " ".join(capsys.readouterr().out.split())
     assert "budget 0.5 of a core; 0.50 spent, 0.80 wanted" in said
     assert "1.6 times as far apart as configured; waiting: front" in said
     enough = budget.model_copy(update={"wanted": 0.3, "stretched_by": 1.0})
-    service_status.status(to_json(a_busy_status().model_copy(update={"budget": enough})))
+    replies.status(to_json(a_busy_status().model_copy(update={"budget": enough})))
     assert "suffice" not in capsys.readouterr().out
 
 
@@ -110,7 +110,7 @@ def test_the_status_of_many_pairs_is_told_once(capsys: pytest.CaptureFixture[str
     shares = {pair.name: share.model_copy(update={"suspected": pair.name == "c3-l0"}) for pair in pairs}
     budget = BudgetStatus(cores=0.5, spent=0.5, wanted=0.8, stretched_by=1.6, in_store_s=0.0, spent_s={}, pairs=shares)
     status = a_busy_status().model_copy(update={"pairs": pairs, "budget": budget})
-    service_status.status(to_json(status))
+    replies.status(to_json(status))
     said = capsys.readouterr().out
     lines = [" ".join(line.split()) for line in said.splitlines()]
     assert "lost, camera: 1 overrun in c3-l0, c3-l1, c3-l2" in lines

@@ -8,19 +8,18 @@ from math import radians
 import numpy as np
 import pytest
 
-import posts
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig
-from coec.evaluation.local_shifts import local_shifts
 from coec.geometry import se3
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
+from coec.io.images import GreyImages
 from coec.reports import lens_residual as lens
-from coec.reports.residual_map import residual_map, sentences
+from coec.reports.residual_map import local_shifts, residual_map, sentences
+from support import scenes
 
 
 def test_the_words_tell_what_all_parts_have_in_common() -> None:
-    window = posts.post_window(tuple(np.arange(-36.0, 37.0, 4.0).tolist()))
+    window = scenes.post_window(tuple(np.arange(-36.0, 37.0, 4.0).tolist()))
     window = replace(window, pairs=window.pairs * 4)
     moved = se3.perturb(window.T_camera_lidar_start, np.array([0, radians(0.5), 0, 0, 0, 0]))
     shifts = local_shifts(window, GreyImages(LimitsConfig()), moved, compensated=True)
@@ -34,7 +33,7 @@ def test_the_words_tell_what_all_parts_have_in_common() -> None:
 
 
 def test_a_picture_without_a_range_edge_says_that_nothing_is_told() -> None:
-    window = posts.post_window((0.0,))
+    window = scenes.post_window((0.0,))
     (pair,) = window.pairs
     empty = LidarFrame(0, "lidar", np.zeros((0, 3), np.float32))
     window = replace(window, pairs=(replace(pair, lidar=empty),))
@@ -46,9 +45,9 @@ def test_a_picture_without_a_range_edge_says_that_nothing_is_told() -> None:
 
 
 def test_an_exact_fit_leaves_nothing_and_another_what_the_fit_says() -> None:
-    exact = posts.POST_LENSES["double_sphere"]
+    exact = scenes.POST_LENSES["double_sphere"]
     assert "0 px" in lens.sentences(exact, exact, np.zeros(4))[0]
-    fisheye = posts.POST_LENSES["kannala_brandt"]
+    fisheye = scenes.POST_LENSES["kannala_brandt"]
     fit = fit_double_sphere(fisheye)
     cells = (np.arange(64) + 0.5) / 64  # as the fit compares them
     u, v = np.meshgrid(640 * cells - 0.5, 360 * cells - 0.5)
@@ -64,7 +63,7 @@ def test_an_exact_fit_leaves_nothing_and_another_what_the_fit_says() -> None:
 
 
 def test_where_one_has_no_pixel_nothing_is_told() -> None:
-    wide, narrow = posts.POST_LENSES["double_sphere"], posts.POST_LENSES["mei"]
+    wide, narrow = scenes.POST_LENSES["double_sphere"], scenes.POST_LENSES["mei"]
     corner = np.array([[-5000.0, -5000.0], [320.0, 180.0]])
     apart = lens.residuals_px(narrow, wide, corner)
     assert np.isnan(apart[0]).all()

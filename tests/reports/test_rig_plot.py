@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.reports.rig_plot import PlottedEdge, PlottedSensor, label_of, rig_from_above
+from coec_lab.demo.demo_plots import PlottedEdge, PlottedSensor, label_of, rig_from_above
 
 
 def placed(x_m: float, y_m: float) -> NDArray[np.float64]:

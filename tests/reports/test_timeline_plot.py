@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from coec.reports.timeline_plot import timeline
+from coec_lab.demo.demo_plots import timeline
 
 SERIES = [(0.0, 0.0, "unknown"), (10.0, 0.05, "healthy"), (20.0, 3.0, "miscalibrated"), (30.0, 0.05, "healthy")]
 

@@ -6,8 +6,7 @@ import threading
 
 import pytest
 
-from coec.runtime.decisions.mailbox import COMMANDS_WAITING, TaskQueue
-from coec.runtime.handover import BusyError, DeferredCall
+from coec.service.task_queue import COMMANDS_WAITING, BusyError, DeferredCall, TaskQueue
 
 
 def test_what_nobody_waits_for_any_more_is_not_done() -> None:

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.frames.incoming import Refusal
-from coec.adapters.system.logs import LOST, LossCounter, loss_text
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Reason
-from coec.runtime.ingest import chooser
-from coec.runtime.ingest.decoder import EXPLAINED
-from coec.runtime.ingest.stream_log import QUIET_S, RATE_FRAMES, SILENT_S, StreamLog
-from coec.runtime.worker.compilation import Compiling
-from pair_bench import BEGIN_S, DRIVE_END_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
+from coec.io.frame_validation import Refusal
+from coec.io.logs import LOST, LossCounter, loss_text
+from coec.service.ingest import frame_selector
+from coec.service.ingest.decoder import EXPLAINED
+from coec.service.ingest.intake import QUIET_S, RATE_FRAMES, SILENT_S, StreamLog
+from coec.service.worker.compilation import Compiling
+from support.vehicles import BEGIN_S, DRIVE_END_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
 
 
 @dataclass
@@ -42,7 +42,7 @@ def camera(stamp_ns: int) -> CameraFrame:
 def test_a_drive_in_which_the_mount_moves_is_a_story_of_a_few_lines(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chooser, "PROGRESS_S", 0.0)
+    monkeypatch.setattr(frame_selector, "PROGRESS_S", 0.0)
     caplog.set_level(logging.INFO)
     PairBench(tmp_path / "state").drive(BEGIN_S, DRIVE_END_S)
     told = lines(caplog)

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from calibration.test_lifecycle import HEALTHY, RULES, check
-from coec.calibration import lifecycle
-from coec.calibration.lifecycle import HealthState
+from coec.calibration import state as lifecycle
 from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Matrix4, Reason
 from coec.geometry import se3
-from pair_bench import BEFORE, BEGIN_S, NS_PER_S, STEP_S, PairBench
+from support.vehicles import BEFORE, BEGIN_S, NS_PER_S, STEP_S, PairBench
 
 WRONG_DEG, WRONG_M = 1.0, 0.1
 PERIOD_S = 5

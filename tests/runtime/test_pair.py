@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from baselines import a_baseline
-from coec.adapters.files.baseline_file import save_baseline
-from coec.adapters.files.conversions import matrix_of
-from coec.adapters.files.state_file import StateFile
-from coec.calibration.commissioning.baseline import learned_hash
+from coec.calibration.baseline import learned_hash
 from coec.calibration.monitor.change_detector import alarm_levels
 from coec.calibration.types import (
     Reason,
 )
-from coec.runtime.ingest.pair_stream import PairStream
-from coec.runtime.recording.window_store import start_ns_of
-from pair_bench import (
+from coec.io.baseline_file import save_baseline
+from coec.io.serialise import matrix_of
+from coec.io.storage import StateFile
+from coec.service.ingest.pair_stream import PairStream
+from coec.service.recording.window_store import start_ns_of
+from support.estimates import a_baseline
+from support.vehicles import (
     AFTER,
     BEFORE,
     BEGIN_S,

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from coec.calibration.types import Reason
-from coec.runtime.worker.jobs import Kind
-from pair_bench import BEGIN_S, DRIVE_END_S, STEP_S, PairBench
+from coec.service.worker.worker_jobs import Kind
+from support.vehicles import BEGIN_S, DRIVE_END_S, STEP_S, PairBench
 
 
 def driven(folder: Path, cores: float, cost_s: dict[Kind, float], end_s: int = STEP_S) -> PairBench:

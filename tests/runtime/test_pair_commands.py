@@ -13,23 +13,21 @@ from unittest.mock import create_autospec
 import numpy as np
 import pytest
 
-from baselines import a_baseline
-from coec.adapters.files.baseline_file import save_baseline
-from coec.adapters.zenoh.bus import Bus, Request, Route
-from coec.calibration.commissioning.baseline import learned_hash
+from coec.calibration.baseline import learned_hash
 from coec.config import AuthorityConfig, UplinkConfig
 from coec.geometry import se3
-from coec.runtime.api import commands, rate_limit
-from coec.runtime.api.authority import Authority
-from coec.runtime.api.last_words import Heartbeats
-from coec.runtime.api.reception import CommandHandler, CommandRules
-from coec.runtime.api.rig import RigAnswers
-from coec.runtime.api.routes import VehicleRoutes
-from coec.runtime.api.snapshots import SerializedReply
-from coec.runtime.api.uplink import Uplink
-from coec.runtime.worker.jobs import Commissioned, Fate, JobOutcome, Kind, WorkerJob
+from coec.io.baseline_file import save_baseline
+from coec.io.zenoh.bus import Bus, Request, Route
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
-from pair_bench import BEGIN_S, DRIVE_END_S, STEP_S, OracleWorker, PairBench
+from coec.service.api import command_execution
+from coec.service.api.authorization import Authority, CommandHandler, CommandRules
+from coec.service.api.reply_builders import SerializedReply
+from coec.service.api.rig_answers import RigAnswers
+from coec.service.api.routes import VehicleRoutes
+from coec.service.api.uplink import Heartbeats, Uplink
+from coec.service.worker.worker_jobs import Commissioned, Fate, JobOutcome, Kind, WorkerJob
+from support.estimates import a_baseline
+from support.vehicles import BEGIN_S, DRIVE_END_S, STEP_S, OracleWorker, PairBench
 
 
 def test_a_roll_back_on_a_commissioned_rig_serves_what_was_served_to_the_byte(tmp_path: Path) -> None:
@@ -141,7 +139,7 @@ def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, mon
     bench.drive(BEGIN_S, BEGIN_S + 30)
     selected = bench.pair.stream.report.selection.selected
     assert selected >= 5
-    monkeypatch.setattr(commands, "TIMEOUT_S", 0.0)
+    monkeypatch.setattr(command_execution, "TIMEOUT_S", 0.0)
     told = bench.pair.commands.carry_out("calibrate", {}, "the test")
     assert (told.accepted, told.code) == (False, "busy")
     bench.settle()
@@ -151,7 +149,7 @@ def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, mon
 
 @pytest.mark.fault("more commands than a book of the history holds", "`rollback` and `commission` find what they need")
 def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rate_limit, "BURST", 10_000)
+    monkeypatch.setattr(command_execution, "BURST", 10_000)
     bench = PairBench(tmp_path / "state")
     bench.config = bench.config.model_copy(update={"state": bench.config.state.model_copy(update={"history": 12})})
     bench.restart()
@@ -252,16 +250,16 @@ def test_commands_that_come_too_fast_are_answered_and_do_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # However long they take here, they come at once.
-    monkeypatch.setattr(commands, "RateLimit", partial(rate_limit.RateLimit, clock=lambda: 0.0))
+    monkeypatch.setattr(command_execution, "RateLimit", partial(command_execution.RateLimit, clock=lambda: 0.0))
     bench = PairBench(tmp_path / "state")
-    codes = [bench.do("hold") for _ in range(rate_limit.BURST)]
+    codes = [bench.do("hold") for _ in range(command_execution.BURST)]
     assert set(codes) == {"held"}
     before = bench.store.history.entries()
     told = [bench.pair.commands.carry_out("hold", {"release": True}, "the test") for _ in range(5)]
     assert {(one.accepted, one.code) for one in told} == {(False, "too_many")}
     assert bench.store.state.hold is not None
     assert bench.store.history.entries() == before
-    assert bench.answers.status().commands == {"hold_accepted": rate_limit.BURST, "hold_refused": 5}
+    assert bench.answers.status().commands == {"hold_accepted": command_execution.BURST, "hold_refused": 5}
 
 
 def route_of(bench: PairBench, command: str) -> Route:

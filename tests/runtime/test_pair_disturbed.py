@@ -21,9 +21,8 @@ from coec.calibration.frames.pairing import MOTION_LATE_NS
 from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4
 from coec.config import LimitsConfig
-from coec.runtime.worker.jobs import Kind, WorkerJob
-from coec.runtime.worker.messages import unpack_pairs
-from pair_bench import BEGIN_S, DRIVE_END_S, NS_PER_S, OracleWorker, PairBench, SlowWorker, frame_pair_at
+from coec.service.worker.worker_jobs import Kind, WorkerJob, unpack_pairs
+from support.vehicles import BEGIN_S, DRIVE_END_S, NS_PER_S, OracleWorker, PairBench, SlowWorker, frame_pair_at
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 

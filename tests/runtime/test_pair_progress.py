@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from coec.calibration.types import Reason
-from pair_bench import BEGIN_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
+from support.vehicles import BEGIN_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
 
 
 @pytest.fixture

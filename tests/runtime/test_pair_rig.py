@@ -12,29 +12,28 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from coec.adapters.files.scribe import DiskWriter
-from coec.adapters.zenoh.ros_topics import RosTopicList
-from coec.calibration.lifecycle import HealthState
+from coec.calibration.state_machine import HealthState
 from coec.config import Config
 from coec.errors import NotFoundError
-from coec.runtime import pair as runtime_pair
-from coec.runtime.api.rig import RigAnswers
-from coec.runtime.api.rig_commands import RigCommands
-from coec.runtime.budget.budget import Budget
-from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.ingest.inbox import Call
-from coec.runtime.ingest.intake import Intake
-from coec.runtime.outside import VehicleContext
-from coec.runtime.pair import Pair
-from coec.runtime.recording.window_store import WindowStore
-from coec.runtime.rig.keeper import RigEstimatorThread
-from coec.runtime.worker.jobs import Checked, WorkerJob
-from coec.runtime.worker.supervisor import Worker
-from coec.schemas.base import to_json
+from coec.io.disk_writer import DiskWriter
+from coec.io.zenoh.ros_node import RosTopicList
 from coec.schemas.keys import Keys
+from coec.schemas.message import to_json
 from coec.schemas.replies import Acknowledgement, HistoryEntry
 from coec.schemas.rig_state import RigReply
-from pair_bench import (
+from coec.service import camera_lidar_pair as runtime_pair
+from coec.service.api.command_execution import RigCommands
+from coec.service.api.rig_answers import RigAnswers
+from coec.service.camera_lidar_pair import Pair
+from coec.service.cpu_budget import Budget
+from coec.service.engine.rig_estimator_thread import RigEstimatorThread
+from coec.service.ingest.intake import Call, Intake
+from coec.service.recording.window_store import WindowStore
+from coec.service.records.state_store import StateStore
+from coec.service.vehicle_context import VehicleContext
+from coec.service.worker.supervisor import Worker
+from coec.service.worker.worker_jobs import Checked, WorkerJob
+from support.vehicles import (
     AFTER,
     NS_PER_S,
     STEP_S,

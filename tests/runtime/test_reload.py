@@ -12,10 +12,10 @@ import pytest
 
 from coec.config import IDENTITY, Config, PairConfig, WindowConfig
 from coec.errors import ConfigError
-from coec.runtime.nominal.kept import completed
-from coec.runtime.reload import RELOADED, Reload, reload_of, settings_hash
-from coec.runtime.worker.jobs import Kind, WorkerJob
-from pair_bench import BEGIN_S, OracleWorker, PairBench, pair_configuration
+from coec.service.configuration import RELOADED, Reload, reload_of, settings_hash
+from coec.service.discovery import completed
+from coec.service.worker.worker_jobs import Kind, WorkerJob
+from support.vehicles import BEGIN_S, OracleWorker, PairBench, pair_configuration
 
 INTRINSICS = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0}
 

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from baselines import a_baseline
-from coec.adapters.files.baseline_file import BASELINES, load_baseline, save_baseline
-from coec.adapters.files.scribe import DiskWriter
-from coec.daemon.state_folder import locked
 from coec.errors import ConfigError, UnavailableError
-from coec.runtime.decisions.rig_baseline import RigBaseline
-from coec.runtime.rig.rig_file import RIG_FILE as RIG_FILE
-from fakes import wait_until
-from pair_bench import BEGIN_S, DRIVE_END_S, PAIR_RIG, STEP_S, PairBench, pair_configuration
+from coec.io.baseline_file import BASELINES, load_baseline, save_baseline
+from coec.io.disk_writer import DiskWriter
+from coec.service.process_lifetime import locked
+from coec.service.records.rig_baseline import RigBaseline
+from coec.service.records.rig_store import RIG_FILE
+from support.estimates import a_baseline
+from support.fake_worker import wait_until
+from support.vehicles import BEGIN_S, DRIVE_END_S, PAIR_RIG, STEP_S, PairBench, pair_configuration
 
 
 def books(folder: Path) -> dict[str, int]:
@@ -139,7 +139,7 @@ def test_what_is_written_while_the_folder_is_replaced_is_written_again(tmp_path:
 
 
 def test_a_thread_writes_them_again_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.adapters.files.scribe.RETRY_S", 0.01)
+    monkeypatch.setattr("coec.io.disk_writer.RETRY_S", 0.01)
     folder, written = tmp_path / "state", threading.Event()
     folder.mkdir()
 

@@ -11,18 +11,17 @@ from typing import cast
 import numpy as np
 import pytest
 
-from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import InputSample, StreamInput
-from coec.adapters.zenoh.ros_side import RosSide
 from coec.calibration.types import Reason
 from coec.config import AnyStreamConfig, Config, PairConfig, config_of
 from coec.errors import ConfigError
-from coec.runtime.nominal.findings import DiscoveredPair
-from coec.runtime.nominal.watch import DiscoveryListener
-from coec.runtime.waiting_room import PendingPairs
-from fakes import wait_until
-from pair_bench import PairBench
+from coec.io.zenoh.bus import Bus, InputSample, StreamInput
+from coec.io.zenoh.ros_node import RosSide
+from coec.service.discovery import DiscoveredPair
+from coec.service.discovery_listener import DiscoveryListener
+from coec.service.pending_pairs import PendingPairs
 from runtime.waiting import CAMERA, INFO, POINTS, SAMPLES, T_CAMERA_LIDAR, TF_STATIC, World, configured
+from support.fake_worker import wait_until
+from support.vehicles import PairBench
 
 
 class Line:

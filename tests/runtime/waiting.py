@@ -9,18 +9,17 @@ from typing import Any, cast
 import numpy as np
 from rosbags.typesys.stores import ros2_humble as ros
 
-from bags import STORE, camera_info_message, transform_message
-from coec.adapters.ros import messages
-from coec.adapters.zenoh.bus import Answer
-from coec.adapters.zenoh.inputs import CDR, InputSample
-from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.calibration.types import Reason
 from coec.config import Config
-from coec.runtime.nominal.watch import NominalStatus
-from coec.runtime.outside import VehicleContext
+from coec.io.ros import messages
+from coec.io.zenoh.bus import CDR, Answer, InputSample
+from coec.io.zenoh.ros_node import RosTopicList
 from coec.schemas.keys import Keys
-from pair_bench import InstantDiskWriter
-from ros_messages import compressed_image, packed_cloud
+from coec.service.discovery_listener import NominalStatus
+from coec.service.vehicle_context import VehicleContext
+from support.recordings import STORE, camera_info_message, transform_message
+from support.ros import compressed_image, packed_cloud
+from support.vehicles import InstantDiskWriter
 
 CAMERA, POINTS, INFO, TF_STATIC = "/front/image/compressed", "/top/points", "/front/camera_info", "/tf_static"
 

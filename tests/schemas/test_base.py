@@ -13,10 +13,10 @@ from pydantic import BaseModel
 
 from coec import schemas
 from coec.errors import DecodeError
-from coec.schemas.base import from_json, from_msgpack, json_value, to_json, to_msgpack
+from coec.schemas.message import from_json, from_msgpack, json_value, to_json, to_msgpack
 from coec.schemas.replies import Acknowledgement, HealthReply, MetricReply, StreamStatus, Transform
 from coec.untrusted import Untrusted
-from hostile import HOSTILE, hostile_message, message_texts, obeyed_characters
+from support.strategies import HOSTILE, hostile_message, message_texts, obeyed_characters
 
 ACKNOWLEDGEMENT = Acknowledgement(
     vehicle="v", pair="front", command="calibrate", accepted=False, code="too_few_pairs", text="4 more pairs — wait"

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from coec.schemas.export import main, schemas, text
+from coec_lab.experiments.schema_export import main, schemas, text
 
 EGO_REQUIRED = ("stamp_ns", "frame_id", "linear_mps", "angular_radps")
 COMMITTED = Path(__file__).resolve().parents[2] / "schemas" / "v1"
@@ -12,7 +12,7 @@ def test_the_committed_schemas_equal_the_models() -> None:
     committed = {path.name: path.read_text(encoding="utf-8") for path in COMMITTED.glob("*.json")}
 
     assert committed == {name: text(schema) for name, schema in schemas().items()}, (
-        "run: PYTHONPATH=service python -m coec.schemas.export schemas/v1"
+        "run: PYTHONPATH=service python -m coec_lab.experiments.schema_export schemas/v1"
     )
 
 

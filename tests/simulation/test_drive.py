@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.adapters.images.codec import decode_depth
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
 from coec.config import LimitsConfig
@@ -21,13 +20,14 @@ from coec.geometry import cameras
 from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
 from coec.geometry.se3 import difference, exp
-from coec.simulation import parallel
-from coec.simulation.aboard import NEAREST_M
-from coec.simulation.drive import DriveConfig, SimulatedDrive
-from coec.simulation.faults import parse_fault
-from coec.simulation.journey import START_NS
-from coec.simulation.parallel import messages_by
-from coec.sources.recording import SensorMessage
+from coec.io.images import decode_depth
+from coec.io.recordings.recording_source import SensorMessage
+from coec_lab.simulation import parallel
+from coec_lab.simulation.drive import DriveConfig, SimulatedDrive
+from coec_lab.simulation.faults import parse_fault
+from coec_lab.simulation.journey import START_NS
+from coec_lab.simulation.parallel import messages_by
+from coec_lab.simulation.simulated_sensors import NEAREST_M
 
 
 def small(*faults: str, seconds: float = 1.0, depth: bool = False, **more: object) -> SimulatedDrive:

@@ -7,8 +7,8 @@ import pytest
 
 from coec.errors import UsageError
 from coec.geometry.se3 import difference
-from coec.simulation import faults
-from coec.simulation.faults import parse_fault, shifted
+from coec_lab.simulation import faults
+from coec_lab.simulation.faults import parse_fault, shifted
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.simulation.lidar import LIDARS, LidarModel, sweep
-from coec.simulation.mesh import Material, Mesh, join, quads
-from coec.simulation.road import build_road
-from coec.simulation.scan import Raster, Rosette, Turn, even_deg
-from coec.simulation.scene import Scene
-from coec.simulation.sky import sample_sky
-from coec.simulation.weather import Air, rainy_air
+from coec_lab.simulation.lidar_model import LIDARS, LidarModel, Raster, Rosette, Turn, even_deg, sweep
+from coec_lab.simulation.mesh import Material, Mesh, join, quads
+from coec_lab.simulation.road import build_road
+from coec_lab.simulation.scene import Scene
+from coec_lab.simulation.weather import Air, rainy_air, sample_sky
 
 TURN = Turn(even_deg(-15.0, 15.0, 16), columns=720)
 EXACT = LidarModel(TURN, reach_m=100.0, noise_m=1e-9, dropout=0.0)

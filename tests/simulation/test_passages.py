@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from coec.calibration.types import EgoMotion, FramePair, LidarFrame
-from coec.simulation.drive import SimulatedDrive
-from coec.simulation.faults import parse_fault
-from coec.simulation.parallel import messages_by
-from coec.simulation.passages import CLEAR_M, Passages, RoadSpan, passages
-from coec.simulation.scene import Town
-from coec.simulation.street import sample_style
-from coec.simulation.tunnel import HIGH_M, VERGE_M
-from coec.simulation.vehicle import P_EGO_LIDAR_M, Pace
+from coec_lab.simulation.drive import SimulatedDrive
+from coec_lab.simulation.faults import parse_fault
+from coec_lab.simulation.parallel import messages_by
+from coec_lab.simulation.passages import CLEAR_M, HIGH_M, VERGE_M, Passages, RoadSpan, passages
+from coec_lab.simulation.scene import Town
+from coec_lab.simulation.street import sample_style
+from coec_lab.simulation.vehicle_motion import P_EGO_LIDAR_M, Pace
 from simulation.test_drive import fingerprint, pictures, pixels, share_consistent, small, sweeps
 
 

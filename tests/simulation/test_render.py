@@ -10,12 +10,12 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from coec.geometry import cameras
 from coec.geometry.projection import unproject
-from coec.simulation.drive import fisheye
-from coec.simulation.mesh import Material, Mesh, box, join, quads
-from coec.simulation.render import render_view
-from coec.simulation.road import build_road
-from coec.simulation.scene import Scene, Town
-from coec.simulation.sky import sample_sky
+from coec_lab.simulation.drive import fisheye
+from coec_lab.simulation.mesh import Material, Mesh, box, join, quads
+from coec_lab.simulation.render import render_view
+from coec_lab.simulation.road import build_road
+from coec_lab.simulation.scene import Scene, Town
+from coec_lab.simulation.weather import sample_sky
 
 PINHOLE = cameras.build("pinhole", width=61, height=41, fx=40.0, fy=40.0, cx=30.0, cy=20.0)
 FISHEYE = fisheye(96, 92.5)

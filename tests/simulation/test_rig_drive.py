@@ -10,7 +10,6 @@ import pytest
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.adapters.images.codec import decode_depth
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
 from coec.config import LimitsConfig
@@ -18,14 +17,15 @@ from coec.errors import UsageError
 from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
 from coec.geometry.se3 import difference, inverse
-from coec.simulation.aboard import NEAREST_M
-from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigDrive, SimulatedRigPair
-from coec.simulation.scene import Solid
-from coec.simulation.source import open_rig
-from coec.simulation.vehicle import whole_body
-from coec.sources import open_source
-from coec.sources.recording import HasGroundTruth, SensorMessage
+from coec.io.images import decode_depth
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import HasGroundTruth, SensorMessage
+from coec_lab.simulation.journey import START_NS
+from coec_lab.simulation.rig_drive import RigDrive, SimulatedRigPair
+from coec_lab.simulation.scene import Solid
+from coec_lab.simulation.simulated_sensors import NEAREST_M
+from coec_lab.simulation.source import open_rig
+from coec_lab.simulation.vehicle_motion import whole_body
 
 WORDS = "rig=four-fisheyes&seed=4&seconds=0.5&camera=fisheye128&camera_hz=2&lidar_hz=2&ego_hz=20"
 

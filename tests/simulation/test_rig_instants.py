@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from coec.calibration.types import CameraFrame, LidarFrame
-from coec.simulation.rig_drive import RigDrive, RigDriveConfig
-from coec.simulation.rig_instants import instants, pair_of
+from coec_lab.simulation.rig_drive import RigDrive, RigDriveConfig, instants, pair_of
 
 SMALL = RigDriveConfig(seed=4, seconds=3.0, camera="fisheye64", ego_hz=20.0)
 
@@ -52,8 +51,8 @@ def test_the_frames_of_an_instant_are_the_pair_that_the_service_makes_of_them() 
 
 
 def test_rows_without_a_picture_are_black_and_masked_and_the_others_are_drawn() -> None:
-    from coec.adapters.images.codec import GreyImages
     from coec.config import LimitsConfig
+    from coec.io.images import GreyImages
 
     drive = RigDrive(replace(SMALL, rows=(0.25, 0.5)))
     frame = drive.message(instants(drive, "roof", 1.0)[0].pictures["front"])

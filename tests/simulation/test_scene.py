@@ -5,9 +5,9 @@ import pytest
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.simulation.road import build_road
-from coec.simulation.scene import AHEAD, BEHIND, MISSED, Town
-from coec.simulation.street import GROUND_HALF_M, STRETCH_M
+from coec_lab.simulation.road import build_road
+from coec_lab.simulation.scene import AHEAD, BEHIND, MISSED, Town
+from coec_lab.simulation.street import GROUND_HALF_M, STRETCH_M
 
 
 def test_a_place_does_not_depend_on_the_way_there() -> None:

@@ -5,8 +5,8 @@ import sys
 import pytest
 
 from coec.errors import SourceError, UsageError
-from coec.simulation import source
-from coec.sources import open_source
+from coec.io.recordings.layouts import open_source
+from coec_lab.simulation import source
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from coec.calibration.types import EgoMotion, FramePair
-from coec.simulation.drive import SimulatedDrive
-from coec.simulation.faults import OffsetDrift, late_s
-from coec.simulation.vehicle import P_EGO_LIDAR_M
+from coec_lab.simulation.drive import SimulatedDrive
+from coec_lab.simulation.faults import OffsetDrift, late_s
+from coec_lab.simulation.vehicle_motion import P_EGO_LIDAR_M
 from simulation.test_drive import pictures, pixels, share_consistent, small, sweeps
 
 

@@ -19,8 +19,8 @@ import zenoh
 
 from broken_disk import FULL, READ_ONLY, SLOW, WELL, BrokenDisk
 from campaign import stepping_clock
-from coec.adapters.zenoh.settings import settings_of
 from coec.config import LimitsConfig, ZenohConfig
+from coec.io.zenoh.session import settings_of
 from coec.schemas.keys import Keys
 from e2e.processes import environment
 from soak.vehicle import CAMERA, LIDAR, Vehicle

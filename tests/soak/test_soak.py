@@ -21,13 +21,13 @@ import pytest
 
 from broken_disk import BrokenDisk
 from campaign import stepping_clock
-from coec.adapters.zenoh.client import connected
+from coec.io.zenoh.query_client import connected
 from e2e.processes import Router as ForClients
 from e2e.processes import Service, free_endpoint, service
-from fakes import wait_until
 from soak import faults
 from soak.faults import Bench, Router
 from soak.vehicle import CAMERA, EGO, LIDAR, Vehicle, configured
+from support.fake_worker import wait_until
 
 MIB = 2**20
 MEMORY_MIB = 30.0

@@ -12,13 +12,13 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
-from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.matching import has_subscribers
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import Config
+from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.io.zenoh.bus import MSGPACK
+from coec.io.zenoh.ros_node import has_subscribers
 from coec.reports.commented_yaml import commented_yaml
-from fakes import wait_until
+from support.fake_worker import wait_until
 
 NS_PER_S = 1_000_000_000
 TICK_HZ = 20

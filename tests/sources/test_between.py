@@ -2,9 +2,8 @@
 
 from coec.calibration.types import Window
 from coec.config import WindowConfig
-from coec.sources.between import with_thinned_pairs
-from coec.sources.windows import window_of_recording
-from drives import rendered_source
+from coec.io.recordings.window_cutting import window_of_recording, with_thinned_pairs
+from support.simulated_drives import rendered_source
 
 STREET = "sim:seed=1&seconds=40&camera_hz=0.2&lidar_hz=0.2&camera=fisheye320&lidar=32&depth=yes"
 """Eight pairs, five seconds apart."""

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coec.errors import SourceError
-from coec.sources import reading
-from coec.sources.clouds import load_cloud
-from coec.sources.pcd import PcdError, parse_pcd
+from coec.io import user_files
+from coec.io.recordings.cloud_files import PcdError, load_cloud, parse_pcd
 
 NAN = float("nan")
 POINTS = [(1.5, -2.0, 3.25, 10.0, 3), (NAN, 0.0, 0.0, 20.0, 4), (4.0, 5.0, -6.0, 30.5, 5)]
@@ -208,7 +207,7 @@ def test_numpy_files_that_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(SourceError, match="is not an"):
         load_cloud(0, "lidar", packed)
     np.savez_compressed(packed, xyz=np.zeros((6_000, 3)))
-    monkeypatch.setattr(reading, "MAX_FILE_BYTES", 100_000)
+    monkeypatch.setattr(user_files, "MAX_FILE_BYTES", 100_000)
     with pytest.raises(SourceError, match="would unpack"):
         load_cloud(0, "lidar", packed)
 

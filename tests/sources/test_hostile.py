@@ -15,13 +15,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ruamel.yaml.scanner import Scanner
 
-from cloud_files import npy, npy_with_header, npz, pcd
 from coec.config import MAX_YAML_BYTES, load_config, load_yaml, parse_yaml
 from coec.errors import CoecError, ConfigError, SourceError
-from coec.sources import open_source, reading
-from coec.sources.clouds import load_cloud
-from coec.sources.kitti_files import read_numbers, read_stamps
-from coec.sources.pcd import MAX_TABLE_BYTES, MAX_UNPACKED_BYTES, PcdError, parse_pcd
+from coec.io import user_files
+from coec.io.recordings.cloud_files import MAX_TABLE_BYTES, MAX_UNPACKED_BYTES, PcdError, load_cloud, parse_pcd
+from coec.io.recordings.kitti import read_numbers, read_stamps
+from coec.io.recordings.layouts import open_source
+from support.recordings import npy, npy_with_header, npz, pcd
 
 DEEP = 100_000
 DIGITS = "9" * 5000
@@ -66,7 +66,7 @@ def test_an_archive_that_promises_more_than_it_holds_is_refused_before_it_is_unp
     path.write_bytes(npz(xyz=npy_with_header(HEADERS["immense"].replace("9" + 18 * "0", "20000000"), bytes(96))))
     with pytest.raises(SourceError, match="promises more"):
         load_cloud(0, "lidar", path)
-    monkeypatch.setattr(reading, "MAX_FILE_BYTES", MB)
+    monkeypatch.setattr(user_files, "MAX_FILE_BYTES", MB)
     bomb = npz(xyz=npy_with_header("{'descr': '<f8', 'fortran_order': False, 'shape': (4, 3), }", bytes(2 * MB)))
     path.write_bytes(bomb)
     with pytest.raises(SourceError, match="would unpack"):
@@ -146,7 +146,7 @@ def test_much_of_a_small_compressed_file_stays_within_its_bound() -> None:
 
 
 def test_text_rows_are_read_in_blocks_with_the_right_place_of_a_complaint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.sources.pcd.ASCII_BLOCK_BYTES", 20)
+    monkeypatch.setattr("coec.io.recordings.cloud_files.ASCII_BLOCK_BYTES", 20)
     rows = [f"{i} {i} {i}" for i in range(50)]
     head = pcd(*XYZ, 50, "ascii")
     assert parse_pcd(head + "\n".join(rows).encode())["xyz"].tolist() == [[i] * 3 for i in range(50)]
@@ -161,10 +161,10 @@ def test_text_rows_are_read_in_blocks_with_the_right_place_of_a_complaint(monkey
 @pytest.mark.parametrize("suffix", ["bin", "pcd", "npy"])
 def test_files_larger_than_a_file_may_be_are_not_read(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"cloud.{suffix}"
-    rows = reading.MAX_FILE_BYTES // 24 + 1
+    rows = user_files.MAX_FILE_BYTES // 24 + 1
     with path.open("wb") as stream:
         stream.write(npy_with_header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({rows}, 3), }}"))
-        stream.truncate(reading.MAX_FILE_BYTES + 1024)
+        stream.truncate(user_files.MAX_FILE_BYTES + 1024)
     tracemalloc.start()
     try:
         with pytest.raises(SourceError, match="too large"):
@@ -216,7 +216,7 @@ def test_yaml_is_given_up_before_all_of_its_values_are_read(value: str, monkeypa
         one_more(scanner)
 
     monkeypatch.setattr(Scanner, "fetch_flow_entry", counted)
-    monkeypatch.setattr("coec.config.yaml_text.MAX_YAML_VALUES", 1000)
+    monkeypatch.setattr("coec.config.loading.MAX_YAML_VALUES", 1000)
     with pytest.raises(ConfigError, match="more than 1000 values"):
         parse_yaml("[" + f"{value}," * 10_000 + "]")
     assert 900 < len(read) < 1100

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from coec.adapters.images.codec import decode_bgr, decode_depth
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, SweepTiming
 from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import cameras, se3
 from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
-from coec.sources import open_source
+from coec.io.images import decode_bgr, decode_depth
+from coec.io.recordings.layouts import open_source
 
 DRIVE = "2013_05_28_drive_0000_sync"
 LIMITS = LimitsConfig()

@@ -10,7 +10,7 @@ import pytest
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.errors import SourceError
 from coec.geometry import cameras
-from coec.sources import open_source
+from coec.io.recordings.layouts import open_source
 
 DATE, DRIVE = "2011_09_26", "2011_09_26_drive_0005_sync"
 

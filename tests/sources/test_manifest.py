@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from coec.adapters.images.codec import decode_bgr, decode_depth
 from coec.calibration.types import CameraFrame, EgoMotion, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import cameras
-from coec.sources import open_source
-from sweeps import ROOF_POSE, sweep_in_frame, turning_sweep
+from coec.io.images import decode_bgr, decode_depth
+from coec.io.recordings.layouts import open_source
+from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
 
 LIMITS = LimitsConfig()
 

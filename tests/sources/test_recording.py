@@ -15,9 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.errors import SourceError, UsageError
 from coec.geometry import cameras
-from coec.sources import open_source
-from coec.sources.recording import FramewiseRecording, RecordedFrame
-from coec.sources.spec import parse_spec
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, parse_spec
 
 T = TypeVar("T")
 IMAGE = EncodedImage(ImageFormat.MONO8, 1, 1, b"\0")

@@ -13,13 +13,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.adapters.files.baseline_file import BASELINES, load_baseline
-from coec.adapters.files.rig import rig_from_json
-from coec.calibration import lifecycle
-from coec.calibration.lifecycle import PairState
-from coec.runtime.decisions.history import PairHistory
-from coec.runtime.decisions.incidents import Incidents
-from coec.runtime.decisions.state_store import StateStore
+from coec.calibration import state as lifecycle
+from coec.calibration.state import PairState
+from coec.io.baseline_file import BASELINES, load_baseline
+from coec.io.rig_files import rig_from_json
+from coec.service.records.history import PairHistory
+from coec.service.records.incidents import Incidents
+from coec.service.records.state_store import StateStore
 
 
 def state_of(remembered: Any) -> PairState:

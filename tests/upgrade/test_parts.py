@@ -15,27 +15,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coec.adapters.files.rig import identity_sha256, rig_identity
-from coec.adapters.files.state_file import StateFile
-from coec.calibration.lifecycle import (
-    ExtrinsicHold,
-    HealthState,
-    PairState,
-    Provenance,
-    after_estimate,
-    initial_state,
-    restored,
-)
 from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState
+from coec.calibration.state import ExtrinsicHold, PairState, Provenance, after_estimate, initial_state, restored
+from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import StateError
-from coec.runtime.decisions.pair_reader import pair_from_json
-from coec.runtime.decisions.state_store import STATE_FILE, StateStore, read_pairs
-from coec.runtime.decisions.stored_pair import PARTS, Clocks, RestoredPair, StoredPair, pair_to_json
-from coec.schemas.base import from_json, to_json
+from coec.io.rig_files import identity_sha256, rig_identity
+from coec.io.storage import StateFile
+from coec.schemas.message import from_json, to_json
 from coec.schemas.replies import CalibrationResult
-from estimates import ESTIMATE_RIG, estimate
+from coec.service.records.state_store import STATE_FILE, StateStore, read_pairs
+from coec.service.records.stored_pair import PARTS, Clocks, RestoredPair, StoredPair, pair_from_json, pair_to_json
+from support.estimates import ESTIMATE_RIG, estimate
 from upgrade.write_state import FRONT, REAR, front_state, rear_state, rules
 
 CLOCKS = Clocks(6, 8, 4)

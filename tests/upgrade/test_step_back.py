@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from coec.adapters.files.state_file import StateFile
+from coec.io.storage import StateFile
 from conftest import REPOSITORY
 from upgrade.write_state import write
 

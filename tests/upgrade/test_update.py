@@ -12,23 +12,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coec.adapters.files.baseline_file import BASELINES, baseline_hash, load_baseline
-from coec.adapters.files.rig import rig_from_json
-from coec.adapters.system.logs import LossCounter
-from coec.calibration.commissioning.baseline import learned_hash
-from coec.calibration.lifecycle import ExtrinsicHold, HealthState, PairState, after_observation, restored
+from coec.calibration.baseline import learned_hash
 from coec.calibration.monitor.change_detector import MonitorOutcome
+from coec.calibration.state import ExtrinsicHold, PairState, after_observation, restored
+from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Rig
 from coec.config import CalibrationConfig, Config, StateConfig
-from coec.runtime.decisions.history import PairHistory
-from coec.runtime.decisions.incidents import Incidents
-from coec.runtime.decisions.pair_store import PairStore
-from coec.runtime.decisions.state_store import StateStore, read_pairs
-from coec.runtime.decisions.stored_pair import RestoredPair
-from coec.runtime.nominal.kept import DiscoveryStore
-from coec.runtime.recording.window_store import WindowStore
-from coec.runtime.rig.rig_file import RigStore
-from pair_bench import InstantDiskWriter
+from coec.io.baseline_file import BASELINES, baseline_hash, load_baseline
+from coec.io.logs import LossCounter
+from coec.io.rig_files import rig_from_json
+from coec.service.discovery import DiscoveryStore
+from coec.service.recording.window_store import WindowStore
+from coec.service.records.history import PairHistory
+from coec.service.records.incidents import Incidents
+from coec.service.records.pair_store import PairStore
+from coec.service.records.rig_store import RigStore
+from coec.service.records.state_store import StateStore, read_pairs
+from coec.service.records.stored_pair import RestoredPair
+from support.vehicles import InstantDiskWriter
 from upgrade.write_state import VEHICLE, checked, rules
 
 FIXTURES = Path(__file__).with_name("fixtures")

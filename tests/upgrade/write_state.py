@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from baselines import a_baseline
+from estimates import RIG, estimate
+
 from coec.adapters.files.baseline_file import BASELINES, baseline_hash, save_baseline
 from coec.adapters.files.conversions import check_of, result_of, transform_of
 from coec.adapters.files.rig import rig_to_json
@@ -36,7 +37,6 @@ from coec.runtime.decisions.history import History
 from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.state_store import StateStore
 from coec.schemas.replies import EvidenceEvent, HistoryEntry, Reason
-from estimates import RIG, estimate
 
 S = 1_000_000_000
 VEHICLE = "shuttle-7"

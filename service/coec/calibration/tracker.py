@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from coec.calibration.types import Estimate, Matrix4, Uncertainty
 from coec.config import TrackerConfig
 from coec.geometry import se3
-from coec.geometry.linear import congruent, solved
+from coec.geometry.linalg import congruent, solved
 
 Matrix6 = NDArray[np.float64]
 

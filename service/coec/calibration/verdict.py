@@ -17,14 +17,14 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.looks import IndependentSamples
-from coec.calibration.confidence.loosened import LENS_FREE, RelaxedAssumption
 from coec.calibration.figures import FIGURES
-from coec.calibration.frames.sampling import drives
-from coec.calibration.objective.curvature import Curvature
+from coec.calibration.frames.window import drives
+from coec.calibration.objective.derivatives import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
 from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, FramePair, Metric, Reason, StopReason, Verdict
+from coec.calibration.uncertainty.nuisance_parameters import LENS_FREE, RelaxedAssumption
+from coec.calibration.uncertainty.scatter import IndependentSamples
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)

@@ -16,7 +16,7 @@ from coec.cli.options import Json
 from coec.errors import UsageError
 
 if TYPE_CHECKING:
-    from coec.fleet.engines.engine import Engine, WorkerLimits
+    from coec.fleet.worker_pool import Engine, WorkerLimits
     from coec.schemas.fleet import BatchReport, WindowRow
 
 MIB = 2**20
@@ -88,9 +88,9 @@ def batch(
 ) -> int:
     """Evaluate many windows again: exit 0 if every one has a result, 1 if not."""
     from coec.fleet import batch as fleet_batch
-    from coec.fleet.engines.engine import WorkerLimits
-    from coec.fleet.places import jobs_of
-    from coec.fleet.terms import load_settings
+    from coec.fleet.jobs import jobs_of
+    from coec.fleet.replay_settings import load_settings
+    from coec.fleet.worker_pool import WorkerLimits
     from coec.reports import console
 
     terms = load_settings(with_config, rig, depth)
@@ -117,12 +117,12 @@ def _engine(
     name: str, jobs: int | None, bounds: WorkerLimits, ray_address: str | None, *, send_credentials: bool
 ) -> Engine:
     if name == "ray":
-        from coec.fleet.engines.ray import RayEngine
+        from coec.fleet.ray_engine import RayEngine
 
         return RayEngine(jobs, bounds, ray_address, send_credentials=send_credentials)
     if ray_address is not None:
         raise UsageError("--ray-address is for --engine ray")
-    from coec.fleet.engines.local import LocalEngine
+    from coec.fleet.local_engine import LocalEngine
 
     return LocalEngine(jobs or len(os.sched_getaffinity(0)), bounds)
 
@@ -133,7 +133,7 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
     from coec.reports.progress import PlainColumn
 
     bars = Progress(
@@ -167,7 +167,7 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
 
 def _show(report: BatchReport, cores: int) -> None:
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
 
     rows = console.table("windows", "", right=(1,))
     rows.add_row("in all", str(report.windows))

@@ -37,12 +37,12 @@ def calibrate(
     **options: Unpack[CalibrationOptions],
 ) -> int:
     """Calibrate from a recording: exit 0 if the result is accepted, 1 if the self-diagnosis refuses it."""
-    from coec.adapters.files import output as files
     from coec.config import WindowConfig
+    from coec.io import user_files as files
+    from coec.io.recordings import window_cutting
     from coec.recording import perturbation_of, solve
     from coec.reports import calibration, console
-    from coec.reports.stage_times import StageTimes
-    from coec.sources import windows
+    from coec.reports.progress import StageTimes
 
     if output is not None:
         files.try_folder(output)
@@ -50,7 +50,7 @@ def calibrate(
         perturbation_of(options["perturb"] or ())
     with console.progress() as bars:
         times = StageTimes(bars)
-        loaded = windows.load_window(
+        loaded = window_cutting.load_window(
             source, options.get("frames"), WindowConfig().pairs, lambda done, total: times.step("load", done, total)
         )
         with picture_of_lens_error(output, loaded.window.rig.camera):
@@ -127,18 +127,13 @@ def _write(
     have been fitted."""
     import numpy as np
 
-    from coec.adapters.files import output as files
-    from coec.reports import (
-        calibration,
-        page,
-        pictures,  # matplotlib takes a second to import
-        provenance,
-    )
-    from coec.reports.calibration_page import calibration_page
+    from coec.io import user_files as files
+    from coec.reports import calibration, page, pictures, provenance
+    from coec.reports.calibration import calibration_page
     from coec.reports.close_ups import Caption
     from coec.reports.page import Pictures
     from coec.reports.page_parts import file_picture
-    from coec.schemas.base import to_json
+    from coec.schemas.message import to_json
     from coec.schemas.replies import CalibrationReport
 
     window, result, compensated = solution.window, solution.result, solution.configuration.motion_compensation

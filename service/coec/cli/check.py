@@ -12,9 +12,9 @@ from coec.errors import CalibrationError, SourceError
 
 if TYPE_CHECKING:
     from coec.calibration.types import Estimate
-    from coec.evaluation.fitness import Cadence, Fitness, Notice
-    from coec.reports.stage_times import StageTimes
-    from coec.sources import RecordingSource
+    from coec.io.recordings.layouts import RecordingSource
+    from coec.reports.progress import StageTimes
+    from coec.reports.recording_fitness import Cadence, Fitness, Notice
 
 PAIRS = 6
 """Pairs of the trial, evenly chosen: as many as in a check of the monitor."""
@@ -28,10 +28,10 @@ def check(
     as_json: Json = False,
 ) -> int:
     """Show the content of a recording and whether it is suitable: exit 1 if it allows no calibration."""
-    from coec.evaluation.fitness import fitness_of
+    from coec.io.recordings.layouts import open_source
     from coec.reports import console
-    from coec.reports.stage_times import StageTimes
-    from coec.sources import open_source
+    from coec.reports.progress import StageTimes
+    from coec.reports.recording_fitness import fitness_of
 
     try:
         recording = open_source(source)
@@ -55,13 +55,13 @@ def check(
 
 def _trial(recording: RecordingSource, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
     """A calibration of a few pairs near the recording's own extrinsic: shows how well this scene fixes the pose."""
-    from coec.adapters.depth.maps import open_depth
-    from coec.adapters.images.codec import GreyImages
-    from coec.calibration.calibrator import calibrate
+    from coec.calibration.pipeline import calibrate
     from coec.config import LimitsConfig
-    from coec.sources import windows
+    from coec.io.depth.depth_maps import open_depth
+    from coec.io.images import GreyImages
+    from coec.io.recordings import window_cutting
 
-    loaded = windows.window_of_recording(recording, PAIRS, lambda done, total: times.step("load", done, total))
+    loaded = window_cutting.window_of_recording(recording, PAIRS, lambda done, total: times.step("load", done, total))
     window = loaded.window
     configuration = configuration_of(SolverOptions(depth=depth), loaded.configuration)
     limits = LimitsConfig()
@@ -72,7 +72,7 @@ def _trial(recording: RecordingSource, depth: str | None, times: StageTimes) -> 
 
 
 def _of_trial(trial: Estimate | CalibrationError | None) -> tuple[Notice, ...]:
-    from coec.evaluation.fitness import Notice
+    from coec.reports.recording_fitness import Notice
 
     if isinstance(trial, CalibrationError):
         return (Notice("fail", "no_calibration", str(trial)),)
@@ -82,8 +82,8 @@ def _of_trial(trial: Estimate | CalibrationError | None) -> tuple[Notice, ...]:
 
 
 def _document(source: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> dict[str, Any]:
-    from coec.adapters.files.conversions import degrees_or_null
     from coec.calibration.types import Estimate
+    from coec.io.serialise import degrees_or_null
 
     document = {"source": source, **asdict(seen), "trial": None}
     if isinstance(trial, Estimate):
@@ -127,9 +127,9 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
 
 
 def _show_trial(trial: Estimate) -> None:
-    from coec.adapters.files.conversions import degrees_or_null
+    from coec.io.serialise import degrees_or_null
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
 
     axes = console.table("axis", "from the recording's own", "± σ", "unit", right=(1, 2))
     correction, sigma = degrees_or_null(trial.correction), degrees_or_null(trial.sigma)
@@ -142,13 +142,13 @@ def _show_trial(trial: Estimate) -> None:
 
 
 def _show_topics(source: str) -> None:
+    from coec.io.recordings.recording_source import is_bag, parse_spec
     from coec.reports import console
-    from coec.sources.spec import is_bag, parse_spec
 
     spec = parse_spec(source)
     if not is_bag(spec):
         return
-    from coec.sources.bag.topics import open_topics
+    from coec.io.recordings.bag import open_topics
 
     # A damaged file has been reported already.
     with suppress(SourceError):

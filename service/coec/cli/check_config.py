@@ -28,9 +28,9 @@ def check_config(
     as_json: Json = False,
 ) -> int:
     """Print the effective configuration with every default; exit 78 if it, or a file it names, cannot be used."""
-    from coec.adapters.tls.conversation import CommandListener, credentials_of
-    from coec.adapters.zenoh.settings import check_certificates, settings_of, settings_source
     from coec.config import config_hash, load_config
+    from coec.io.zenoh.command_auth import CommandListener, credentials_of
+    from coec.io.zenoh.session import check_certificates, settings_of, settings_source
     from coec.reports import console
     from coec.reports.commented_yaml import commented_yaml
 
@@ -107,7 +107,7 @@ def _check(pair: PairConfig, config: Config) -> list[str]:
     Raises:
         ConfigError: the rig or the network cannot be used.
     """
-    from coec.adapters.files.rig import rig_of
+    from coec.io.rig_files import rig_of
 
     rig = rig_of(pair)
     mask = f", mask {pair.camera.mask}" if rig.mask is not None else ""
@@ -120,7 +120,7 @@ def _check_undiscovered(pair: OpenPairConfig, config: Config) -> list[str]:
     Raises:
         ConfigError: the given parts of the rig, or the network, cannot be used.
     """
-    from coec.adapters.files.rig import check_given
+    from coec.io.rig_files import check_given
 
     check_given(pair)
     rig = "its frames, and what else is left out, come from /tf_static and CameraInfo when the service runs"
@@ -128,7 +128,7 @@ def _check_undiscovered(pair: OpenPairConfig, config: Config) -> list[str]:
 
 
 def _check_network(pair: OpenPairConfig, config: Config) -> str:
-    from coec.adapters.depth.maps import open_depth
+    from coec.io.depth.depth_maps import open_depth
 
     try:
         depth = open_depth(pair.calibration.depth, config.limits)

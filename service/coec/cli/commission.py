@@ -14,11 +14,11 @@ from coec.cli.options import SOURCE_HELP, Depth, Dof, Frames, Json, Objective
 from coec.errors import UsageError
 
 if TYPE_CHECKING:
-    from coec.calibration.commissioning.baseline import Baseline
+    from coec.calibration.baseline import Baseline
     from coec.calibration.ports import DepthModel, ImageReader
     from coec.calibration.types import Window
     from coec.config import CalibrationConfig
-    from coec.reports.stage_times import StageTimes
+    from coec.reports.progress import StageTimes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,12 +58,12 @@ def commission(
     as_json: Json = False,
 ) -> int:
     """Learn the baseline of a rig from windows in which its calibration is right: bias, spread, every limit."""
-    from coec.adapters.files.baseline_file import load_baselines, save_baseline
-    from coec.adapters.files.output import try_file
-    from coec.calibration.commissioning.learning import commission as learn
+    from coec.calibration.commissioning import commission as learn
+    from coec.io.baseline_file import load_baselines, save_baseline
+    from coec.io.user_files import try_file
     from coec.reports import console, page, provenance
     from coec.reports.baseline_page import baselines_page
-    from coec.reports.stage_times import StageTimes
+    from coec.reports.progress import StageTimes
 
     serials = _serials_of(sensors or ())
     try_file(output)
@@ -104,16 +104,16 @@ def load(sources: Sequence[str], options: SolverOptions, times: StageTimes) -> R
     Raises:
         UsageError: no source, or an unknown value.
     """
-    from coec.adapters.depth.maps import CachedDepth, open_depth
-    from coec.adapters.images.codec import CachedGreys, GreyImages
-    from coec.calibration.commissioning.learning import MAX_PAIRS
+    from coec.calibration.commissioning import MAX_PAIRS
     from coec.config import LimitsConfig, WindowConfig
-    from coec.sources import windows
+    from coec.io.depth.depth_maps import CachedDepth, open_depth
+    from coec.io.images import CachedGreys, GreyImages
+    from coec.io.recordings import window_cutting
 
     if not sources:
         raise UsageError("name at least one recording of a rig whose calibration is right")
     loaded = [
-        windows.load_window(
+        window_cutting.load_window(
             source,
             options.get("frames"),
             WindowConfig().pairs,
@@ -149,7 +149,7 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
     """What `--json` prints: the baseline as it is written, its hash, and bias and spread in degrees and metres."""
     import numpy as np
 
-    from coec.adapters.files.baseline_file import baseline_hash, baseline_to_json
+    from coec.io.baseline_file import baseline_hash, baseline_to_json
 
     sigma = baseline.accuracy.sigma(baseline.pairs)
     return {
@@ -163,9 +163,9 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
 
 def show(baseline: Baseline) -> None:
     """Prints the baseline for people."""
-    from coec.adapters.files.baseline_file import baseline_hash
+    from coec.io.baseline_file import baseline_hash
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
 
     console.show(
         f"{baseline.pair}: commissioned from {count(baseline.pairs, 'pair')} of "

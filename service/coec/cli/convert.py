@@ -17,7 +17,7 @@ from coec.errors import OutputError, UsageError
 if TYPE_CHECKING:
     from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
     from coec.config import CalibrationConfig, PairConfig, SweepConfig, WindowConfig
-    from coec.sources import RecordingSource
+    from coec.io.recordings.layouts import RecordingSource
 
 NS_PER_S = 1_000_000_000
 
@@ -59,15 +59,15 @@ def convert(
     as_json: Json = False,
 ) -> int:
     """Turn a recording into a ROS 2 MCAP, or into a configuration with which `run` serves it."""
-    from coec.adapters.files import output
+    from coec.io import user_files
+    from coec.io.recordings.layouts import open_source
     from coec.reports import console
-    from coec.sources import open_source
 
     if out.suffix not in (".mcap", ".yaml", ".yml"):
         raise UsageError(f"{out}: OUT must end in .mcap (ROS 2 bag) or .yaml (daemon configuration)")
     if full and out.suffix == ".mcap":
         raise UsageError("--full belongs to a configuration, OUT.yaml")
-    output.require_absent(out, force=force)
+    user_files.require_absent(out, force=force)
     recording = open_source(source)
     is_bag = out.suffix == ".mcap"
     written = _bag(recording, out) if is_bag else _configuration(recording, out, full=full, force=force)
@@ -84,10 +84,10 @@ def configuration_for(recording: RecordingSource, T_camera_lidar: Matrix4, mask:
 
     Its window is one that the recording can fill, see `_window`.
     """
-    from coec.adapters.files.rig import intrinsics_config, matrix_rows
-    from coec.adapters.zenoh.player import StreamKeys
     from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
     from coec.config import CameraConfig, EgoConfig, LidarConfig, PairConfig
+    from coec.io.rig_files import intrinsics_config, matrix_rows
+    from coec.io.zenoh.player import StreamKeys
 
     rig = recording.rig
     streams = StreamKeys.default(rig.pair)
@@ -135,8 +135,8 @@ def _window(camera_stamps_ns: Sequence[int]) -> WindowConfig:
 
 def _calibration(camera: CameraFrame) -> CalibrationConfig:
     """The defaults, with the depth maps of the recording where it has them."""
-    from coec.adapters.depth.maps import STEREO
     from coec.config import CalibrationConfig, DepthConfig
+    from coec.io.depth.depth_maps import STEREO
 
     return CalibrationConfig() if camera.depth is None else CalibrationConfig(depth=DepthConfig(model=STEREO))
 
@@ -149,14 +149,14 @@ def first_frames(recording: RecordingSource) -> list[CameraFrame | LidarFrame | 
 def _configuration(recording: RecordingSource, out: Path, *, full: bool, force: bool) -> list[Path]:
     import numpy as np
 
-    from coec.adapters.files import output
-    from coec.adapters.files.rig import mask_to_png
     from coec.config import Config, StateConfig
+    from coec.io import user_files
+    from coec.io.rig_files import mask_to_png
     from coec.reports.commented_yaml import commented_yaml, short_yaml
 
     mask, mask_path = recording.rig.mask, out.with_name(f"{out.stem}-mask.png")
     if mask is not None:
-        output.require_absent(mask_path, force=force)
+        user_files.require_absent(mask_path, force=force)
     name = None if mask is None else Path(mask_path.name)
     pair = configuration_for(recording, recording.rig.T_camera_lidar_nominal, name)
     config = Config(state=StateConfig(), pairs=(pair,))
@@ -167,11 +167,11 @@ def _configuration(recording: RecordingSource, out: Path, *, full: bool, force: 
         text = f"{head}# Keys that are not here have their defaults: `coec check-config {out.name}` prints them all.\n"
         text += short_yaml(config, ALWAYS, COMMENTS)
     if mask is None:
-        return [output.replace_output(out, text.encode())]
+        return [user_files.replace_output(out, text.encode())]
     had_mask = mask_path.exists()
-    output.replace_output(mask_path, mask_to_png(np.asarray(mask)))
+    user_files.replace_output(mask_path, mask_to_png(np.asarray(mask)))
     try:
-        output.replace_output(out, text.encode())
+        user_files.replace_output(out, text.encode())
     except OutputError:
         if not had_mask:  # it would refuse the next try
             mask_path.unlink(missing_ok=True)
@@ -180,8 +180,8 @@ def _configuration(recording: RecordingSource, out: Path, *, full: bool, force: 
 
 
 def _bag(recording: RecordingSource, out: Path) -> list[Path]:
-    from coec.adapters.mcap.bag_writer import write_bag
     from coec.calibration.types import CameraFrame
+    from coec.io.mcap.bag_writer import write_bag
     from coec.reports import console
 
     depth = any(isinstance(frame, CameraFrame) and frame.depth is not None for frame in first_frames(recording))

@@ -14,12 +14,12 @@ from coec.cli.options import Depth, Frames, Json, Source
 from coec.errors import CalibrationError, UsageError
 
 if TYPE_CHECKING:
-    from coec.calibration.commissioning.baseline import Baseline
+    from coec.calibration.baseline import Baseline
     from coec.calibration.monitor.change_detector import Observation
     from coec.calibration.types import Window
     from coec.reports import diagnosis
-    from coec.reports.stage_times import StageTimes
-    from coec.schemas.evaluation import DetectionReport
+    from coec.reports.progress import StageTimes
+    from coec_lab.experiments.evaluation_schema import DetectionReport
 
 REACH_DEG = 8.0
 """How far around the given pose the pose is searched: as far as a knock moves a mount. Beyond that, use
@@ -58,7 +58,7 @@ def diagnose(
     """Check the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong or undecided."""
     from coec.calibration.monitor.check_verdict import diagnose as check_extrinsic
     from coec.reports import console, diagnosis
-    from coec.reports.stage_times import StageTimes
+    from coec.reports.progress import StageTimes
 
     with console.progress() as bars:
         times = StageTimes(bars)
@@ -87,11 +87,11 @@ def diagnose(
 
 def _detection(rigged: RigWindows, splits: int, checks: int, times: StageTimes) -> DetectionReport:
     """How well moved extrinsics are detected on the window."""
-    from coec.calibration.commissioning.learning import FAR_RAD
-    from coec.calibration.estimators import prepare_window_data
+    from coec.calibration.commissioning import FAR_RAD
     from coec.calibration.monitor.check import gather
-    from coec.evaluation.detection import try_detection
-    from coec.reports.evaluation_documents import detection_of
+    from coec.calibration.solver import prepare_window_data
+    from coec_lab.experiments.detection import try_detection
+    from coec_lab.experiments.evaluation_documents import detection_of
 
     window = rigged.windows[0]
     evidence = gather(prepare_window_data(window, rigged.depth, rigged.images, rigged.configuration, times), FAR_RAD)
@@ -107,8 +107,9 @@ def _detection(rigged: RigWindows, splits: int, checks: int, times: StageTimes) 
 
 
 def _show_detection(report: DetectionReport, source: str, output: Path | None, *, as_json: bool) -> int:
-    from coec.reports import console, evaluation_tables, page, provenance
-    from coec.reports.check_page import detection_page
+    from coec.reports import console, page, provenance
+    from coec.reports.diagnosis import detection_page
+    from coec_lab.experiments import evaluation_tables
 
     if output is not None:
         page.write(output / "report.html", detection_page(report, source, provenance.here()))
@@ -121,11 +122,11 @@ def _show_detection(report: DetectionReport, source: str, output: Path | None, *
 
 def _moved(window: Window, perturb: str | None) -> Window:
     from coec.geometry import se3
-    from coec.sources import windows
+    from coec.io.recordings import window_cutting
 
     if perturb is None:
         return window
-    moved = se3.perturb(window.T_camera_lidar_start, windows.parse_perturbation("--perturb", perturb))
+    moved = se3.perturb(window.T_camera_lidar_start, window_cutting.parse_perturbation("--perturb", perturb))
     return replace(window, T_camera_lidar_start=moved)
 
 
@@ -135,8 +136,8 @@ def _baseline(file: Path | None, window: Window, rigged: RigWindows) -> Baseline
     Raises:
         UsageError: the file has none, or it does not hold for this recording.
     """
-    from coec.adapters.files.baseline_file import load_baseline
-    from coec.calibration.commissioning.baseline import learned_hash, mismatch
+    from coec.calibration.baseline import learned_hash, mismatch
+    from coec.io.baseline_file import load_baseline
 
     if file is None:
         return None
@@ -154,7 +155,7 @@ def _baseline(file: Path | None, window: Window, rigged: RigWindows) -> Baseline
 def _document(
     seen: Observation, finding: diagnosis.ExtrinsicFinding, measured: diagnosis.SolvedOffset | None
 ) -> dict[str, Any]:
-    from coec.adapters.files.conversions import metric_of
+    from coec.io.serialise import metric_of
 
     return {
         "finding": finding.state,
@@ -175,7 +176,7 @@ def _document(
 
 
 def _show(seen: Observation, finding: diagnosis.ExtrinsicFinding) -> None:
-    from coec.adapters.files.conversions import metric_of
+    from coec.io.serialise import metric_of
     from coec.reports import console, diagnosis
 
     offset, sigma = in_degrees(seen.offset), in_degrees(seen.sigma)
@@ -200,7 +201,7 @@ def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosi
     check knows it, because what turned the mount may also have shifted it."""
     import numpy as np
 
-    from coec.calibration.calibrator import calibrate
+    from coec.calibration.pipeline import calibrate
     from coec.calibration.ports import Silence
     from coec.calibration.types import Decision
     from coec.geometry import se3
@@ -234,7 +235,7 @@ def _write(
 ) -> None:
     from coec.config import config_hash
     from coec.reports import page, pictures, provenance
-    from coec.reports.check_page import check_page
+    from coec.reports.diagnosis import check_page
 
     (image,) = pictures.overlays(window, (window.T_camera_lidar_start,), rigged.configuration.motion_compensation)
     title = f"{window.rig.pair}  the extrinsic that was checked"

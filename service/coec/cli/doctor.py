@@ -19,9 +19,9 @@ from coec.errors import ConfigError, ModelError
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.adapters.zenoh.ros_topics import RosTopicList
     from coec.config import Config, OpenPairConfig
-    from coec.schemas.doctor import Finding
+    from coec.io.zenoh.ros_node import RosTopicList
+    from coec.schemas.documents import Finding
 
 USUAL_FILE = Path("/etc/coec/coec.yaml")
 """Configuration that the systemd unit names."""
@@ -43,7 +43,7 @@ def doctor(
     there is one; changes and disturbs nothing.
     """
     from coec.reports import console
-    from coec.schemas.doctor import DoctorReport
+    from coec.schemas.documents import DoctorReport
 
     findings: list[Finding] = []
     for finding in examine(config or USUAL_FILE, seconds):
@@ -66,8 +66,8 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
     """
     import coec.cli.doctor_computer as computer
     import coec.cli.doctor_connection as connection
-    from coec.adapters.zenoh.bus import closed
     from coec.cli.doctor_computer import warn
+    from coec.io.zenoh.bus import closed
 
     config, finding = _configuration(path)
     yield finding
@@ -102,9 +102,9 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
 def _received(config: Config, session: zenoh.Session, client: zenoh.Session, seconds: float) -> Iterator[Finding]:
     """Findings on what a session as that of the service receives, compared with a client of the same router."""
     import coec.cli.doctor_streams as streams
-    from coec.adapters.zenoh.ros_side import RosSide
+    from coec.io.zenoh.ros_node import RosSide
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
 
     ros, known = RosSide(session, config), RosSide(client, config)
     with console.progress(counted=False) as progress:
@@ -125,12 +125,12 @@ def _received(config: Config, session: zenoh.Session, client: zenoh.Session, sec
 
 def _configuration(path: Path) -> tuple[Config | None, Finding]:
     """The configuration, if a service could start with it, and the finding on it."""
-    from coec.adapters.files.rig import check_given, rig_of
-    from coec.adapters.zenoh.endpoints import Endpoint
-    from coec.adapters.zenoh.settings import connected_of, listened_of, settings_of
     from coec.cli.doctor_computer import fail, ok
     from coec.config import load_config
-    from coec.runtime.nominal.kept import with_discovered
+    from coec.io.rig_files import check_given, rig_of
+    from coec.io.zenoh.endpoints import Endpoint
+    from coec.io.zenoh.session import connected_of, listened_of, settings_of
+    from coec.service.discovery import with_discovered
 
     advice = "correct it, or name another with --config; `coec check-config FILE` prints what a file comes to"
     try:
@@ -161,8 +161,8 @@ def _undiscovered(pair: OpenPairConfig, there: RosTopicList) -> Finding:
 
 def _networks(config: Config) -> Iterator[Finding]:
     """Findings on the depth networks, each once."""
-    from coec.adapters.depth.maps import open_depth
     from coec.cli.doctor_computer import fail, ok
+    from coec.io.depth.depth_maps import open_depth
 
     for depth in dict.fromkeys(pair.calibration.depth for pair in config.every_pair):
         try:

@@ -12,10 +12,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from coec.adapters.system.clock import clock_state
-from coec.adapters.system.locks import lock_holder
 from coec.config import StateConfig
-from coec.schemas.doctor import Finding
+from coec.io.system import clock_state, lock_holder
+from coec.schemas.documents import Finding
 
 MIB = 2**20
 

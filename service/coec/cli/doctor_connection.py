@@ -15,30 +15,31 @@ from typing import Literal
 import zenoh
 
 from coec import __version__
-from coec.adapters.zenoh.bus import closed, is_connected, open_session
-from coec.adapters.zenoh.client import query_all, query_one
-from coec.adapters.zenoh.endpoints import CERTIFIED, WITH_PORT, Endpoint, redacted
-from coec.adapters.zenoh.opening import open_client
-from coec.adapters.zenoh.settings import connected_of, finds_peers, listened_of, mode_of, settings_of
-from coec.adapters.zenoh.settings import to_observer as as_separate_client
-from coec.adapters.zenoh.tls import (
-    Certificate,
-    CertificateError,
-    host_and_port,
-    read_certificate,
-    shake_hands,
-    tls_files,
-)
 from coec.cli.doctor_computer import fail, ok, warn
 from coec.config import Config
 from coec.errors import CoecError, NotFoundError, UnavailableError
-from coec.runtime.api.configuration import redacted_configuration
-from coec.runtime.api.troubles import PROBLEMS
-from coec.runtime.reload import differing
-from coec.schemas.base import from_json, json_value
-from coec.schemas.doctor import Finding, Level
+from coec.io.zenoh.bus import closed, is_connected, open_session
+from coec.io.zenoh.endpoints import (
+    CERTIFIED,
+    WITH_PORT,
+    Certificate,
+    CertificateError,
+    Endpoint,
+    host_and_port,
+    read_certificate,
+    redacted,
+    shake_hands,
+    tls_files,
+)
+from coec.io.zenoh.query_client import query_all, query_one
+from coec.io.zenoh.session import connected_of, finds_peers, listened_of, mode_of, open_client, settings_of
+from coec.io.zenoh.session import to_observer as as_separate_client
+from coec.schemas.documents import Finding, Level
 from coec.schemas.keys import Keys
+from coec.schemas.message import from_json, json_value
 from coec.schemas.replies import HealthReply, StatusReply
+from coec.service.api.problems import PROBLEMS
+from coec.service.configuration import differing, redacted_configuration
 
 CONNECT_S = 3.0
 """Timeout of each step; a router on the same network answers in milliseconds."""

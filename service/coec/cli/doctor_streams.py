@@ -17,24 +17,21 @@ from typing import get_args
 import numpy as np
 import zenoh
 
-from coec.adapters.depth.maps import STEREO
-from coec.adapters.images.codec import Inspector
-from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import InputSample, StreamInput
-from coec.adapters.zenoh.ros_side import RosSide
-from coec.adapters.zenoh.ros_topics import RosTopicList, listed
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.cli.doctor_computer import fail, ok, warn
 from coec.cli.doctor_connection import cause_of_silence
 from coec.config import CameraMessage, Config, EgoMessage, LidarMessage, PairConfig
 from coec.errors import DecodeError
-from coec.runtime.api.streams import stream_problems
-from coec.runtime.api.troubles import PROBLEMS
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame, StreamCounts
-from coec.runtime.nominal.findings import info_topic_of, needs_transforms
-from coec.schemas.doctor import Finding
-from coec.schemas.ros_names import TF_STATIC
+from coec.io.depth.depth_maps import STEREO
+from coec.io.images import Inspector
+from coec.io.logs import LossCounter
+from coec.io.zenoh.bus import Bus, InputSample, StreamInput
+from coec.io.zenoh.ros_node import RosSide, RosTopicList, listed
+from coec.schemas.documents import Finding
+from coec.schemas.keys import TF_STATIC
+from coec.service.api.problems import PROBLEMS, stream_problems
+from coec.service.discovery import info_topic_of, needs_transforms
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame, StreamCounts
 
 SAMPLES_WAITING = 8
 """Most samples of a stream that wait to be decoded; further ones are only counted."""

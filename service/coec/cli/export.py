@@ -13,14 +13,13 @@ from coec.cli.options import Json, pair_named, suggesting
 from coec.errors import DecodeError, SourceError, UsageError
 
 if TYPE_CHECKING:
-    from coec.adapters.exports.extrinsic import ExportedExtrinsic
-    from coec.adapters.exports.told import ExportFrames
     from coec.calibration.types import Matrix4
     from coec.config import CameraIntrinsics, Config
+    from coec.io.exports.exported_extrinsic import ExportedExtrinsic, ExportFrames
 
 
 def _formats() -> Iterable[str]:
-    from coec.adapters.exports import FORMATS
+    from coec.io.exports.formats import FORMATS
 
     return tuple(FORMATS)
 
@@ -80,8 +79,8 @@ def export(
     as_json: Json = False,
 ) -> int:
     """Write a calibration into the files of other programs: exit 1 if it is not accepted."""
-    from coec.adapters.exports.told import ExportFrames
-    from coec.adapters.files import output as files
+    from coec.io import user_files as files
+    from coec.io.exports.exported_extrinsic import ExportFrames
     from coec.recording import export_text, require_accepted, require_format
     from coec.reports import console
 
@@ -104,8 +103,8 @@ def export(
 
 def _read(source: Path, config: Path | None, pair: str | None, frames: ExportFrames) -> ExportedExtrinsic:
     from coec.config import load_config
-    from coec.runtime.decisions.state_store import STATE_FILE
-    from coec.runtime.nominal.kept import with_discovered
+    from coec.service.discovery import with_discovered
+    from coec.service.records.state_store import STATE_FILE
 
     loaded = None if config is None else with_discovered(load_config(config))
     if source.is_dir() or source.name == STATE_FILE:
@@ -116,9 +115,9 @@ def _read(source: Path, config: Path | None, pair: str | None, frames: ExportFra
 
 
 def _of_window(path: Path, frames: ExportFrames) -> ExportedExtrinsic:
-    from coec.adapters.exports.told import extrinsic_of_result
-    from coec.adapters.files.rig import intrinsics_config
-    from coec.adapters.mcap.windows import read_result, read_window
+    from coec.io.exports.exported_extrinsic import extrinsic_of_result
+    from coec.io.mcap.window_reader import read_result, read_window
+    from coec.io.rig_files import intrinsics_config
 
     result = read_result(path)
     if result is None:
@@ -128,11 +127,11 @@ def _of_window(path: Path, frames: ExportFrames) -> ExportedExtrinsic:
 
 
 def _of_document(path: Path, camera: CameraIntrinsics | None, frames: ExportFrames) -> ExportedExtrinsic:
-    from coec.adapters.exports.told import extrinsic_of_reply, extrinsic_of_result
+    from coec.io.exports.exported_extrinsic import extrinsic_of_reply, extrinsic_of_result
+    from coec.io.user_files import read_bytes
     from coec.recording import MAX_EXPORT_BYTES
-    from coec.schemas.base import from_json
+    from coec.schemas.message import from_json
     from coec.schemas.replies import CalibrationResult, ExtrinsicReply
-    from coec.sources.reading import read_bytes
 
     data = read_bytes(path, MAX_EXPORT_BYTES)
     with suppress(DecodeError):
@@ -147,9 +146,9 @@ def _of_document(path: Path, camera: CameraIntrinsics | None, frames: ExportFram
 
 def _of_state(folder: Path, name: str | None, config: Config | None, frames: ExportFrames) -> ExportedExtrinsic:
     """The calibration that the service of a state directory serves, with its full covariance."""
-    from coec.adapters.exports.told import intrinsics_config_of
-    from coec.runtime.api.exports import exported
-    from coec.runtime.decisions.state_store import read_pairs
+    from coec.io.exports.exported_extrinsic import intrinsics_config_of
+    from coec.service.api.reply_builders import exported
+    from coec.service.records.state_store import read_pairs
 
     pairs = read_pairs(folder)
     if name is None and len(pairs) != 1:
@@ -170,7 +169,7 @@ def _of_state(folder: Path, name: str | None, config: Config | None, frames: Exp
 
 
 def _pose(text: str | None) -> Matrix4 | None:
-    from coec.adapters.exports.told import parse_pose
+    from coec.io.exports.exported_extrinsic import parse_pose
 
     if text is None:
         return None

@@ -24,10 +24,10 @@ from coec.errors import CoecError, DecodeError, NotFoundError, OutputError, Remo
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.adapters.zenoh.window_fetch import RecordingInfo
-    from coec.schemas.base import Message
-    from coec.schemas.incident import Absent, FetchedFile, FetchedWindow, IncidentReport
+    from coec.io.zenoh.window_fetch import RecordingInfo
+    from coec.schemas.documents import Absent, FetchedFile, FetchedWindow, IncidentReport
     from coec.schemas.keys import Keys
+    from coec.schemas.message import Message
     from coec.schemas.replies import ChainedEntry, EvidenceEvent, HistoryReply, WindowsReply
 
 LATEST: Final = "latest"
@@ -93,7 +93,7 @@ def fetch(
 
     The same command resumes an interrupted download.
     """
-    from coec.adapters.zenoh.client import connected_by
+    from coec.io.zenoh.query_client import connected_by
     from coec.reports import console, incident_page
     from coec.schemas.keys import Keys
 
@@ -124,8 +124,8 @@ def fetch(
 
 def _events(session: zenoh.Session, keys: Keys, pair: str | None, timeout_s: float) -> list[EvidenceEvent]:
     """Red events of the pair (None: of every pair), the latest last."""
-    from coec.adapters.zenoh.client import query_all
-    from coec.schemas.base import from_json
+    from coec.io.zenoh.query_client import query_all
+    from coec.schemas.message import from_json
     from coec.schemas.replies import EvidenceReply
 
     selector = f"{keys.evidence(pair or '*')}?format=json"
@@ -141,9 +141,9 @@ def _events(session: zenoh.Session, keys: Keys, pair: str | None, timeout_s: flo
 
 def _nobody(session: zenoh.Session, keys: Keys, timeout_s: float, selector: str) -> NotFoundError:
     """The error that nobody answers, with the last heartbeat of the vehicle, if one is stored."""
-    from coec.adapters.zenoh.client import no_reply_error, query_all
+    from coec.io.zenoh.query_client import no_reply_error, query_all
     from coec.reports.fleet_board import duration
-    from coec.schemas.last_word import decode_heartbeat as read_word
+    from coec.schemas.heartbeat import decode_heartbeat as read_word
 
     for answer in query_all(session, keys.last("*"), timeout_s):
         try:
@@ -166,7 +166,7 @@ def _is_of(event: EvidenceEvent, vehicle: str, pair: str) -> bool:
 
 def _list(events: Sequence[EvidenceEvent], vehicle: str, *, as_json: bool) -> int:
     from coec.reports import console, replies
-    from coec.schemas.base import to_json
+    from coec.schemas.message import to_json
     from coec.schemas.replies import EvidenceReply
 
     if as_json:
@@ -205,11 +205,11 @@ class Download:
     recorded_bytes: int = 0
 
     def fetch(self, event_id: str) -> IncidentReport:
-        from coec.adapters.files import output as files
+        from coec.io import user_files as files
         from coec.reports import incident_page, provenance
         from coec.reports.page import render
-        from coec.schemas.base import to_json
-        from coec.schemas.incident import IncidentReport
+        from coec.schemas.documents import IncidentReport
+        from coec.schemas.message import to_json
         from coec.schemas.replies import EvidenceEvent, ExtrinsicReply, HealthReply, HistoryReply, StatusReply
         from coec.schemas.rig_state import RigReply
 
@@ -254,13 +254,13 @@ class Download:
         return report
 
     def _document(self, model: type[M], selector: str) -> M:
-        from coec.schemas.base import from_json
+        from coec.schemas.message import from_json
 
         joined = ";" if "?" in selector else "?"
         return from_json(model, self._answer(f"{selector}{joined}format=json"))
 
     def _optional(self, name: str, model: type[M], selector: str) -> M | None:
-        from coec.schemas.base import to_json
+        from coec.schemas.message import to_json
 
         documents: list[M] = []
 
@@ -273,14 +273,14 @@ class Download:
 
     def _configuration(self) -> bytes:
         """The configuration as the vehicle sends it; a newer vehicle may have keys that this program does not know."""
-        from coec.schemas.base import json_value
+        from coec.schemas.message import json_value
 
         document = json_value(self._answer(f"{self.keys.config}?format=json"))
         return json.dumps(document, indent=2, sort_keys=True).encode()
 
     def _picture(self, event_id: str, side: str) -> None:
-        from coec.adapters.images.codec import decode_bgr, probe
         from coec.config import LimitsConfig
+        from coec.io.images import decode_bgr, probe
 
         data = self._answer(f"{self.keys.evidence_of(self.pair, event_id)}?overlay={side}")
         limits = LimitsConfig(max_message_bytes=MAX_PICTURE_BYTES)
@@ -288,7 +288,7 @@ class Download:
         self._store(f"{side}.jpg", data)
 
     def _window(self, window_id: str, history: HistoryReply | None) -> FetchedWindow | None:
-        from coec.schemas.incident import FetchedWindow
+        from coec.schemas.documents import FetchedWindow
         from coec.schemas.replies import WindowInfo
 
         info = self._recording(window_id)
@@ -305,7 +305,7 @@ class Download:
 
     def _snippets(self, event: EvidenceEvent) -> Iterator[str]:
         """Ids of the snippets that were recorded at full rate about the event."""
-        from coec.schemas.incident import Absent
+        from coec.schemas.documents import Absent
         from coec.schemas.replies import WindowsReply
 
         listed: list[WindowsReply] = []
@@ -325,9 +325,9 @@ class Download:
             self.absent.append(Absent(what=f"{len(near) - MAX_SNIPPETS} snippets", why=f"{why}; {how}"))
 
     def _recording(self, recording_id: str) -> RecordingInfo | None:
-        from coec.adapters.zenoh.window_fetch import fetch_window
+        from coec.io.zenoh.window_fetch import fetch_window
         from coec.reports import console
-        from coec.schemas.incident import Absent, FetchedFile
+        from coec.schemas.documents import Absent, FetchedFile
 
         if (named := OF_PAIR.fullmatch(recording_id)) is None or named["pair"] != self.pair:
             self.absent.append(Absent(what="a recording", why="the vehicle reports an invalid name for it"))
@@ -362,7 +362,7 @@ class Download:
         return recordings[0] if recordings else None
 
     def _answer(self, selector: str) -> bytes:
-        from coec.adapters.zenoh.client import query_one
+        from coec.io.zenoh.query_client import query_one
 
         deadline_s = time.monotonic() + self.patience_s
         while True:
@@ -374,7 +374,7 @@ class Download:
             time.sleep(WAIT_S)
 
     def _try(self, what: str, fetch: Callable[[], None]) -> None:
-        from coec.schemas.incident import Absent
+        from coec.schemas.documents import Absent
 
         try:
             fetch()
@@ -386,8 +386,8 @@ class Download:
     def _store(self, name: str, data: bytes) -> None:
         import hashlib
 
-        from coec.adapters.files import output as files
-        from coec.schemas.incident import FetchedFile
+        from coec.io import user_files as files
+        from coec.schemas.documents import FetchedFile
 
         files.replace_output(self.folder / name, data)
         self.files[name] = FetchedFile(name=name, sha256=hashlib.sha256(data).hexdigest(), size_bytes=len(data))
@@ -396,7 +396,7 @@ class Download:
 def chain_holds(history: HistoryReply) -> bool | None:
     """Whether the entries match their hashes, and each holds the hash of the entry before it in its book, as far as
     that was fetched. None: unknown, because no two fetched entries follow each other, or another version wrote them."""
-    from coec.schemas.base import SCHEMA_VERSION
+    from coec.schemas.message import SCHEMA_VERSION
 
     linked = 0
     last: dict[str, ChainedEntry] = {}
@@ -433,8 +433,8 @@ def _around(key: str, event: EvidenceEvent) -> str:
 
 
 def _in_history(path: Path, window_id: str, history: HistoryReply | None) -> bool | None:
-    from coec.adapters.mcap.windows import read_result
-    from coec.schemas.base import SCHEMA_VERSION
+    from coec.io.mcap.window_reader import read_result
+    from coec.schemas.message import SCHEMA_VERSION
 
     entries = () if history is None else history.entries
     stored = [item.entry.result_sha256 for item in entries if item.entry.window_id == window_id]
@@ -451,6 +451,6 @@ def _in_history(path: Path, window_id: str, history: HistoryReply | None) -> boo
 def _sha256(message: Message) -> str:
     import hashlib
 
-    from coec.schemas.base import to_json
+    from coec.schemas.message import to_json
 
     return hashlib.sha256(to_json(message)).hexdigest()

@@ -13,9 +13,8 @@ from coec.cli.options import Json
 from coec.errors import DecodeError, UsageError
 
 if TYPE_CHECKING:
-    from coec.calibration.commissioning.baseline import Baseline
-    from coec.schemas.fleet import FleetReport
-    from coec.schemas.fleet_now import FleetNow
+    from coec.calibration.baseline import Baseline
+    from coec.schemas.fleet import FleetNow, FleetReport
 
 app = typer.Typer(no_args_is_help=True, help="Combine results of many vehicles.")
 
@@ -40,10 +39,10 @@ def report(
     as_json: Json = False,
 ) -> int:
     """Report drift of every pair, what is refused and why, and what an earlier batch decided otherwise."""
-    from coec.adapters.files import output as files
     from coec.fleet import report as fleet_report
+    from coec.io import user_files as files
     from coec.reports import console, fleet_page, page, provenance
-    from coec.schemas.base import to_json
+    from coec.schemas.message import to_json
 
     if sql:
         _show_sql(results)
@@ -66,7 +65,7 @@ def report(
 def _show(summary: FleetReport) -> None:
     from coec.reports import console, fleet_page
     from coec.reports.console import figure
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
     from coec.schemas.fleet import AXES
 
     console.show(fleet_page.sentence(summary))
@@ -99,8 +98,8 @@ def _show(summary: FleetReport) -> None:
 
 
 def _fleet_now(path: Path) -> FleetNow:
-    from coec.schemas.base import from_json
-    from coec.schemas.fleet_now import FleetNow
+    from coec.schemas.fleet import FleetNow
+    from coec.schemas.message import from_json
 
     try:
         return from_json(FleetNow, path.read_bytes())
@@ -111,14 +110,14 @@ def _fleet_now(path: Path) -> FleetNow:
 
 
 def _show_sql(results: Path) -> None:
-    from coec.fleet import questions
+    from coec.fleet import tables
     from coec.reports import console
 
-    console.write(f"-- the view `{questions.WINDOWS_VIEW}` of the examples below\n")
-    console.write(f"{questions.view_statement(questions.WINDOWS_VIEW, results)};\n\n")
-    for name, kind in questions.columns(results):
+    console.write(f"-- the view `{tables.WINDOWS_VIEW}` of the examples below\n")
+    console.write(f"{tables.view_statement(tables.WINDOWS_VIEW, results)};\n\n")
+    for name, kind in tables.columns(results):
         console.write(f"--   {name:<22} {kind}\n")
-    for question, query in questions.EXAMPLE_QUERIES.items():
+    for question, query in tables.EXAMPLE_QUERIES.items():
         console.write(f"\n-- {question}{query};\n")
 
 
@@ -136,8 +135,8 @@ def commission(
     as_json: Json = False,
 ) -> int:
     """Learn from commissioned vehicles what others of their model start from (`state.model`): bias, spread, limits."""
-    from coec.adapters.files.baseline_file import load_baselines, save_baseline
-    from coec.calibration.commissioning.of_model import model_baseline
+    from coec.calibration.baseline import model_baseline
+    from coec.io.baseline_file import load_baselines, save_baseline
     from coec.reports import console
 
     vehicles = [load_baselines(path) for path in _each_once(baselines)]
@@ -168,7 +167,7 @@ def _each_once(paths: Sequence[Path]) -> Sequence[Path]:
 
 def _show_model(model: Baseline, vehicles: int) -> None:
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
 
     console.show(
         f"{model.pair}: {count(vehicles, 'vehicle')}, {count(model.pairs, 'pair')} of {count(model.windows, 'window')}"

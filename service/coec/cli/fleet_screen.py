@@ -12,18 +12,18 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from coec.adapters.system.keyboard import pressed_keys as keyboard
-from coec.adapters.zenoh.client import connected_by, query_one
-from coec.adapters.zenoh.words import HeartbeatReceiver
 from coec.cli.options import ServiceAddress
 from coec.cli.signals import until_signal
 from coec.errors import CoecError, UsageError
-from coec.fleet.roster import RANKS, FleetFilter, FleetState, PairName, parse_states
-from coec.reports import console, fleet_board, half_blocks
+from coec.fleet.fleet_state import RANKS, FleetFilter, FleetState, PairName, parse_states
+from coec.io.system import pressed_keys as keyboard
+from coec.io.zenoh.query_client import connected_by, query_one
+from coec.io.zenoh.subscriptions import HeartbeatReceiver
+from coec.reports import console, fleet_board
 from coec.reports.replies import results_table
-from coec.schemas.base import from_msgpack
-from coec.schemas.fleet_now import FleetNow, PairNow
+from coec.schemas.fleet import FleetNow, PairNow
 from coec.schemas.keys import Keys
+from coec.schemas.message import from_msgpack
 from coec.schemas.replies import HistoryReply
 
 FRAME_S = 0.5
@@ -129,7 +129,7 @@ class PairQuery:
 
     def _overlay(self, name: PairName, size: tuple[int, int]) -> RenderableType:
         key = Keys(self._prefix, name[0]).overlay(name[1])
-        return half_blocks.half_block_text(query_one(self._session, key, ANSWER_S).payload, *size)
+        return fleet_board.half_block_text(query_one(self._session, key, ANSWER_S).payload, *size)
 
 
 @dataclass(slots=True)

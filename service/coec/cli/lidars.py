@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from coec.calibration.lidar_to_lidar.types import LidarEdge
-    from coec.sources.lidars import LidarRecording
+    from coec.calibration.rig.lidar_sampling import LidarEdge
+    from coec.io.recordings.lidar_recordings import LidarRecording
 
 
 def lidars(
@@ -37,11 +37,11 @@ def lidars(
     as_json: Json = False,
 ) -> int:
     """Find the pose of one LiDAR in another from the surfaces that both see: exit 1 if those are too few."""
-    from coec.adapters.registration.nearest import Trees
-    from coec.calibration.lidar_to_lidar.registration import register
+    from coec.calibration.rig.lidar_registration import register
     from coec.geometry.se3 import difference
+    from coec.io.nearest_neighbours import Trees
+    from coec.io.recordings.lidar_recordings import open_lidars
     from coec.reports import console
-    from coec.sources.lidars import open_lidars
 
     search = Trees()
     recording = open_lidars(source, a, b)
@@ -62,7 +62,7 @@ def lidars(
 
 def _show(recording: LidarRecording, edge: LidarEdge, error: np.ndarray | None) -> None:
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
 
     table = console.table("axis of " + edge.rig.a, "correction", "sigma", *(["error"] if error is not None else []))
     rows = zip(console.AXES, console.UNITS, _in_degrees(edge.correction), _in_degrees(edge.sigma), strict=True)

@@ -2,7 +2,7 @@
 
 A command is a function `module:function` with the parameters that Typer reads, whose docstring is its help and which
 returns the exit status. This package names its commands in `BUILT_IN`; another package adds commands by entry points of
-group `coec.commands`. Exit codes (CONTRACT, "Command line") are those of `coec.exit_codes`. With `--json`, standard
+group `coec.commands`. Exit codes (CONTRACT, "Command line") are those of `coec.errors`. With `--json`, standard
 output holds one JSON document and nothing else.
 """
 
@@ -24,8 +24,7 @@ import typer
 
 from coec import __version__
 from coec.cli.signals import no_interrupt_lost
-from coec.errors import CoecError, UsageError
-from coec.exit_codes import ExitCode
+from coec.errors import CoecError, ExitCode, UsageError
 from coec.reports import plain_text
 from coec.untrusted import json_printable
 

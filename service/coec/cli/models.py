@@ -26,8 +26,8 @@ def show(
     as_json: Json = False,
 ) -> int:
     """Show the model card with which a network file is run."""
-    from coec.adapters.depth.model_cards import find_card
-    from coec.adapters.depth.onnx_network import file_identity
+    from coec.io.depth.model_cards import find_card
+    from coec.io.depth.onnx_network import file_identity
     from coec.reports import console
 
     if not file.is_file():
@@ -55,10 +55,10 @@ def add(
     as_json: Json = False,
 ) -> int:
     """Copy the file of a known depth network to where this user's services load it, after checking it."""
-    from coec.adapters.depth import network_files
+    from coec.io.depth import depth_maps
     from coec.reports import console
 
-    card, place, copied = network_files.add_network(file, name, force=force)
+    card, place, copied = depth_maps.add_network(file, name, force=force)
     if as_json:
         console.print_json({"name": card.name, "path": str(place), "copied": copied})
     elif copied:
@@ -70,21 +70,21 @@ def add(
 
 def _list(*, as_json: bool) -> int:
     """Lists the built-in cards: whose file is present, and where the others come from."""
-    from coec.adapters.depth import network_files
-    from coec.adapters.depth.model_cards import list_models
-    from coec.adapters.depth.network_files import models_folder
+    from coec.io.depth import depth_maps
+    from coec.io.depth.depth_maps import models_folder
+    from coec.io.depth.model_cards import list_models
     from coec.reports import console
 
     cards = list_models()
     folder = models_folder()
-    files = {card.name: network_files.network_file(card) for card in cards}
+    files = {card.name: depth_maps.network_file(card) for card in cards}
     if as_json:
         documents = [
             {
                 **card.model_dump(mode="json"),
                 "present": files[card.name] is not None,
                 "path": None if files[card.name] is None else str(files[card.name]),
-                "looked_for": [str(path) for path in network_files.candidate_paths(card)],
+                "looked_for": [str(path) for path in depth_maps.candidate_paths(card)],
             }
             for card in cards
         ]

@@ -19,9 +19,9 @@ from coec.calibration_options import Entry, entries
 from coec.errors import UsageError
 
 if TYPE_CHECKING:
-    from coec.adapters.tls.conversation import Credentials
-    from coec.adapters.zenoh.client import RouterAddress
     from coec.config import Config, PairConfig
+    from coec.io.zenoh.command_auth import Credentials
+    from coec.io.zenoh.query_client import RouterAddress
 
 
 def suggesting(values: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
@@ -183,10 +183,10 @@ def service_address(
     Raises:
         ConfigError: the configuration, or the Zenoh configuration, cannot be read.
     """
-    from coec.adapters.zenoh.client import RouterAddress
-    from coec.adapters.zenoh.settings import connected_of
-    from coec.adapters.zenoh.settings_file import credentials_in, read_settings
     from coec.config import Config, ZenohConfig, load_config
+    from coec.io.zenoh.endpoints import credentials_in, read_settings
+    from coec.io.zenoh.query_client import RouterAddress
+    from coec.io.zenoh.session import connected_of
 
     if config is not None:
         loaded = load_config(config)

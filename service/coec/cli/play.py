@@ -16,13 +16,12 @@ from coec.cli.signals import until_signal
 from coec.errors import DecodeError, SourceError, UsageError
 
 if TYPE_CHECKING:
-    from coec.adapters.ros.topics import TopicInfo, TopicMessage
-    from coec.adapters.zenoh.cadence import Played, Stamped
-    from coec.adapters.zenoh.player import SensorKeys, StreamKeys
     from coec.calibration.types import Rig
     from coec.config import Config, OpenPairConfig, RosConfig
-    from coec.sources import RecordingSource
-    from coec.sources.spec import SourceSpec
+    from coec.io.recordings.layouts import RecordingSource
+    from coec.io.recordings.recording_source import SourceSpec
+    from coec.io.ros.topics import TopicInfo, TopicMessage
+    from coec.io.zenoh.player import Played, SensorKeys, Stamped, StreamKeys
 
 RosMiddleware = Literal["rmw_zenoh", "ros2dds"]
 Middleware = Literal["native", "rmw_zenoh", "ros2dds"]
@@ -146,7 +145,7 @@ def play(
     as_json: Json = False,
 ) -> int:
     """Publish a recording on Zenoh, as its sensors would have."""
-    from coec.sources.spec import is_rig, parse_spec
+    from coec.io.recordings.recording_source import is_rig, parse_spec
 
     target = _target(config, pair, middleware, domain, connect)
     pace = Pace(rate, loop, start_now)
@@ -202,9 +201,8 @@ def _publish_frames(programme: FrameProgramme, target: Target, encoding: Encodin
     Raises:
         ConnectionFailedError: no router.
     """
-    from coec.adapters.zenoh.cadence import repeated
-    from coec.adapters.zenoh.client import connected
-    from coec.adapters.zenoh.player import Player, shifted
+    from coec.io.zenoh.player import Player, repeated, shifted
+    from coec.io.zenoh.query_client import connected
 
     shift_ns = pace.shift_ns(programme.first_stamp_ns)
     with until_signal() as stop, connected(target.endpoints, CONNECT_S) as session:
@@ -229,10 +227,9 @@ def _publish_topics(
         UsageError, SourceError: no such topic, or a message whose stamps cannot be shifted to now.
         ConnectionFailedError: no router.
     """
-    from coec.adapters.ros.later import shifted as shifted_message
-    from coec.adapters.zenoh.cadence import repeated
-    from coec.adapters.zenoh.client import connected
-    from coec.adapters.zenoh.topic_player import TopicPlayer, dialect_of
+    from coec.io.ros.topics import shifted as shifted_message
+    from coec.io.zenoh.player import TopicPlayer, dialect_of, repeated
+    from coec.io.zenoh.query_client import connected
 
     selected = _select(programme, requested, middleware)
     first = next(programme.messages(selected), None)
@@ -261,9 +258,9 @@ def _publish_topics(
 
 
 def _frames(source: str, name: str | None, target: Target, encoding: Encoding) -> FrameProgramme:
-    from coec.adapters.zenoh.client import single_key
-    from coec.adapters.zenoh.player import StreamKeys
-    from coec.sources import open_source
+    from coec.io.recordings.layouts import open_source
+    from coec.io.zenoh.player import StreamKeys
+    from coec.io.zenoh.query_client import single_key
 
     recording, pair = open_source(source), target.pair
     streams = StreamKeys.default(name or recording.rig.pair) if pair is None else StreamKeys.of_pair(pair)
@@ -281,7 +278,7 @@ def _frames(source: str, name: str | None, target: Target, encoding: Encoding) -
 
 
 def _rig_frames(spec: SourceSpec) -> FrameProgramme:
-    from coec.cli.play_rig import open_played_rig
+    from coec_lab.commands.rig_play import open_played_rig
 
     rig = open_played_rig(spec)
     return FrameProgramme(rig.name, rig.keys, rig.messages, rig.first_stamp_ns, rig.sensors, rig.frames, rig.period_ns)
@@ -290,9 +287,9 @@ def _rig_frames(spec: SourceSpec) -> FrameProgramme:
 def _topics(source: str, pair: str | None, target: Target) -> TopicProgramme:
     """The topics of a recording: those of a bag as they are, those of a simulated rig, else those of the configured
     pair, or below `/<pair>/`."""
-    from coec.cli.play_rig import open_played_rig
-    from coec.sources.bag.topics import open_topics
-    from coec.sources.spec import is_bag, is_rig, parse_spec
+    from coec.io.recordings.bag import open_topics
+    from coec.io.recordings.recording_source import is_bag, is_rig, parse_spec
+    from coec_lab.commands.rig_play import open_played_rig
 
     spec = parse_spec(source)
     if is_bag(spec):
@@ -309,9 +306,9 @@ def _topics(source: str, pair: str | None, target: Target) -> TopicProgramme:
 
 
 def _pair_topics(source: str, name: str | None, pair: OpenPairConfig | None) -> TopicProgramme:
-    from coec.adapters.ros.topics import FrameTopics, PairTopics, TopicInfo
     from coec.calibration.types import CameraFrame
-    from coec.sources import open_source
+    from coec.io.recordings.layouts import open_source
+    from coec.io.ros.topics import FrameTopics, PairTopics, TopicInfo
 
     recording = open_source(source)
     rig: Rig = recording.rig
@@ -338,9 +335,9 @@ def _split(requested: list[str] | None) -> tuple[str, ...]:
 
 def _select(programme: TopicProgramme, requested: tuple[str, ...], middleware: RosMiddleware) -> dict[str, TopicInfo]:
     """The topics to play: the requested ones, else all that can be played; prints which are left out."""
-    from coec.adapters.zenoh.topic_player import is_playable
+    from coec.io.zenoh.player import is_playable
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
 
     infos = programme.infos
     unknown = [topic for topic in requested if topic not in infos]
@@ -362,7 +359,7 @@ def _select(programme: TopicProgramme, requested: tuple[str, ...], middleware: R
 def _needing_listener(selected: Iterable[str], pair: OpenPairConfig | None) -> list[str]:
     """The topics that need a listener before the first message is sent: those of the configured pair, or all."""
     from coec.reports import console
-    from coec.schemas.ros_names import TF_STATIC
+    from coec.schemas.keys import TF_STATIC
 
     ours = [topic for topic in selected if topic != TF_STATIC]
     configured = {stream.topic for stream in pair.streams.values()} if pair is not None else None

@@ -19,7 +19,7 @@ from coec.untrusted import Untrusted
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.adapters.zenoh.client import Reply, RouterAddress
+    from coec.io.zenoh.query_client import Reply, RouterAddress
     from coec.schemas.keys import Keys
 
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
@@ -179,7 +179,7 @@ def query(
     force: ForceOption = False,
     as_json: Json = False,
 ) -> int:
-    from coec.adapters.zenoh.client import connected_by, is_alive, no_reply_error
+    from coec.io.zenoh.query_client import connected_by, is_alive, no_reply_error
 
     address = service_address(config, vehicle, prefix, connect, zenoh)
     request = Request(key, pair, sensor, tuple(params or ()), timeout_s)
@@ -212,10 +212,9 @@ def _answers(
     anonymous: bool,
 ) -> list[Reply]:
     """Answers to the query; a command is authenticated if the session has a certificate."""
-    from coec.adapters.tls.conversation import CommandSender
-    from coec.adapters.zenoh.bus import JSON, MSGPACK
-    from coec.adapters.zenoh.client import myself, query_all
-    from coec.adapters.zenoh.proven import send_authenticated
+    from coec.io.zenoh.bus import JSON, MSGPACK
+    from coec.io.zenoh.command_auth import CommandSender
+    from coec.io.zenoh.query_client import myself, query_all, send_authenticated
 
     selector = _selector(key, _params(key, request))
     credentials = address.credentials
@@ -241,7 +240,7 @@ def _keys(request: Request, address: ServiceAddress) -> Keys:
     Raises:
         UsageError: something does not fit; the message names it.
     """
-    from coec.adapters.zenoh.client import key_expression
+    from coec.io.zenoh.query_client import key_expression
     from coec.schemas.keys import VERSION_CHUNK, Keys
 
     if not math.isfinite(request.timeout_s):
@@ -268,7 +267,7 @@ def _pair_of(session: zenoh.Session, request: Request, keys: Keys, named: str) -
 
 def _resolve(session: zenoh.Session, request: Request, keys: Keys) -> tuple[str, str | None]:
     """The key expression, and the kind of reply, which decides how it is printed (None: as it comes)."""
-    from coec.adapters.zenoh.client import single_key
+    from coec.io.zenoh.query_client import single_key
     from coec.schemas.keys import RIG
 
     head, _, argument = request.key.partition("/")
@@ -288,8 +287,8 @@ def _resolve(session: zenoh.Session, request: Request, keys: Keys) -> tuple[str,
 
 def _only_pair(session: zenoh.Session, request: Request, keys: Keys) -> str:
     """The name of the vehicle's pair, if it has one."""
-    from coec.adapters.zenoh.client import query_one
-    from coec.schemas.base import from_json
+    from coec.io.zenoh.query_client import query_one
+    from coec.schemas.message import from_json
     from coec.schemas.replies import StatusReply
 
     reply = query_one(session, f"{keys.status}?format=json", request.timeout_s)
@@ -301,7 +300,7 @@ def _only_pair(session: zenoh.Session, request: Request, keys: Keys) -> str:
 
 def _params(key: str, request: Request) -> tuple[str, ...]:
     """The given parameters; to a command is added how long its acknowledgement is awaited."""
-    from coec.adapters.zenoh.client import patience_ms
+    from coec.io.zenoh.query_client import patience_ms
 
     given = request.params
     if not _is_command(key) or any(item.startswith("timeout_ms=") for item in given):
@@ -377,7 +376,7 @@ def _value(reply: Reply) -> Any:
     Raises:
         DecodeError: the sender calls it JSON, but it is not.
     """
-    from coec.adapters.zenoh.bus import JSON
+    from coec.io.zenoh.bus import JSON
 
     if reply.encoding.startswith(JSON):
         return _json(reply)
@@ -385,7 +384,7 @@ def _value(reply: Reply) -> Any:
 
 
 def _render(reply: Reply, kind: str | None) -> None:
-    from coec.adapters.zenoh.bus import JSON
+    from coec.io.zenoh.bus import JSON
     from coec.reports import console
     from coec.reports import replies as tables
 
@@ -399,7 +398,7 @@ def _render(reply: Reply, kind: str | None) -> None:
 
 
 def _succeeded(reply: Reply, kind: str | None) -> bool:
-    from coec.schemas.base import from_json
+    from coec.schemas.message import from_json
     from coec.schemas.replies import Acknowledgement
 
     return kind != "command" or from_json(Acknowledgement, reply.payload).accepted
@@ -411,7 +410,7 @@ def _json(reply: Reply) -> Any:
     Raises:
         DecodeError: it is none; says what is wrong with it, whose it is, and what to do.
     """
-    from coec.schemas.base import json_value
+    from coec.schemas.message import json_value
 
     try:
         return json_value(reply.payload)
@@ -425,8 +424,8 @@ def _json(reply: Reply) -> Any:
 
 def _save_picture(request: Request, way: RouterAddress, keys: Keys, path: Path, *, as_json: bool) -> int:
     """Saves `overlay`, or `evidence/ID` with `--param overlay=before`, as a JPEG file."""
-    from coec.adapters.files import output as files
-    from coec.adapters.zenoh.client import connected_by, query_one, single_key
+    from coec.io import user_files as files
+    from coec.io.zenoh.query_client import connected_by, query_one, single_key
     from coec.reports import console
 
     head, _, argument = request.key.partition("/")
@@ -455,8 +454,8 @@ def _save_picture(request: Request, way: RouterAddress, keys: Keys, path: Path, 
 def _download(
     request: Request, way: RouterAddress, keys: Keys, window_id: str, output: Path | None, *, force: bool, as_json: bool
 ) -> int:
-    from coec.adapters.zenoh.client import connected_by, single_key
-    from coec.adapters.zenoh.window_fetch import fetch_window
+    from coec.io.zenoh.query_client import connected_by, single_key
+    from coec.io.zenoh.window_fetch import fetch_window
     from coec.reports import console
 
     if output is None:

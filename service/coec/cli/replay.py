@@ -19,15 +19,15 @@ def replay(
     as_json: Json = False,
 ) -> int:
     """Reproduce the recorded decision from the file alone: exit 1 if a byte of it differs."""
-    from coec.adapters.depth.maps import open_depth
-    from coec.adapters.files.conversions import comparable, result_of
-    from coec.adapters.images.codec import GreyImages
-    from coec.adapters.mcap.windows import read_result, read_window
-    from coec.calibration.calibrator import calibrate
+    from coec.calibration.pipeline import calibrate
     from coec.config import LimitsConfig
+    from coec.io.depth.depth_maps import open_depth
+    from coec.io.images import GreyImages
+    from coec.io.mcap.window_reader import read_result, read_window
+    from coec.io.serialise import comparable, result_of
     from coec.reports import console
-    from coec.reports.stage_times import StageTimes
-    from coec.schemas.base import to_json
+    from coec.reports.progress import StageTimes
+    from coec.schemas.message import to_json
 
     recorded = read_result(window)
     if recorded is None:

@@ -23,9 +23,9 @@ def router(
 ) -> int:
     """Run a Zenoh router for the vehicle, with the access control of its configuration (deploy/router.json5)."""
     with success_on_sigterm():
-        from coec.adapters.system import logs
-        from coec.adapters.system.notify import ServiceManagerNotifier
-        from coec.adapters.zenoh.router import open_router
+        from coec.io import logs
+        from coec.io.system import ServiceManagerNotifier
+        from coec.io.zenoh.session import open_router
 
         logs.configure("info", "auto")
         notifier = ServiceManagerNotifier.from_environment()

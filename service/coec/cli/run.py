@@ -40,10 +40,10 @@ def run(
             os.environ.setdefault(name, "1")
         # Imported after the configuration is read, so that a mistake in it is reported at once.
         from coec import daemon
-        from coec.adapters.system import allocator
+        from coec.io import system
 
-        allocator.limit_arenas()
-        allocator.reuse_frame_memory()
+        system.limit_arenas()
+        system.reuse_frame_memory()
         return daemon.run(loaded, read)
 
 

@@ -35,8 +35,8 @@ def sbom(
     as_json: Json = False,
 ) -> int:
     """List the packages of this installation: a table of licences, with --json a bill of materials (CycloneDX)."""
-    from coec.adapters.files.output import write_output
-    from coec.adapters.system.installed import pinned_hashes
+    from coec.io.installed_packages import pinned_hashes
+    from coec.io.user_files import write_output
     from coec.reports import bill_of_materials, console
 
     hashes = {} if lock is None else pinned_hashes(lock)
@@ -78,7 +78,7 @@ def inventory_here() -> Inventory:
     Raises:
         NotFoundError: coec is not installed as a package, or something it needs is not.
     """
-    from coec.adapters.system.installed import installed_packages
+    from coec.io.installed_packages import installed_packages
     from coec.reports.bill_of_materials import Inventory
 
     packages = installed_packages(APPLICATION)
@@ -88,8 +88,8 @@ def inventory_here() -> Inventory:
 
 def _networks() -> Sequence[Network]:
     """The networks whose file comes with the package."""
-    from coec.adapters.depth.model_cards import CARDS, list_models
-    from coec.adapters.depth.onnx_network import file_identity
+    from coec.io.depth.model_cards import CARDS, list_models
+    from coec.io.depth.onnx_network import file_identity
     from coec.reports.bill_of_materials import Network
 
     networks = []

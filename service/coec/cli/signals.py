@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from coec.exit_codes import ExitCode
+from coec.errors import ExitCode
 
 
 @contextmanager

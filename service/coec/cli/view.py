@@ -24,8 +24,8 @@ from coec.cli.signals import until_signal
 from coec.errors import UsageError
 
 if TYPE_CHECKING:
-    from coec.adapters.foxglove.server import ViewerServer
     from coec.calibration.types import Rig
+    from coec.io.foxglove import ViewerServer
 
 LAYOUT = "deploy/foxglove-layout.json"
 ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]+):(\d{1,5})")
@@ -127,12 +127,12 @@ def _show_vehicle(
         ConnectionFailedError: no router answered.
         UnavailableError: the address cannot be listened on.
     """
-    from coec.adapters.files.rig import rig_of
-    from coec.adapters.zenoh.client import connected_by
     from coec.cli.view_vehicle import VehiclePair, show_live
     from coec.config import load_config
-    from coec.runtime.nominal.kept import with_discovered
+    from coec.io.rig_files import rig_of
+    from coec.io.zenoh.query_client import connected_by
     from coec.schemas.keys import Keys
+    from coec.service.discovery import with_discovered
 
     config = with_discovered(load_config(file))
     pair, limits = pair_named(config, name), config.limits
@@ -159,8 +159,8 @@ def _show_recording(
         UnavailableError: the address cannot be listened on.
     """
     from coec.cli.view_recording import Playback, load_candidate, show_recording
+    from coec.io.recordings.layouts import open_source
     from coec.reports import console
-    from coec.sources import open_source
 
     recording = open_source(source)
     candidate = None if result is None else load_candidate(result)
@@ -181,14 +181,14 @@ def _show_recording(
 
 
 def _screen(address: ListenAddress, rig: Rig) -> ViewerServer:
-    from coec.adapters.foxglove.server import ViewerServer
+    from coec.io.foxglove import ViewerServer
 
     return ViewerServer(address.host, address.port, f"coec {rig.pair}", rig.camera)
 
 
 def _announce(screen: ViewerServer, rig: Rig, shown: str, *, as_json: bool) -> None:
     """Prints where viewers are served, and what."""
-    from coec.adapters.foxglove.topics import DisplayedPose, frame_of, topics_for
+    from coec.io.viewer_scene import DisplayedPose, frame_of, topics_for
     from coec.reports import console
 
     if as_json:

@@ -13,24 +13,32 @@ from typing import Final
 
 import numpy as np
 
-from coec.adapters.files.conversions import degrees_or_null, matrix_of
-from coec.adapters.foxglove.server import ViewerServer
-from coec.adapters.foxglove.shown import TitledExtrinsic, picture_of
-from coec.adapters.foxglove.timeline import NOT_SERVED, RECORDED, SILENT, PoseAxes, TimelineEntry, TimelineFigure
-from coec.adapters.foxglove.topics import PICTURE_TOPICS, DisplayedPose
-from coec.adapters.zenoh.cadence import repeated
-from coec.adapters.zenoh.player import shifted
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.config import LimitsConfig, PairingConfig
 from coec.errors import DecodeError, SourceError
 from coec.geometry import se3
 from coec.geometry.se3 import is_rigid
-from coec.schemas.base import from_json
+from coec.io.foxglove import ViewerServer
+from coec.io.recordings.layouts import RecordingSource
+from coec.io.recordings.window_cutting import RECORDED_GAP_S
+from coec.io.serialise import degrees_or_null, matrix_of
+from coec.io.user_files import read_bytes
+from coec.io.viewer_scene import (
+    NOT_SERVED,
+    PICTURE_TOPICS,
+    RECORDED,
+    SILENT,
+    DisplayedPose,
+    PoseAxes,
+    TimelineEntry,
+    TimelineFigure,
+    TitledExtrinsic,
+    picture_of,
+)
+from coec.io.zenoh.player import repeated, shifted
+from coec.schemas.message import from_json
 from coec.schemas.replies import CalibrationResult, MetricReply
-from coec.sources import RecordingSource
-from coec.sources.reading import read_bytes
-from coec.sources.windows import RECORDED_GAP_S
 
 NS_PER_S = 1_000_000_000
 

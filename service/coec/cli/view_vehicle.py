@@ -14,24 +14,33 @@ from typing import TypeVar
 
 import zenoh
 
-from coec.adapters.files.conversions import matrix_of
-from coec.adapters.foxglove.server import ViewerServer
-from coec.adapters.foxglove.shown import PairPicture, TitledExtrinsic, picture_of
-from coec.adapters.foxglove.timeline import NOT_SERVED, SILENT, MissedFrames, StreamAges, TimelineEntry
-from coec.adapters.foxglove.topics import PICTURE_TOPICS, DisplayedPose
-from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import StreamInput, input_of
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.cli.view_recording import EXPLANATIONS, STALE, axes_of, figures_of
 from coec.config import Config, PairConfig
 from coec.errors import DecodeError
 from coec.geometry.se3 import is_rigid
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
-from coec.runtime.ingest.inbox import Inbox, Parcel
-from coec.schemas.base import from_msgpack
+from coec.io.foxglove import ViewerServer
+from coec.io.logs import LossCounter
+from coec.io.serialise import matrix_of
+from coec.io.viewer_scene import (
+    NOT_SERVED,
+    PICTURE_TOPICS,
+    SILENT,
+    DisplayedPose,
+    MissedFrames,
+    PairPicture,
+    StreamAges,
+    TimelineEntry,
+    TitledExtrinsic,
+    picture_of,
+)
+from coec.io.zenoh.bus import StreamInput, input_of
 from coec.schemas.keys import Keys
+from coec.schemas.message import from_msgpack
 from coec.schemas.replies import AxisReply, ExtrinsicReply, HealthReply, Transform
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
+from coec.service.ingest.intake import Inbox, Parcel
 
 REPEAT_S = 1.0
 """Time between two lines of the timeline while nothing changes."""

@@ -92,12 +92,12 @@ def _lens_model(pair: PairConfig | OpenPairConfig) -> str | None:
 def _compile(lenses: Sequence[str]) -> int:
     """Runs every kernel once; returns how many there are."""
     from coec.config import Config
-    from coec.geometry import compile_news
+    from coec.geometry import compilation_events
     from coec.reports import console
-    from coec.reports.stage_times import StageTimes
-    from coec.runtime.worker.kernels import compiled
-    from coec.runtime.worker.second_compiler import second_compiler
-    from coec.runtime.worker.tasks import Solver
+    from coec.reports.progress import StageTimes
+    from coec.service.worker.compilation import compiled
+    from coec.service.worker.second_compiler import second_compiler
+    from coec.service.worker.tasks import Solver
 
     config = Config.model_validate({"pairs": list(_pairs(lenses))})
     total = compiled(len(lenses)).total
@@ -107,7 +107,7 @@ def _compile(lenses: Sequence[str]) -> int:
         def report(_: str) -> None:
             times.step("compiling kernels", compiled(len(lenses)).done, total)
 
-        with compile_news.listening(report), second_compiler(config):
+        with compilation_events.listening(report), second_compiler(config):
             Solver(config, 1).warm_up()
     return total
 

@@ -19,7 +19,7 @@ from coec.errors import UsageError
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.adapters.zenoh.changes import PairUpdate
+    from coec.io.zenoh.subscriptions import PairUpdate
 
 EVERY_VEHICLE = "*"
 
@@ -91,7 +91,7 @@ def _print_changes(address: ServiceAddress, seconds: float | None, timeout_s: fl
     Raises:
         ConnectionFailedError: no router answered.
     """
-    from coec.adapters.zenoh.client import connected_by
+    from coec.io.zenoh.query_client import connected_by
 
     received = 0
     connection = connected_by(address.way, timeout_s)
@@ -112,9 +112,9 @@ def _print_changes(address: ServiceAddress, seconds: float | None, timeout_s: fl
 @contextmanager
 def _changes(session: zenoh.Session, address: ServiceAddress, timeout_s: float) -> Iterator[queue.Queue[PairUpdate]]:
     """The present state, and every change from then on."""
-    from coec.adapters.zenoh.changes import subscribed
+    from coec.io.zenoh.subscriptions import subscribed
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
     from coec.schemas.keys import Keys
 
     waiting: queue.Queue[PairUpdate] = queue.Queue(WAITING)
@@ -139,9 +139,9 @@ def _changes(session: zenoh.Session, address: ServiceAddress, timeout_s: float) 
 def _write(change: PairUpdate, vehicle: str, *, as_json: bool) -> None:
     """Prints a change: for people with the time, and with its vehicle."""
     from coec.reports import console
-    from coec.reports.instants import second
-    from coec.runtime.worker import compilation
+    from coec.reports.formatting import second
     from coec.schemas.replies import HealthReply
+    from coec.service.worker import compilation
 
     value, pair = change.value, f"{vehicle}/{change.pair}"
     if as_json:

@@ -4,37 +4,9 @@
 `CalibrationConfig`, ...), so that each default exists once. Import from this package, not from its modules.
 """
 
-from coec.config.authority import AuthorityConfig, SenderConfig
-from coec.config.base import IDENTITY, FilePath, Matrix4x4, Name, describe
-from coec.config.decisions import MonitorConfig, PolicyConfig
-from coec.config.links import LinkConfig
-from coec.config.metrics import MetricsConfig, is_loopback
-from coec.config.pair import OpenPairConfig, PairConfig
-from coec.config.reading import config_of, load_config
-from coec.config.ros import RosConfig, RosOutput
-from coec.config.service import (
-    BudgetConfig,
-    LidarEdgesConfig,
-    LimitsConfig,
-    LogConfig,
-    SnippetsConfig,
-    StateConfig,
-    WorkerConfig,
-    ZenohConfig,
-)
-from coec.config.stages import (
-    MAX_SLICE_S,
-    CalibrationConfig,
-    DepthConfig,
-    ObjectiveConfig,
-    PairingConfig,
-    SearchConfig,
-    TimeOffsetConfig,
-    TrackerConfig,
-    VerdictConfig,
-    WindowConfig,
-)
-from coec.config.streams import (
+from coec.config.loading import MAX_YAML_BYTES, config_of, load_config, load_yaml, parse_yaml
+from coec.config.model import IDENTITY, FilePath, Matrix4x4, Name, describe
+from coec.config.pair import (
     AnyStreamConfig,
     CameraConfig,
     CameraIntrinsics,
@@ -46,6 +18,8 @@ from coec.config.streams import (
     LidarMessage,
     OpenEgoConfig,
     OpenLidarConfig,
+    OpenPairConfig,
+    PairConfig,
     PointTimeConfig,
     StreamConfig,
     SweepConfig,
@@ -53,9 +27,39 @@ from coec.config.streams import (
     TimeUnit,
     TopicName,
 )
-from coec.config.uplink import UplinkConfig
-from coec.config.whole import Config, config_hash
-from coec.config.yaml_text import MAX_YAML_BYTES, load_yaml, parse_yaml
+from coec.config.rig import LinkConfig
+from coec.config.root import Config, config_hash
+from coec.config.service import (
+    AuthorityConfig,
+    BudgetConfig,
+    LidarEdgesConfig,
+    LimitsConfig,
+    LogConfig,
+    MetricsConfig,
+    RosConfig,
+    RosOutput,
+    SenderConfig,
+    SnippetsConfig,
+    StateConfig,
+    UplinkConfig,
+    WorkerConfig,
+    ZenohConfig,
+    is_loopback,
+)
+from coec.config.stages import (
+    MAX_SLICE_S,
+    CalibrationConfig,
+    DepthConfig,
+    MonitorConfig,
+    ObjectiveConfig,
+    PairingConfig,
+    PolicyConfig,
+    SearchConfig,
+    TimeOffsetConfig,
+    TrackerConfig,
+    VerdictConfig,
+    WindowConfig,
+)
 
 __all__ = [
     "IDENTITY",

@@ -1,25 +1,281 @@
-"""One camera-LiDAR pair: its streams, the poses between them, and the stages of its calibration."""
+"""One camera-LiDAR pair: its streams of images, clouds and ego-motion, the poses between its sensors, and the stages
+of its calibration.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from coec.config.base import ConfigModel, Matrix4x4, Name
-from coec.config.decisions import MonitorConfig, PolicyConfig
-from coec.config.stages import CalibrationConfig, PairingConfig, TrackerConfig, WindowConfig
-from coec.config.streams import (
-    AnyStreamConfig,
-    CameraConfig,
-    EgoConfig,
-    KnownStreamConfig,
-    LidarConfig,
-    OpenCameraConfig,
-    OpenEgoConfig,
-    OpenLidarConfig,
+from coec.config.model import IDENTITY, ConfigModel, FilePath, KeyExpression, Matrix4x4, Name
+from coec.config.stages import (
+    CalibrationConfig,
+    MonitorConfig,
+    PairingConfig,
+    PolicyConfig,
+    TrackerConfig,
+    WindowConfig,
 )
+
+ROS_NAMES = {
+    "plumb_bob": "radtan",
+    "rational_polynomial": "rational",
+    "equidistant": "kannala_brandt",
+    "fisheye": "kannala_brandt",
+    "ds": "double_sphere",
+    "cata": "mei",
+}
+"""Models of lenses by the names that ROS (sensor_msgs/distortion_models.hpp), OpenCV and Kalibr have for them."""
+
+
+class CameraIntrinsics(ConfigModel):
+    """Intrinsics of a camera; `model` determines which of the optional parameters are needed. The names are those of
+    `dataset.yaml`."""
+
+    model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"] = Field(
+        description="model of the lens"
+    )
+    width: int = Field(gt=0, le=16384, description="image width, px")
+    height: int = Field(gt=0, le=16384, description="image height, px")
+    fx: float = Field(gt=0, description="focal length, px")
+    fy: float = Field(gt=0, description="focal length, px")
+    cx: float = Field(description="principal point, px; pixel centres at integers")
+    cy: float = Field(description="principal point, px; pixel centres at integers")
+    xi: float | None = Field(
+        default=None, description="shift of the second sphere (double_sphere) or of the mirror (mei)"
+    )
+    alpha: float | None = Field(default=None, description="from pinhole to sphere (double_sphere, eucm), 0 to 1")
+    beta: float | None = Field(default=None, description="form of the ellipsoid (eucm)")
+    k1: float | None = Field(default=None, description="radial (radtan, rational, mei); of θ³ (kannala_brandt)")
+    k2: float | None = Field(default=None, description="radial (radtan, rational, mei); of θ⁵ (kannala_brandt)")
+    k3: float | None = Field(default=None, description="radial (radtan, rational); of θ⁷ (kannala_brandt)")
+    k4: float | None = Field(default=None, description="radial, below the fraction (rational); of θ⁹ (kannala_brandt)")
+    k5: float | None = Field(default=None, description="radial, below the fraction (rational)")
+    k6: float | None = Field(default=None, description="radial, below the fraction (rational)")
+    p1: float | None = Field(default=None, description="tangential (radtan, rational, mei)")
+    p2: float | None = Field(default=None, description="tangential (radtan, rational, mei)")
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _name_of_ros(cls, name: Any) -> Any:
+        return ROS_NAMES.get(name, name) if isinstance(name, str) else name
+
+    def parameters(self) -> dict[str, float]:
+        """The intrinsics that were given, by name, without `model`."""
+        return self.model_dump(exclude={"model"}, exclude_none=True)
+
+
+class SweepConfig(ConfigModel):
+    """Azimuth timing of a spinning LiDAR without per-point time: a point at azimuth a was measured
+    `sign · wrap(a - stamp_azimuth_deg) / 360°` revolutions after the stamp."""
+
+    period_s: float = Field(default=0.1, gt=0, le=10, description="one revolution, s")
+    sign: Literal[-1, 1] = Field(default=-1, description="-1 clockwise seen from above, 1 counter-clockwise")
+    stamp_azimuth_deg: float = Field(default=0.0, ge=-360, le=360, description="azimuth of the LiDAR at the stamp")
+
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+TimeBase = Literal["stamp", "clock"]
+
+
+class PointTimeConfig(ConfigModel):
+    """How the points of a `PointCloud2` are timed, for clouds whose values do not show it."""
+
+    field: str = Field(min_length=1, max_length=64, description="name of the field with the time")
+    unit: TimeUnit = Field(description="unit of its values")
+    base: TimeBase = Field(
+        default="stamp", description="stamp: times since the cloud's stamp; clock: times on the clock of the stamp"
+    )
+
+
+Encoding = Literal["msgpack", "cdr"]
+
+TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$", max_length=247)]
+"""A full ROS 2 topic name (rmw/validate_full_topic_name.h)."""
+
+CameraMessage = Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"]
+LidarMessage = Literal["sensor_msgs/msg/PointCloud2"]
+EgoMessage = Literal[
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/TwistStamped",
+    "geometry_msgs/msg/TwistWithCovarianceStamped",
+    "sensor_msgs/msg/Imu",
+    "tf2_msgs/msg/TFMessage",
+]
+
+
+class StreamConfig(ConfigModel):
+    """Where the samples of a stream come from; a text in its place is short for `topic`."""
+
+    key: KeyExpression | None = Field(default=None, description="Zenoh key of the frames")
+    topic: TopicName | None = Field(
+        default=None,
+        description="ROS 2 topic, given instead of `key` unless `middleware` is native; its frames are CDR",
+    )
+    encoding: Encoding = Field(default="msgpack", description="assumed when a sample names no encoding")
+
+    @property
+    def place(self) -> str:
+        """The key or the topic, as it was configured."""
+        return self.key or self.topic or ""
+
+    @property
+    def sensor(self) -> str:
+        """The sensor's name in every pair that it belongs to: `name`, or `place` if it has none."""
+        return str(getattr(self, "name", None) or self.place)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _completed(cls, document: Any) -> Any:
+        """A text is the name of a topic, and frames on topics are CDR."""
+        if isinstance(document, str):
+            document = {"topic": document}
+        if isinstance(document, dict) and document.get("topic") is not None:
+            if document.get("encoding", "cdr") != "cdr":
+                raise ValueError("what comes on a topic is CDR: leave `encoding` out")
+            document = {**document, "encoding": "cdr"}
+        return document
+
+    @model_validator(mode="after")
+    def _key_or_topic(self) -> Self:
+        if (self.key is None) == (self.topic is None):
+            raise ValueError("give `key`, a key of Zenoh, or `topic`, a name of ROS 2 that begins with /: one of them")
+        return self
+
+
+class OpenCameraConfig(StreamConfig):
+    """Camera stream of a pair that may leave out the camera's calibration, to be found on ROS 2 topics."""
+
+    name: Name | None = Field(default=None, description="name of the camera, the same in all its pairs; `links` use it")
+
+    frame_id: str | None = Field(default=None, max_length=128, description="images with another frame id are refused")
+    type: CameraMessage | None = Field(
+        default=None,
+        description="type of CDR messages that do not name theirs; by default CompressedImage, or Image on a topic "
+        "whose name does not end with /compressed. If set, a topic's messages must have this type",
+    )
+    intrinsics: CameraIntrinsics | None = Field(default=None, description="intrinsics of the images as they come")
+    info_topic: TopicName | None = Field(
+        default=None,
+        description="topic of the `CameraInfo` that gives omitted intrinsics; by default `camera_info` beside the "
+        "images",
+    )
+    mask: FilePath | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
+    hardware_id: str | None = Field(
+        default=None, max_length=128, description="serial number of the camera, for ROS diagnostics; null: vehicle/pair"
+    )
+
+    @property
+    def assumed_type(self) -> CameraMessage:
+        """The type of messages that do not name theirs."""
+        if self.type is not None:
+            return self.type
+        is_raw = self.topic is not None and not self.topic.endswith("/compressed")
+        return "sensor_msgs/msg/Image" if is_raw else "sensor_msgs/msg/CompressedImage"
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """The message types that this stream accepts."""
+        return _types(CameraMessage, self.type if self.topic else None)
+
+
+class CameraConfig(OpenCameraConfig):
+    """Camera stream of a pair."""
+
+    frame_id: str = Field(default="camera", max_length=128, description="images with another frame id are refused")
+    intrinsics: CameraIntrinsics
+
+
+class OpenLidarConfig(StreamConfig):
+    """LiDAR stream of a pair that may leave out the LiDAR's frames, to be found on ROS 2 topics."""
+
+    name: Name | None = Field(default=None, description="name of the LiDAR, the same in all its pairs; `links` use it")
+
+    frame_id: str | None = Field(
+        default=None, max_length=128, description="frame of the LiDAR; clouds with another frame id are refused"
+    )
+    T_cloud_lidar: Matrix4x4 | None = Field(
+        default=None, description="pose of the LiDAR in the frame of the points that its driver sends"
+    )
+    cloud_frame_id: str | None = Field(
+        default=None, max_length=128, description="frame of the clouds as they come, if it is not the LiDAR's"
+    )
+    source: int | None = Field(
+        default=None,
+        ge=-(2**31),
+        lt=2**32,
+        description="if a cloud holds several LiDARs: this one's number in the field that tells them apart (lidar_id, "
+        "sensor_id, source_id, device_id or source)",
+    )
+    sweep: SweepConfig | None = Field(default=None, description="needed for clouds without per-point time")
+    time: PointTimeConfig | None = Field(
+        default=None, description="time of the points of ROS clouds; by default recognised from the values"
+    )
+
+    @property
+    def assumed_type(self) -> LidarMessage:
+        """The type of messages that do not name theirs."""
+        return "sensor_msgs/msg/PointCloud2"
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """The message types that this stream accepts."""
+        return _types(LidarMessage, None)
+
+
+class LidarConfig(OpenLidarConfig):
+    """LiDAR stream of a pair."""
+
+    frame_id: str = Field(
+        default="lidar", max_length=128, description="frame of the LiDAR; clouds with another frame id are refused"
+    )
+    T_cloud_lidar: Matrix4x4 = Field(
+        default=IDENTITY, description="pose of the LiDAR in the frame of the points that its driver sends"
+    )
+
+
+class OpenEgoConfig(StreamConfig):
+    """Ego-motion stream of a pair that may leave out the pose of its frame, to be found on ROS 2 topics."""
+
+    type: EgoMessage | None = Field(
+        default=None,
+        description="type of CDR messages that do not name theirs; by default Odometry. If set, a topic's messages "
+        "must have this type",
+    )
+    T_lidar_ego: Matrix4x4 | None = Field(default=None, description="maps ego-frame to LiDAR coordinates")
+    parent: str = Field(
+        default="odom", min_length=1, max_length=128, description="frame in which the vehicle moves (TFMessage)"
+    )
+    child: str = Field(
+        default="base_link", min_length=1, max_length=128, description="frame of the vehicle (TFMessage)"
+    )
+
+    @property
+    def assumed_type(self) -> EgoMessage:
+        """The type of messages that do not name theirs."""
+        return self.type or "nav_msgs/msg/Odometry"
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """The message types that this stream accepts."""
+        return _types(EgoMessage, self.type if self.topic else None)
+
+
+class EgoConfig(OpenEgoConfig):
+    """Ego-motion stream of a pair."""
+
+    T_lidar_ego: Matrix4x4 = Field(default=IDENTITY, description="maps ego-frame to LiDAR coordinates")
+
+
+AnyStreamConfig = OpenCameraConfig | OpenLidarConfig | OpenEgoConfig
+KnownStreamConfig = CameraConfig | LidarConfig | EgoConfig
+
+
+def _types(known: Any, only: str | None) -> tuple[str, ...]:
+    """The values of a `Literal`, or only the one that was configured."""
+    return get_args(known) if only is None else (only,)
 
 
 class OpenPairConfig(ConfigModel):

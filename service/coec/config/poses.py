@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.config.base import Matrix4x4
+from coec.config.model import Matrix4x4
 from coec.geometry import cameras, se3
 
 VIEW_DISTANCE_M = 15.0

@@ -1,13 +1,18 @@
-"""The process itself: limits, state, worker, session, log."""
+"""The process and its interfaces: limits, state directory, worker, processor budget, log, Zenoh session, ROS 2 output,
+metrics over HTTP, uplink, and who may give commands.
+"""
 
 from __future__ import annotations
 
+import ipaddress
+import re
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from coec.config.base import ConfigModel, FilePath
+from coec.config.model import ConfigModel, FilePath
+from coec.schemas.commands import COMMAND_NAMES, CommandName
 
 
 class LimitsConfig(ConfigModel):
@@ -155,4 +160,149 @@ class LogConfig(ConfigModel):
     )
     format: Literal["auto", "json", "human"] = Field(
         default="auto", description="auto: human on a terminal, else JSON lines"
+    )
+
+
+CommonName = Annotated[str, Field(pattern=r"^[A-Za-z0-9 ._:/@+=,-]{1,64}$")]
+"""Common name of a certificate; X.509 allows 64 characters."""
+
+
+class SenderConfig(ConfigModel):
+    """A sender who may give commands, known by the common name of its certificate."""
+
+    name: CommonName = Field(description="common name of the certificate")
+    commands: tuple[CommandName, ...] = Field(
+        default=COMMAND_NAMES, min_length=1, description="commands that this sender may give; all unless listed"
+    )
+
+
+class AuthorityConfig(ConfigModel):
+    """Who may give commands, whatever the router lets through. A router does not tell the service who asks. A sender
+    proves its name to the service itself, with a certificate signed by `root_ca`, in a TLS conversation inside the
+    query (`coec query command/...` does this); a router in between can only hold such a command back. Senders without
+    proof are `anonymous`. `loopback` accepts their commands while the session listens and connects on loopback only and
+    the router's port is open on no other address. The service cannot see whether the router listens elsewhere, too. If
+    it does, the router's own access control decides who gets in there; `never` refuses all anonymous commands."""
+
+    anonymous: Literal["never", "loopback", "always"] = Field(
+        default="loopback", description="when the service takes commands from senders without proof"
+    )
+    senders: tuple[SenderConfig, ...] = Field(default=(), max_length=64, description="who may give which commands")
+    certificate: FilePath | None = Field(
+        default=None, description="certificate of the service; its common name is the vehicle's name"
+    )
+    private_key: FilePath | None = Field(default=None, description="private key of `certificate`")
+    root_ca: FilePath | None = Field(default=None, description="authority that signed the senders' certificates")
+
+    @model_validator(mode="after")
+    def _provable(self) -> AuthorityConfig:
+        given = [path is not None for path in (self.certificate, self.private_key, self.root_ca)]
+        if any(given) != all(given):
+            raise ValueError("certificate, private_key and root_ca belong together: give all three or none")
+        if self.senders and not all(given):
+            raise ValueError("senders prove their names to the service: give certificate, private_key and root_ca, too")
+        names = [sender.name for sender in self.senders]
+        if len(set(names)) != len(names):
+            raise ValueError("names of senders must be unique")
+        return self
+
+
+class MetricsConfig(ConfigModel):
+    """HTTP for a scraper on the same computer: `/metrics` (OpenMetrics if asked for, else Prometheus text), `/health`
+    (200, or 503 when a calibration is not known to be right) and `/live` (200 while the service makes progress).
+    Everybody who reaches the address can read; nobody can change anything."""
+
+    http: str | None = Field(default=None, description="HOST:PORT, such as 127.0.0.1:9464; null: no HTTP")
+    insecure: bool = Field(default=False, description="allow addresses other than loopback; health says so")
+
+    @property
+    def address(self) -> tuple[str, int] | None:
+        """Host, without brackets, and port; None: no HTTP."""
+        if self.http is None:
+            return None
+        host, _, port = self.http.rpartition(":")
+        return host.removeprefix("[").removesuffix("]"), int(port)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether other computers can reach it."""
+        return self.address is not None and not is_loopback(self.address[0])
+
+    @model_validator(mode="after")
+    def _validate_address(self) -> MetricsConfig:
+        if self.http is None:
+            return self
+        if not re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]+):\d{1,5}", self.http) or not 0 < self._port < 65536:
+            raise ValueError(f"http: {self.http!r} is no HOST:PORT: write 127.0.0.1:9464")
+        if self.is_open and not self.insecure:
+            raise ValueError(
+                f"http: whoever reaches {self.http} would read the metrics, without a certificate: listen on loopback, "
+                "as 127.0.0.1:9464, or set `metrics.insecure: true`, and health will say so"
+            )
+        return self
+
+    @property
+    def _port(self) -> int:
+        return 0 if self.address is None else self.address[1]
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer can reach an address (without brackets). Of names, only `localhost` counts: any other
+    could resolve to any address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+RosOutput = Literal["diagnostics", "tf_static", "camera_info", "overlay"]
+
+
+class RosConfig(ConfigModel):
+    """ROS 2 on the bus, used if `middleware` is `rmw_zenoh` or `ros2dds`."""
+
+    domain: int = Field(default=0, ge=0, le=232, description="ROS_DOMAIN_ID (rmw_zenoh)")
+    namespace: str = Field(
+        default="",
+        pattern=r"^(/?[A-Za-z_][A-Za-z0-9_]*)*$",
+        max_length=128,
+        description="namespace of the bridge, if it has one (ros2dds)",
+    )
+    publish: tuple[RosOutput, ...] = Field(
+        default=(), description="what is published to ROS nodes: diagnostics, tf_static, camera_info, overlay"
+    )
+    calibrated_suffix: str = Field(
+        default="_calibrated",
+        pattern=r"^[A-Za-z0-9_]+$",
+        max_length=64,
+        description="added to the camera's frame id to name the published frame, as the vehicle's own tree has the "
+        "camera's frame",
+    )
+    replace_camera_frames: bool = Field(
+        default=False,
+        description="publish the camera's own frame instead; then nobody else may, because a frame has one parent",
+    )
+
+    @model_validator(mode="after")
+    def _unique_outputs(self) -> RosConfig:
+        if len(set(self.publish)) != len(self.publish):
+            raise ValueError("publish names something twice")
+        return self
+
+
+class UplinkConfig(ConfigModel):
+    """Limits for the link to a fleet centre, often a modem that others need, too. The service does not know who asks,
+    so that it meters queries from the vehicle itself alike."""
+
+    last_word_s: float = Field(
+        default=60.0,
+        ge=1.0,
+        le=86_400.0,
+        description="period at which each pair publishes its last word, one kilobyte, even if nothing has changed",
+    )
+    evidence_bytes_per_s: int = Field(
+        default=1_000_000,
+        ge=1_000,
+        description="long-run limit for history, red events, pictures and bytes of windows; beyond it the service asks "
+        "the reader to wait",
     )

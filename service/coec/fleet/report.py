@@ -1,28 +1,60 @@
-"""The report on a fleet from many windows: drift of every pair, refusals and their reasons, and differences from
-another batch."""
+"""The report on a fleet from many windows: drift of every pair, refusals and their reasons, false alarms, and
+differences from another batch.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from coec.fleet.alarms import false_alarms
-from coec.fleet.questions import WINDOWS_VIEW, connect, create_view
-from coec.fleet.tables import NAMELESS
+from coec.calibration.baseline import poisson_most
+from coec.fleet.tables import NAMELESS, WINDOWS_VIEW, connect, create_view
 from coec.schemas.fleet import (
     AXES,
     SEEN,
     ChangedWindow,
     DayOfPair,
+    FalseAlarms,
     FigureOfFleet,
     FleetChanges,
+    FleetNow,
     FleetReport,
     PairOfFleet,
 )
-from coec.schemas.fleet_now import FleetNow
-from coec.schemas.replies import Maybe6
+from coec.schemas.heartbeat import LastWord
+from coec.schemas.replies import Alarms, Maybe6
+
+S_PER_H = 3600.0
+
+CONFIDENCE = 0.95
+"""Confidence of the upper bound on the rate."""
+
+
+def false_alarms(heartbeats: Iterable[LastWord]) -> FalseAlarms:
+    """False alarms of all pairs together. Pairs whose word has no counts, because they are awaited, are left out."""
+    counted = [
+        (f"{heartbeat.vehicle}/{heartbeat.pair}", heartbeat.alarms)
+        for heartbeat in heartbeats
+        if heartbeat.alarms is not None
+    ]
+    watched_h = sum(alarms.watched_s for _, alarms in counted) / S_PER_H
+    withdrawn = sum(alarms.withdrawn for _, alarms in counted)
+    return FalseAlarms(
+        pairs=len(counted),
+        watched_h=watched_h,
+        confirmed=sum(alarms.confirmed for _, alarms in counted),
+        withdrawn=withdrawn,
+        per_100_h=100.0 * withdrawn / watched_h if watched_h > 0.0 else None,
+        per_100_h_at_most=100.0 * poisson_most(CONFIDENCE, withdrawn) / watched_h if watched_h > 0.0 else None,
+        by_pair={name: alarms.withdrawn for name, alarms in sorted(counted, key=_most_first) if alarms.withdrawn},
+    )
+
+
+def _most_first(entry: tuple[str, Alarms]) -> tuple[int, str]:
+    return -entry[1].withdrawn, entry[0]
+
 
 REPORT_TABLE, EARLIER_VIEW = "read", "before"
 """Names of the table with the columns that a report needs, and of the view of the batch to compare with."""

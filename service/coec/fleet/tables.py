@@ -1,21 +1,38 @@
-"""Writes rows as Parquet files in folders by date and vehicle, as DuckDB, Spark and pandas read them."""
+"""The tables of a batch: writes rows as Parquet files in folders by date and vehicle, as DuckDB, Spark and pandas read
+them, and queries them with SQL. The libraries for both are the optional extra `fleet`.
+"""
 
 from __future__ import annotations
 
 import io
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from coec.adapters.files import output
-from coec.errors import SourceError
-from coec.fleet.extra import optional_library
-from coec.schemas.base import to_json
+from coec.errors import SourceError, UsageError
+from coec.io import user_files
 from coec.schemas.fleet import AXES, WindowRow
+from coec.schemas.message import to_json
 from coec.schemas.replies import Maybe6, Maybe6x6
+
+
+def optional_library(name: str) -> Any:
+    """A module of the extra.
+
+    Raises:
+        SourceError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise SourceError(
+            "tables of many windows need the optional extra `fleet`: pip install 'coec[fleet]'"
+        ) from error
+
 
 NS_PER_S = 1_000_000_000
 
@@ -85,7 +102,7 @@ def write_tables(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
     for row in rows:
         groups[_partition(row)].append(row)
     for partition, group in sorted(groups.items()):
-        output.replace_output(folder / partition / f"{name}.parquet", _parquet(group))
+        user_files.replace_output(folder / partition / f"{name}.parquet", _parquet(group))
 
 
 def tabulated_urls(folder: Path) -> set[str]:
@@ -187,3 +204,71 @@ def _correlation(noise: Maybe6x6) -> list[float | None]:
         for a, line in enumerate(noise)
         for b, covariance in enumerate(line)
     ]
+
+
+WINDOWS_VIEW = "windows"
+"""Name of the view. It has one row per window, with `date` and `vehicle` from the folders."""
+
+EXAMPLE_QUERIES: Mapping[str, str] = {
+    "Which vehicles have drifted most in pitch over the last weeks?": f"""
+SELECT vehicle, pair, max_by(rx_deg, time) - min_by(rx_deg, time) AS drift_deg, count(*) AS windows
+FROM {WINDOWS_VIEW} WHERE accepted GROUP BY ALL ORDER BY abs(drift_deg) DESC LIMIT 20""",
+    "Why are windows refused, and where?": f"""
+SELECT reason, count(*) AS windows, count(DISTINCT vehicle) AS vehicles
+FROM (SELECT vehicle, unnest(reason_codes) AS reason FROM {WINDOWS_VIEW} WHERE NOT accepted)
+GROUP BY ALL ORDER BY windows DESC""",
+    "Which windows could not be judged?": f"""
+SELECT error_code, count(*) AS windows, any_value(url) AS for_example, any_value(error) AS says
+FROM {WINDOWS_VIEW} WHERE error IS NOT NULL GROUP BY ALL ORDER BY windows DESC""",
+    "Where does the cloud decide otherwise than the vehicle did?": f"""
+SELECT vehicle, window_id, accepted, url FROM {WINDOWS_VIEW} WHERE recorded_decision <> decision ORDER BY time""",
+    "What do the figures of accepted windows look like over the fleet?": f"""
+SELECT figure.key AS figure, quantile_cont(figure.value, [0.005, 0.5, 0.995]) AS spread, count(*) AS windows
+FROM (SELECT unnest(map_entries(figures)) AS figure FROM {WINDOWS_VIEW} WHERE accepted) GROUP BY ALL ORDER BY ALL""",
+    "How long does a window take, by version?": f"""
+SELECT versions['coec'] AS version, median(seconds) AS s, quantile_cont(seconds, 0.99) AS s_99, count(*) AS windows
+FROM {WINDOWS_VIEW} WHERE error IS NULL GROUP BY ALL ORDER BY ALL""",
+}
+"""Example queries, by the question that each answers."""
+
+
+def connect(folder: Path) -> Any:
+    """A connection (`duckdb.DuckDBPyConnection`) with the view `windows` over the tables of a batch.
+
+    Raises:
+        UsageError: there are no tables.
+        SourceError: the optional extra is not installed.
+    """
+    connection = optional_library("duckdb").connect(":memory:", config={"autoinstall_known_extensions": "false"})
+    create_view(connection, WINDOWS_VIEW, folder)
+    return connection
+
+
+def create_view(connection: Any, name: str, folder: Path) -> None:
+    """Creates a view over the tables of another batch.
+
+    Raises:
+        UsageError: there are no tables.
+    """
+    if next(folder.glob("date=*/vehicle=*/*.parquet"), None) is None:
+        raise UsageError(f"{folder} holds no tables of a batch (date=.../vehicle=.../*.parquet): coec batch makes them")
+    connection.execute(view_statement(name, folder))
+
+
+def view_statement(name: str, folder: Path) -> str:
+    """SQL that creates a view over the tables of a batch. Names of vehicles stay text, even 007."""
+    pattern = str(folder / "date=*" / "vehicle=*" / "*.parquet").replace("'", "''")
+    return (
+        f"CREATE VIEW {name} AS SELECT * FROM read_parquet('{pattern}', hive_partitioning = true, "
+        "hive_types = {'date': VARCHAR, 'vehicle': VARCHAR})"
+    )
+
+
+def columns(folder: Path) -> list[tuple[str, str]]:
+    """Name and type of every column.
+
+    Raises:
+        UsageError, SourceError: as `ask`.
+    """
+    described = connect(folder).execute(f"DESCRIBE {WINDOWS_VIEW}").fetchall()
+    return [(str(name), str(kind)) for name, kind, *_ in described]

@@ -1,7 +1,7 @@
 """Mutual information between LiDAR ranges and depth maps over all frames of a window: equation (1) of Borer et al.
-2023.
+2023, and the conversion of values to the numbers of their bins.
 
-    MI = H(f^P) + H(f^D) - H(f^P, f^D)
+MI = H(f^P) + H(f^D) - H(f^P, f^D)
 
 per frame, from the joint histogram of the points that fall on a pixel with a value. Both features arrive here as bin
 indices that stay the same for a whole search: the range of a point does not depend on the pose, and depth maps are
@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera
-from coec.geometry.compiler import PRANGE, njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange, prefetch
 from coec.geometry.culling import BUNDLE, NEVER_OUT, Bundles
-from coec.geometry.pixel_lookup import NOT_IN_IMAGE, UNSURE, Certainty, certain_pixels, exact_pixel, filter_of
-from coec.geometry.prefetch import prefetch
+from coec.geometry.projection import NOT_IN_IMAGE, UNSURE, Certainty, certain_pixels, exact_pixel, filter_of
 
 TASK = 32 * BUNDLE
 """Points per parallel task: small enough to balance two to sixteen threads over a handful of frames, and large enough
@@ -299,3 +298,38 @@ def _informations(
         for f in range(shape[1]):
             mi[k, f], points[k, f] = mi_of_pose[f], points_of_pose[f]
     return mi, points
+
+
+def share_of_pixels(
+    values: NDArray[np.float32], usable: NDArray[np.bool_], edges: NDArray[np.float32]
+) -> NDArray[np.unsignedinteger]:
+    """(h·w + 1,): for each pixel, row by row, how many of the ascending edges (n,) its value reaches, 0 to n. It is n +
+    1 for a pixel that is not `usable`, and in the last entry, which stands for points outside of the map (h, w).
+
+    The type is the narrowest that holds n + 1, because look-ups are bound by the cache.
+    """
+    none = len(edges) + 1
+    share: NDArray[np.unsignedinteger] = np.empty(values.size + 1, np.uint8 if none < 256 else np.uint16)
+    share.fill(none)
+    _count_reached(values, usable, edges, share)
+    return share
+
+
+@njit(cache=True, parallel=PRANGE)
+def _count_reached(
+    values: NDArray[np.float32],
+    usable: NDArray[np.bool_],
+    edges: NDArray[np.float32],
+    share: NDArray[np.unsignedinteger],
+) -> None:
+    """Fills `share` (h·w + 1,) at the usable pixels."""
+    h, w = values.shape
+    for y in prange(h):
+        row, reached = values[y], np.zeros(w, np.uint16)
+        # The loop over the pixels is the inner one, so that it runs in vector registers.
+        for edge in edges:
+            for x in range(w):
+                reached[x] += np.uint16(row[x] >= edge)
+        for x in range(w):
+            if usable[y, x]:
+                share[y * w + x] = reached[x]

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import degrees, isfinite
 
-from coec.adapters.files.baseline_file import baseline_hash
-from coec.calibration.commissioning.baseline import Baseline
+from coec.calibration.baseline import Baseline
 from coec.calibration.figures import FIGURES
 from coec.config import VerdictConfig
-from coec.reports.evaluation_documents import in_degrees
+from coec.io.baseline_file import baseline_hash
+from coec.reports.formatting import count, number, percent, significant
 from coec.reports.page import Block, Cell, Facts, Page, Section, Table, Text, VerdictBanner
-from coec.reports.page.words import count, number, percent, significant
 from coec.reports.page_parts import axes_table
 from coec.reports.provenance import Provenance
+from coec_lab.experiments.evaluation_documents import in_degrees
 
 CHECK_PAIRS = 6
 """Number of pairs in the check whose spread is shown."""

@@ -12,7 +12,7 @@ from datetime import datetime
 from itertools import groupby
 from typing import Any
 
-from coec.adapters.system.installed import NativeLibrary, Package
+from coec.io.installed_packages import NativeLibrary, Package
 
 SPEC_VERSION = "1.6"
 NOT_STATED = "not stated"

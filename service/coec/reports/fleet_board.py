@@ -1,16 +1,19 @@
-"""A fleet on one screen: the most urgent pairs, and the details of one of them."""
+"""The board of `coec watch`: the fleet in a line, a row per pair, and a picture in half blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from coec.config import LimitsConfig
+from coec.io.images import decode_bgr, probe
 from coec.reports import console
-from coec.reports.page.words import count
-from coec.schemas.fleet_now import FleetNow, PairNow
+from coec.reports.formatting import count
+from coec.schemas.fleet import FleetNow, PairNow
 
 KEYS = "↑↓ choose   r reasons   h history   o overlay   f filter   q quit"
 """The keys that can be pressed."""
@@ -118,3 +121,31 @@ def _row(pair: PairNow, *, marked: bool) -> tuple[RenderableType, ...]:
         Text(", ".join(console.plain(reason.code) for reason in word.reasons), overflow="ellipsis", no_wrap=True),
         Text(console.plain(word.event or "")),
     )
+
+
+LIMITS = LimitsConfig(max_message_bytes=16 * 2**20, max_image_pixels=33_000_000)
+"""Limits of a picture that came over a network."""
+
+
+def half_block_text(jpeg: bytes, columns: int, rows: int) -> Text:
+    """The picture in at most so many characters, with its proportions kept.
+
+    Raises:
+        DecodeError: it cannot be decoded, or is larger than a picture may be.
+    """
+    pixels = decode_bgr(probe(jpeg, LIMITS), LIMITS)
+    height, width = pixels.shape[:2]
+    scale = min(columns / width, 2 * rows / height)
+    size = (max(round(width * scale), 1), max(round(height * scale / 2), 1) * 2)
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    text = Text(no_wrap=True)
+    for upper, lower in zip(small[::2], small[1::2], strict=True):
+        for above, below in zip(upper, lower, strict=True):
+            text.append("▀", f"{_colour(above)} on {_colour(below)}")
+        text.append("\n")
+    return text
+
+
+def _colour(bgr: object) -> str:
+    blue, green, red = (int(value) for value in bgr)  # type: ignore[attr-defined]
+    return f"#{red:02x}{green:02x}{blue:02x}"

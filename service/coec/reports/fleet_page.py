@@ -7,9 +7,8 @@ from datetime import datetime
 from math import inf
 
 from coec.reports.console import figure
-from coec.reports.instants import day
+from coec.reports.formatting import NONE, count, day, percent
 from coec.reports.page import Block, Cell, Page, Section, Table, Text, Trend, VerdictBanner
-from coec.reports.page.words import NONE, count, percent
 from coec.reports.provenance import Provenance
 from coec.schemas.fleet import AXES, FalseAlarms, FleetChanges, FleetReport, PairOfFleet
 

@@ -7,30 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
+from coec.reports.charts import Chart, Ground, Mark, Series
 from coec.reports.console import AXIS_NAMES, UNITS, figure
-from coec.reports.instants import NS_PER_S, second
-from coec.reports.page import (
-    Block,
-    Cell,
-    Chart,
-    Charts,
-    Ground,
-    Mark,
-    Page,
-    Picture,
-    Pictures,
-    Section,
-    Series,
-    Table,
-    Text,
-    Tone,
-    VerdictBanner,
-)
-from coec.reports.page.words import count
+from coec.reports.formatting import NS_PER_S, count, second
+from coec.reports.page import Block, Cell, Charts, Page, Picture, Pictures, Section, Table, Text, Tone, VerdictBanner
 from coec.reports.page_parts import TONES, advice_of, axis_value, title_of
 from coec.reports.provenance import Provenance
 from coec.reports.replies import entry_text
-from coec.schemas.incident import Absent, FetchedWindow, IncidentReport
+from coec.schemas.documents import Absent, FetchedWindow, IncidentReport
 from coec.schemas.replies import (
     CalibrationResult,
     ChainedEntry,

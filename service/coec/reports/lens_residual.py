@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coec.geometry.cameras import Camera, name_of
 from coec.geometry.cameras.double_sphere_fit import residual
 from coec.geometry.projection import project, unproject
-from coec.reports.canvas import DPI, bgr_of, box
+from coec.reports.close_ups import DPI, bgr_of, box
 
 SAMPLES = 200
 """Samples along the longer side of the image; so few suffice because a lens is a smooth function."""

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images.range_colours import NEAREST_M, RangeScale, scale_of
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import Camera
-from coec.geometry.in_view import points_in_view
+from coec.geometry.projection import points_in_view
+from coec.io.images import NEAREST_M, RangeScale, scale_of
 
 MIN_WIDTH_PX = 960
 """Narrower images are enlarged by a whole factor, so that the title is legible."""

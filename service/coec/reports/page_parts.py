@@ -15,6 +15,7 @@ from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.errors import OutputError
 from coec.geometry import se3
 from coec.reports.console import AXIS_NAMES, UNITS
+from coec.reports.formatting import number, significant, size
 from coec.reports.page import (
     AxesTable,
     AxisLine,
@@ -25,7 +26,6 @@ from coec.reports.page import (
     Picture,
     Tone,
 )
-from coec.reports.page.words import number, significant, size
 from coec.schemas.replies import MetricReply, Reason, Transform
 
 TONES: Mapping[str, Tone] = {

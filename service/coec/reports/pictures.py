@@ -9,17 +9,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.output import write_output
-from coec.adapters.images.codec import decode_bgr, encode_jpeg, encode_png
-from coec.adapters.images.range_colours import NEAREST_M, scale_of
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import FramePair, Matrix4, Window
 from coec.calibration.verdict import saw_one_scene
 from coec.config import LimitsConfig
 from coec.geometry.cameras import Camera
-from coec.geometry.in_view import points_in_view
+from coec.geometry.projection import points_in_view
+from coec.io.images import NEAREST_M, decode_bgr, encode_jpeg, encode_png, scale_of
+from coec.io.user_files import write_output
 from coec.reports.close_ups import Caption, close_ups, difference_text
-from coec.reports.instants import instant
+from coec.reports.formatting import instant
 from coec.reports.lens_residual import lens_residual
 from coec.reports.overlay import render_points, titled
 from coec.reports.page import Block, Compare, Picture, Pictures, Text

@@ -1,4 +1,6 @@
-"""Progress on standard error: bars in a terminal, elsewhere a line now and then, so that no wait is silent."""
+"""Progress on standard error: bars in a terminal, elsewhere a line now and then, so that no wait is silent; and how
+long the stages of a calibration took.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from coec.geometry import compile_news
+from coec.geometry import compilation_events
 from coec.untrusted import printable
 
 LINE_S = 30.0
@@ -90,7 +92,7 @@ class Bars(Progress):
         self._reported_s = now_s()
         self._news = CompilationProgress(now_s)
         self._listening: AbstractContextManager[None] = (
-            compile_news.listening(self._on_kernel) if compiling else nullcontext()
+            compilation_events.listening(self._on_kernel) if compiling else nullcontext()
         )
         self._compiling: TaskID | None = None
         count = (MofNCompleteColumn(),) if counted else ()
@@ -155,3 +157,28 @@ class Bars(Progress):
             return False
         self._reported_s = self._now_s()
         return True
+
+
+class StageTimes:
+    """Progress bars and the seconds that each stage took. A stage ends with its last step."""
+
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
+        self._tasks: dict[str, TaskID] = {}
+        self._mark_s = self._start_s = time.perf_counter()
+        self._elapsed_s: dict[str, float] = {}
+
+    def step(self, stage: str, done: int, total: int) -> None:
+        """See `ports.Progress`. A search has no total: its number of evaluations is unknown until it ends."""
+        now_s = time.perf_counter()
+        self._elapsed_s[stage] = self._elapsed_s.get(stage, 0.0) + now_s - self._mark_s
+        self._mark_s = now_s
+        if stage not in self._tasks:
+            open_end = stage == "search"
+            self._tasks[stage] = self._bars.add_task(stage, total=None if open_end else total, note="")
+        note = f"{done} evaluations" if stage == "search" else ""
+        self._bars.update(self._tasks[stage], completed=done, note=note)
+
+    def elapsed_s(self) -> dict[str, float]:
+        """Seconds by stage, and in `total`."""
+        return {**self._elapsed_s, "total": time.perf_counter() - self._start_s}

@@ -14,10 +14,10 @@ from functools import cache
 from importlib.metadata import version
 
 from coec import __version__
-from coec.adapters.depth.maps import PRECOMPUTED
-from coec.adapters.depth.model_cards import built_in_cards
 from coec.calibration.types import FramePair, Window
-from coec.reports.instants import second
+from coec.io.depth.depth_maps import PRECOMPUTED
+from coec.io.depth.model_cards import built_in_cards
+from coec.reports.formatting import second
 from coec.reports.page import Facts, Section
 
 CALCULATING = ("numpy", "numba", "nlopt", "onnxruntime")

@@ -8,7 +8,7 @@ from typing import Final, Literal, get_args
 
 from pydantic import Field
 
-from coec.schemas.base import Message
+from coec.schemas.message import Message
 
 CommandName = Literal["calibrate", "apply", "rollback", "reset", "commission", "hold"]
 """Commands of CONTRACT."""

@@ -1,13 +1,18 @@
-"""Documents about many windows that were judged again: a row for each window, and a summary of the batch.
+"""Documents about many vehicles: a row for each window that was evaluated again, the summary of a batch, the report on
+a fleet, and the state of a fleet at this moment (`coec watch --once --json`). Angles in degrees, lengths in metres,
+axes rx ry rz tx ty tz about and along the camera axes.
 
 Angles in degrees, lengths in metres, axes rx ry rz tx ty tz about and along the camera axes.
 """
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
-from coec.schemas.base import Message, Part, Text
+from coec.schemas.heartbeat import LastWord
+from coec.schemas.message import Message, Part, Text
 from coec.schemas.replies import CalibrationResult, Count, Counts, Maybe6
 
 AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
@@ -141,3 +146,31 @@ class FleetReport(Message):
     figures: tuple[FigureOfFleet, ...]
     changes: FleetChanges | None = Field(default=None, description="with --against")
     false_alarms: FalseAlarms | None = Field(default=None, description="with --now")
+
+
+Connectivity = Literal["live", "parked", "silent"]
+
+
+class PairNow(Part):
+    """A pair of a vehicle. Nothing in it is newer than its last word; ages are counted up to now."""
+
+    word: LastWord
+    standing: Connectivity = Field(
+        description="`live`: its last word is current; `parked`: it said goodbye; `silent`: it is overdue, or its "
+        "vehicle left without a goodbye, and the state shown is the last known one"
+    )
+    said_s: float = Field(ge=0, description="age of its last word, s")
+    looked_s: float | None = Field(description="age of its last evaluated data, s; null before the first")
+    worst: Literal["rx", "ry", "rz", "tx", "ty", "tz"] | None = Field(description="axis that drifted furthest")
+    urgency: float = Field(ge=0, description="drift of that axis, in steps that a monitor has to detect")
+
+
+class FleetNow(Message):
+    """Pairs of many vehicles, the most urgent first."""
+
+    vehicles: Count
+    known: Count = Field(description="pairs with a last word")
+    states: Counts = Field(description="live pairs by state; the others as `parked` and `silent`")
+    matching: Count = Field(description="pairs that the filter lets through")
+    pairs: tuple[PairNow, ...] = Field(description="the first of the matching pairs")
+    refused: Counts = Field(description="last words that were refused, by cause")

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from coec.schemas.base import Message, Part
+from coec.schemas.message import Message, Part
 
 END_OF_ROS_TIME_NS = 2**31 * 10**9
 """The header of a ROS message holds seconds as int32: a later stamp could not be recorded."""

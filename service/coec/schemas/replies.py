@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part, Text
+from coec.schemas.message import Message, Part, Text
 
 Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from coec.schemas.base import Message, Part, Text
+from coec.schemas.message import Message, Part, Text
 from coec.schemas.replies import Count, Counts, Maybe6x6, Reason, Transform, Vector6
 
 SensorKind = Literal["camera", "lidar"]

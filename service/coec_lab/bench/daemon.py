@@ -22,8 +22,6 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from coec.adapters.files.rig import intrinsics_config
-from coec.adapters.zenoh.client import connected, query_one
 from coec.config import (
     BudgetConfig,
     CalibrationConfig,
@@ -36,9 +34,11 @@ from coec.config import (
     ZenohConfig,
 )
 from coec.errors import ConnectionFailedError, NotFoundError
-from coec.runtime.worker import jobs
-from coec.runtime.worker.child import PACKAGE_ROOT
+from coec.io.rig_files import intrinsics_config
+from coec.io.zenoh.query_client import connected, query_one
 from coec.schemas.keys import Keys
+from coec.service.worker import worker_jobs
+from coec.service.worker.child_process import PACKAGE_ROOT
 from coec_lab.bench import scene, sensors
 from coec_lab.bench.processes import ProcessReading
 
@@ -75,7 +75,7 @@ pairs wait for the budget, and a minute shows how long."""
 READING_S = 1.0
 """Driving time between two readings of the age of each pair's latest check."""
 
-KINDS = (jobs.Kind.CHECK.value, jobs.Kind.SOLVE.value, jobs.PREFETCH)
+KINDS = (worker_jobs.Kind.CHECK.value, worker_jobs.Kind.SOLVE.value, worker_jobs.PREFETCH)
 """Kinds of work that the worker does for the streams."""
 
 

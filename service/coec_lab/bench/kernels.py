@@ -15,22 +15,22 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.images.codec import CachedGreys, GreyImages
-from coec.calibration.calibrator import calibrate
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.objective.mutual_information import MutualInformation, SearchBox
+from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import box_of, maximise
 from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
 from coec.geometry import se3
 from coec.geometry.mutual_information import mutual_information
-from coec.geometry.plain_forms import by_numpy, by_scalar_loop
-from coec.reports.stage_times import StageTimes
-from coec.sources import windows
+from coec.io.depth.depth_maps import open_depth
+from coec.io.images import CachedGreys, GreyImages
+from coec.io.recordings import window_cutting
+from coec.reports.progress import StageTimes
 from coec_lab.bench import scene
+from coec_lab.bench.reference_kernels import by_numpy, by_scalar_loop
 
 FRAMES = 25
 TURNS = 6
@@ -110,7 +110,7 @@ def measure(bars: Progress, size: Size) -> dict[str, Any]:
         times.append(time.perf_counter() - begin)
     document["solve_10deg_3dof_s"] = min(times)
     document["solve_10deg_3dof_evaluations"] = optimum.evaluations
-    document["solve_10deg_3dof_error_deg"] = windows.rotation_error_deg(optimum.T_camera_lidar, scene.T_TRUE)
+    document["solve_10deg_3dof_error_deg"] = window_cutting.rotation_error_deg(optimum.T_camera_lidar, scene.T_TRUE)
     document |= measure_checks(lambda text: bars.update(task, description=text))
     return document | measure_fused(bars, size.street, size.few_repeats)
 
@@ -118,9 +118,9 @@ def measure(bars: Progress, size: Size) -> dict[str, Any]:
 def measure_fused(bars: Progress, street: str = STREET, repeats: int = 3) -> dict[str, Any]:
     """The figures of a fused solve with six degrees of freedom, without depth inference: its time, and the error of its
     end. The first run may compile."""
-    loaded = windows.load_window(street, None, WindowConfig().pairs, lambda *_: None)
+    loaded = window_cutting.load_window(street, None, WindowConfig().pairs, lambda *_: None)
     xi = np.array([*np.radians(FAR_START_DEG), 0.0, 0.0, 0.0])
-    window = windows.with_perturbed_start(loaded.window, xi)
+    window = window_cutting.with_perturbed_start(loaded.window, xi)
     configuration = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=30.0))
     depth = open_depth(configuration.depth, LimitsConfig())
     seconds = []
@@ -129,7 +129,7 @@ def measure_fused(bars: Progress, street: str = STREET, repeats: int = 3) -> dic
         estimate = calibrate(window, depth, GreyImages(LimitsConfig()), configuration, times)
         elapsed = times.elapsed_s()
         seconds.append(elapsed["total"] - sum(elapsed.get(stage, 0.0) for stage in NOT_OF_A_SOLVE))
-    error_deg = windows.rotation_error_deg(estimate.optimum.T_camera_lidar, window.rig.T_camera_lidar_nominal)
+    error_deg = window_cutting.rotation_error_deg(estimate.optimum.T_camera_lidar, window.rig.T_camera_lidar_nominal)
     return {"solve_25deg_6dof_s": min(seconds), "solve_25deg_6dof_error_deg": error_deg}
 
 
@@ -141,7 +141,9 @@ def measure_checks(on_step: Callable[[str], None]) -> dict[str, Any]:
     off_deg: dict[str, float] = {}
     for side, camera in SIDES_PX.items():
         on_step(f"a check at {side} px")
-        window = windows.load_window(f"sim:{CHECK_DRIVE}&camera={camera}", None, CHECK_PAIRS, lambda *_: None).window
+        window = window_cutting.load_window(
+            f"sim:{CHECK_DRIVE}&camera={camera}", None, CHECK_PAIRS, lambda *_: None
+        ).window
         spent_s, observation = _check(window)
         right = not (observation.flagged or observation.weak or observation.causes)
         spent[side] = 1e3 * spent_s if right else None

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from coec.adapters.files.rig import intrinsics_config
-from coec.adapters.mcap.windows import WindowWriter, read_window
 from coec.calibration.types import FramePair
 from coec.config import (
     CalibrationConfig,
@@ -29,10 +27,13 @@ from coec.config import (
     StateConfig,
 )
 from coec.errors import CalibrationError
-from coec.runtime.ingest.frame_budget import frame_bytes
-from coec.runtime.worker import jobs
-from coec.runtime.worker.jobs import JobOutcome
-from coec.runtime.worker.supervisor import Worker, WorkerState
+from coec.io.mcap.window_reader import read_window
+from coec.io.mcap.window_writer import WindowWriter
+from coec.io.rig_files import intrinsics_config
+from coec.service.ingest.frame_buffers import frame_bytes
+from coec.service.worker import worker_jobs
+from coec.service.worker.supervisor import Worker, WorkerState
+from coec.service.worker.worker_jobs import JobOutcome
 from coec_lab.bench import scene
 
 BYTES_PER_MB = 1e6
@@ -155,7 +156,7 @@ def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
         idle_mb = process.resident_mb
         process.reset_peak()
         begin = time.perf_counter()
-        worker.submit(jobs.solve(name, window, window.stem, outcomes.put))
+        worker.submit(worker_jobs.solve(name, window, window.stem, outcomes.put))
         _await_result(outcomes)
         solve_s, peak_mb = time.perf_counter() - begin, process.peak_mb
     return {
@@ -172,7 +173,7 @@ def _first_result_s(name: str, window: Path, config: Config) -> float:
     pairs = read_window(window)[0].pairs[: pair.monitor.pairs]
     with _worker(config) as worker:
         begin = time.perf_counter()
-        check = jobs.check(name, pair.calibration, scene.T_TRUE, pairs, outcomes.put)
+        check = worker_jobs.check(name, pair.calibration, scene.T_TRUE, pairs, outcomes.put)
         worker.submit(replace(check, deadline_s=TIMEOUT_S))
         worker.start()
         _await_result(outcomes)

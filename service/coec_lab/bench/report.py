@@ -16,8 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from coec.reports import console
-from coec.simulation.source import require_extra
 from coec_lab.bench import daemon, kernels, processes
+from coec_lab.simulation.source import require_extra
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images.codec import encode_jpeg
 from coec.calibration.objective.mutual_information import (
     Features,
     MutualInformation,
@@ -22,6 +21,7 @@ from coec.config import ObjectiveConfig
 from coec.geometry.cameras import Camera, build, name_of, scaled
 from coec.geometry.mutual_information import BinnedFrames
 from coec.geometry.projection import unproject
+from coec.io.images import encode_jpeg
 
 POINTS, BEAMS = 114_000, 64
 """Usual number of points, and beams, of a sweep, as of the LiDAR of KITTI and KITTI-360."""

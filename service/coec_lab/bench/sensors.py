@@ -13,14 +13,13 @@ from dataclasses import dataclass, replace
 
 import zenoh
 
-from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
-from coec.adapters.ros import messages, outgoing
-from coec.adapters.ros.wire.qos import SENSOR_DATA
-from coec.adapters.ros.wire.rmw_zenoh import Node, RmwZenoh
-from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.geometry.cameras import Camera
+from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.io.ros import message_encoding, messages
+from coec.io.ros.wire_format import SENSOR_DATA, Node, RmwZenoh
+from coec.io.zenoh.query_client import connected
+from coec.io.zenoh.ros_node import RosNode, RosPublishers
 from coec_lab.bench import scene
 
 Frame = CameraFrame | LidarFrame | EgoMotion
@@ -139,11 +138,11 @@ def _ros(session: zenoh.Session, load: Load) -> Send:
         del index
         match frame:
             case CameraFrame():
-                streams["camera"].put(outgoing.encode_image(frame)[1], frame.stamp_ns)
+                streams["camera"].put(message_encoding.encode_image(frame)[1], frame.stamp_ns)
             case LidarFrame():
-                streams["lidar"].put(outgoing.encode_cloud(frame), frame.stamp_ns)
+                streams["lidar"].put(message_encoding.encode_cloud(frame), frame.stamp_ns)
             case EgoMotion():
-                streams["ego"].put(outgoing.encode_motion(frame)[1], frame.stamp_ns)
+                streams["ego"].put(message_encoding.encode_motion(frame)[1], frame.stamp_ns)
 
     return send
 

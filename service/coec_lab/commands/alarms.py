@@ -23,12 +23,13 @@ def alarms(
     """Estimate false-alarm rate and detection delay of the monitor from simulated checks."""
     from pydantic import ValidationError
 
-    from coec.adapters.files import output as files
     from coec.config import MonitorConfig, describe
     from coec.errors import UsageError
-    from coec.evaluation.alarms import measured
-    from coec.reports import alarm_reports, console
-    from coec.schemas.base import to_json
+    from coec.io import user_files as files
+    from coec.reports import console
+    from coec.schemas.message import to_json
+    from coec_lab.experiments import alarm_statistics
+    from coec_lab.experiments.alarm_statistics import measured
 
     try:
         config = MonitorConfig(period_s=period_s, hours_between_false_alarms=between_h)
@@ -37,12 +38,12 @@ def alarms(
     with console.progress() as bars:
         task = bars.add_task("streams of checks", total=None, note="")
         figures = measured(config, hours, steps, lambda done, total: bars.update(task, completed=done, total=total))
-    report = alarm_reports.document_of(figures)
+    report = alarm_statistics.document_of(figures)
     if output is not None:
         files.write_output(output / "alarms.json", to_json(report))
-        files.write_output(output / "delay.png", alarm_reports.delay_curve(report))
+        files.write_output(output / "delay.png", alarm_statistics.delay_curve(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
-        alarm_reports.show(report)
+        alarm_statistics.show(report)
     return 0

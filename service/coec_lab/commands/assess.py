@@ -12,13 +12,13 @@ import typer
 from coec.cli.options import Frames, Json, Source
 
 if TYPE_CHECKING:
-    from coec.calibration.estimators import WindowData
     from coec.calibration.ports import DepthModel
+    from coec.calibration.solver import WindowData
     from coec.calibration.types import Window
-    from coec.evaluation.depth_quality import DepthQuality
-    from coec.evaluation.experiments import Stages
-    from coec.schemas.evaluation import Maybe3, ModelAssessment
     from coec.schemas.replies import Vector3
+    from coec_lab.experiments.depth_quality import DepthQuality
+    from coec_lab.experiments.evaluation_schema import Maybe3, ModelAssessment
+    from coec_lab.experiments.solve_experiments import Stages
 
 STAGES = 3
 """Steps that an assessment reports."""
@@ -39,25 +39,25 @@ def assess(
     as_json: Json = False,
 ) -> int:
     """Compare a depth network with the LiDAR of a calibrated recording: exit 1 if it is of no use there."""
-    from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
-    from coec.adapters.files import output as files
-    from coec.adapters.images.codec import GreyImages
-    from coec.calibration.estimators import prepare_window_data
     from coec.calibration.ports import Silence
+    from coec.calibration.solver import prepare_window_data
     from coec.calibration_options import SolverOptions, configuration_of
     from coec.config import LimitsConfig, WindowConfig
-    from coec.evaluation import depth_quality
-    from coec.evaluation.experiments import Stages
+    from coec.io import user_files as files
+    from coec.io.depth.depth_maps import STEREO, CachedDepth, open_depth
+    from coec.io.images import GreyImages
+    from coec.io.recordings import window_cutting
     from coec.reports import console
-    from coec.schemas.base import to_json
-    from coec.sources import windows
+    from coec.schemas.message import to_json
+    from coec_lab.experiments import depth_quality
+    from coec_lab.experiments.solve_experiments import Stages
 
     if output is not None:
         files.try_folder(output)
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
-        loaded = windows.load_window(source, frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        loaded = window_cutting.load_window(source, frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         window = loaded.window
         configuration = configuration_of(SolverOptions(depth=model, objective="mi", dof=3), loaded.configuration)
         depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
@@ -102,22 +102,19 @@ def _infer(window: Window, depth: DepthModel, stages: Stages) -> list[float | No
 
 
 def _write_pictures(folder: Path, model: str, data: WindowData, quality: DepthQuality) -> None:
-    from coec.adapters.files import output as files
-    from coec.adapters.images.codec import decode_bgr
     from coec.config import LimitsConfig
-    from coec.evaluation import depth_quality
-    from coec.reports import depth_plots
+    from coec.io import user_files as files
+    from coec.io.images import decode_bgr
+    from coec_lab.experiments import depth_quality, plots
 
     name = f"{Path(model).name} on {data.window.window_id}"
     _, sentence = depth_quality.suitability(quality)
-    files.write_output(
-        folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames")
-    )
-    files.write_output(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
+    files.write_output(folder / "joint.png", plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames"))
+    files.write_output(folder / "curves.png", plots.curves(quality, f"{name}\n{sentence}"))
     index = len(data.window.pairs) // 2
     frame, pairing = data.window.pairs[index].camera, quality.pairings[index]
     title = f"{name}, frame at {frame.stamp_ns} ns: rank correlation {pairing.rank_correlation:+.2f}"
-    picture = depth_plots.frame(decode_bgr(frame.image, LimitsConfig()), data.depth.infer(frame).values, pairing, title)
+    picture = plots.frame(decode_bgr(frame.image, LimitsConfig()), data.depth.infer(frame).values, pairing, title)
     files.write_output(folder / "frame.png", picture)
 
 
@@ -132,9 +129,9 @@ def _report(
     """The report of a network and a source, by their `names`."""
     import numpy as np
 
-    from coec.evaluation import depth_quality
-    from coec.reports.evaluation_documents import number
-    from coec.schemas.evaluation import DepthFrame, ModelAssessment
+    from coec_lab.experiments import depth_quality
+    from coec_lab.experiments.evaluation_documents import number
+    from coec_lab.experiments.evaluation_schema import DepthFrame, ModelAssessment
 
     suitability, sentence = depth_quality.suitability(quality)
     timed = [value for value in times_ms if value is not None]
@@ -173,7 +170,7 @@ def _report(
 
 def _show(report: ModelAssessment) -> None:
     from coec.reports import console
-    from coec.reports.page.words import count
+    from coec.reports.formatting import count
 
     console.show(f"{Path(report.model).name} on {report.window_id}: {count(report.pairs, 'pair')}")
     console.show(report.verdict, STYLES[report.suitability])

@@ -9,22 +9,22 @@ from typing import cast
 
 import numpy as np
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.files import output
 from coec.calibration.types import Matrix4
 from coec.calibration_options import SolverOptions
 from coec.config import LimitsConfig, WindowConfig
-from coec.evaluation import experiments
-from coec.evaluation.closure import Between, Closure, Solve, between, close
-from coec.evaluation.experiments import Bench, Stages
 from coec.geometry import se3
-from coec.library.evaluating import Plan, configuration_of
-from coec.reports import console, evaluation_tables
-from coec.reports.evaluation_documents import closure_of, in_degrees
-from coec.schemas.base import to_json
-from coec.schemas.evaluation import ClosureReport
+from coec.io import user_files
+from coec.io.depth.depth_maps import open_depth
+from coec.io.recordings import window_cutting
+from coec.reports import console
+from coec.schemas.message import to_json
 from coec.schemas.replies import Vector6
-from coec.sources import windows
+from coec_lab.experiments import evaluation_tables, solve_experiments
+from coec_lab.experiments.closure import Between, Closure, Solve, between, close
+from coec_lab.experiments.evaluation_documents import closure_of, in_degrees
+from coec_lab.experiments.evaluation_run import Plan, configuration_of
+from coec_lab.experiments.evaluation_schema import ClosureReport
+from coec_lab.experiments.solve_experiments import Bench, Stages
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +65,12 @@ def run(request: ClosureRequest, folder: Path | None, *, as_json: bool) -> int:
     document = _report(request, bench_a, known, closures, stages.elapsed_s())
     if folder is not None:
         # matplotlib takes a second to import.
-        from coec.reports import evaluation_pictures
+        from coec_lab.experiments import evaluation_pictures
 
         name = f"closure of {bench_a.window.window_id} and {bench_b.window.window_id}"
         of_frames = {f"closure on {closure.frames.value}": closure.normalised for closure in closures}
         evaluation_pictures.write_normalised(folder, name, of_frames)
-        output.write_output(folder / "report.json", to_json(document))
+        user_files.write_output(folder / "report.json", to_json(document))
     if as_json:
         console.print_json(document.model_dump(mode="json"))
     else:
@@ -84,20 +84,20 @@ def relative_of(text: str) -> Matrix4:
     Raises:
         UsageError: the text is not three or six finite numbers.
     """
-    return se3.perturbation(windows.parse_perturbation("--relative", text))
+    return se3.perturbation(window_cutting.parse_perturbation("--relative", text))
 
 
 def _bench(request: ClosureRequest, source: str, name: str, stages: Stages) -> Bench:
     load = stages.begin(f"load {name}", None)
-    loaded = windows.load_window(source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+    loaded = window_cutting.load_window(source, request.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
     configuration = configuration_of(request.plan, request.choices, loaded.configuration)
     model = open_depth(configuration.depth, LimitsConfig())
-    depth = experiments.inferred(loaded.window, model, stages.begin(f"depth {name}", len(loaded.window.pairs)))
-    return Bench(loaded.window, depth, experiments.greys_of(loaded.window), configuration)
+    depth = solve_experiments.inferred(loaded.window, model, stages.begin(f"depth {name}", len(loaded.window.pairs)))
+    return Bench(loaded.window, depth, solve_experiments.greys_of(loaded.window), configuration)
 
 
 def _solves(bench: Bench, plan: Plan) -> Solve:
-    poses = experiments.poses_of(bench, plan.directions, plan.rotation_deg, plan.translation_m)
+    poses = solve_experiments.poses_of(bench, plan.directions, plan.rotation_deg, plan.translation_m)
     return lambda trial, frames: bench.solve(poses[trial], frames)
 
 

@@ -9,25 +9,24 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coec.adapters.files.output import require_absent, write_output
-from coec.adapters.files.rig import mask_to_png
-from coec.adapters.mcap.bag_writer import write_bag, write_messages
-from coec.adapters.ros import messages, outgoing
-from coec.adapters.ros.outgoing import PlacedFrame
-from coec.adapters.ros.sensor_topics import SensorTopics, image_topic, points_topic
-from coec.adapters.ros.topics import Frame, TopicMessage
 from coec.calibration.types import CameraFrame
-from coec.cli.rig_configuration import vehicle_of
 from coec.errors import OutputError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.se3 import inverse
+from coec.io.mcap.bag_writer import write_bag, write_messages
+from coec.io.rig_files import mask_to_png
+from coec.io.ros import message_encoding, messages
+from coec.io.ros.message_encoding import PlacedFrame
+from coec.io.ros.topics import Frame, SensorTopics, TopicMessage, image_topic, points_topic
+from coec.io.user_files import require_absent, write_output
 from coec.reports import console
-from coec.reports.page.words import count
-from coec.simulation.source import open_rig, open_sim
+from coec.reports.formatting import count
+from coec_lab.commands.rig_play import vehicle_of
+from coec_lab.simulation.source import open_rig, open_sim
 
 if TYPE_CHECKING:
-    from coec.simulation.drive import SimulatedDrive
-    from coec.simulation.rig_drive import RigDrive
+    from coec_lab.simulation.drive import SimulatedDrive
+    from coec_lab.simulation.rig_drive import RigDrive
 
 MOST_PROCESSES = 4
 """Most processes, because each keeps its own street in memory."""
@@ -82,7 +81,7 @@ def write_pair(options: DriveOptions, output: Path, *, force: bool, as_json: boo
         raise UsageError(f"{output}: the drive is written as a ROS 2 bag, its name must end in .mcap")
     require_absent(output, force=force)
     simulated = open_sim(options.query())
-    from coec.simulation.parallel import messages_by
+    from coec_lab.simulation.parallel import messages_by
 
     pictures = len(simulated.camera_stamps_ns)
     part = output.with_name(f"{output.name}.part")
@@ -147,7 +146,7 @@ def write_rig(options: DriveOptions, folder: Path, *, force: bool, as_json: bool
     companions = [folder / name for camera in simulated.cameras for name in (f"{camera}_mask.png", f"{camera}.yaml")]
     require_absent(folder / BAG, *companions, force=force)
     present = {path for path in companions if path.exists()}
-    from coec.simulation.parallel import messages_by
+    from coec_lab.simulation.parallel import messages_by
 
     total = sum(entry.stream != 0 for entry in simulated.plan)
     path, part = folder / BAG, folder / f"{BAG}.part"
@@ -222,7 +221,9 @@ def _truth_of_rig(simulated: RigDrive, stamp_ns: int) -> bytes:
     """True poses of all sensors in the vehicle, and of the vehicle in the world."""
     sensors = (*simulated.lidars, *simulated.cameras)
     placed = [PlacedFrame("ego", name, inverse(simulated.T_sensor_ego(name, stamp_ns))) for name in sensors]
-    return outgoing.encode_transforms([PlacedFrame("world", "ego", simulated.true_pose(stamp_ns)), *placed], stamp_ns)
+    return message_encoding.encode_transforms(
+        [PlacedFrame("world", "ego", simulated.true_pose(stamp_ns)), *placed], stamp_ns
+    )
 
 
 def _truth_of_pair(simulated: SimulatedDrive, frame: Frame) -> list[tuple[str, str, bytes]]:
@@ -230,6 +231,6 @@ def _truth_of_pair(simulated: SimulatedDrive, frame: Frame) -> list[tuple[str, s
         return []
     stamp_ns, rig = frame.stamp_ns, simulated.rig
     of_world = replace(rig, camera_frame="world", lidar_frame="ego")
-    extrinsic = outgoing.encode_tf_static(rig, simulated.truth(stamp_ns), stamp_ns)
-    pose = outgoing.encode_tf_static(of_world, simulated.true_pose(stamp_ns), stamp_ns)
+    extrinsic = message_encoding.encode_tf_static(rig, simulated.truth(stamp_ns), stamp_ns)
+    pose = message_encoding.encode_tf_static(of_world, simulated.true_pose(stamp_ns), stamp_ns)
     return [(TRUTH_TOPIC, messages.TF, extrinsic), (TRUTH_TOPIC, messages.TF, pose)]

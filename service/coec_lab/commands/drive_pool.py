@@ -12,10 +12,9 @@ from typing import TypeVar
 
 from pydantic import BaseModel
 
-from coec.adapters.files import output
-from coec.adapters.system.cores import one_thread_each
-from coec.adapters.system.parent import die_with_parent
 from coec.errors import CoecError
+from coec.io import user_files
+from coec.io.system import die_with_parent, one_thread_each
 
 _Drive = TypeVar("_Drive")
 _Row = TypeVar("_Row")
@@ -67,5 +66,5 @@ def resumed(
 ) -> dict[str, _Document]:
     """Results that an earlier run left in the folder, by the name of their drive; without those that are damaged or not
     current."""
-    rows = ((name, output.load_document(drive_file(folder, name), model)) for name in names)
+    rows = ((name, user_files.load_document(drive_file(folder, name), model)) for name in names)
     return {name: row for name, row in rows if row is not None and is_current(row)}

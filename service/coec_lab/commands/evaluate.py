@@ -121,8 +121,8 @@ def evaluate(
             "--closure is an experiment of its own: leave out --objective all, --against-frames, --against-slice, "
             "--halves, --nees, --detection, --steps and --camera-model"
         )
-    from coec.library.evaluating import Plan
     from coec_lab.commands import closure_experiment, starts_experiment
+    from coec_lab.experiments.evaluation_run import Plan
 
     given = {**options, "objective": objective, "dof": None if dof is None else int(dof)}
     choices = cast("SolverOptions", given)

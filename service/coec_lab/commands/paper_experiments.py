@@ -11,22 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.files import output
-from coec.calibration.estimators import depth_features, prepare_window_data
 from coec.calibration.ports import Silence
+from coec.calibration.solver import depth_features, prepare_window_data
 from coec.calibration_options import SolverOptions, configuration_of
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import SourceError
-from coec.evaluation import paper, paper_published, starts, statistics
-from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
-from coec.evaluation.paper_speed import run_times
-from coec.evaluation.statistics import SolveOutcome
-from coec.reports import console, page, paper_charts, paper_plots, plots, provenance
-from coec.reports.bullseye import bullseye
+from coec.io import user_files
+from coec.io.depth.depth_maps import open_depth
+from coec.io.recordings import window_cutting
+from coec.io.recordings.layouts import open_source
+from coec.reports import console, page, provenance
 from coec.reports.page import Block
-from coec.reports.paper_page import Plots, paper_page
-from coec.sources import open_source, windows
+from coec_lab.experiments import evaluation_charts, paper_figures, plots, solve_experiments, solve_statistics
+from coec_lab.experiments.evaluation_charts import bullseye
+from coec_lab.experiments.paper_figures import Plots, paper_page, run_times
+from coec_lab.experiments.solve_experiments import Bench, Stages, greys_of, inferred
+from coec_lab.experiments.solve_statistics import SolveOutcome
 
 FAR_DEG, DRIVE_DEG = 25.0, (5.0, 10.0)
 """Radii of the starts in the published experiments."""
@@ -65,11 +65,11 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
     Raises:
         CoecError: an experiment is not possible.
     """
-    output.try_folder(folder)
+    user_files.try_folder(folder)
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
-        loaded = windows.load_window(
+        loaded = window_cutting.load_window(
             request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, "")
         )
         choices = SolverOptions(depth=request.depth, objective=request.objective)
@@ -90,9 +90,9 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
             "bullseye": far,
             "drive": along,
             "run_times": [asdict(row) for row in run_times(request.source, configuration, stages)],
-            "published": paper_published.document(),
+            "published": paper_figures.document(),
         }
-    written = output.write_output(folder / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
+    written = user_files.write_output(folder / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
     page.write(folder / "report.html", paper_page(document, Plots(metrics, ends, drive), provenance.here()))
     if as_json:
         console.print_json(document)
@@ -108,11 +108,11 @@ def _failure_metrics(bench: Bench, request: PaperRequest, folder: Path, stages: 
     frames = depth_features(data, bench.reference)
     on_done = stages.begin("metrics", 2 * request.samples)
     rig, right = bench.window.rig, bench.reference
-    known = paper.failure_figures(
+    known = paper_figures.failure_figures(
         frames[::2], rig, right, bench.configuration, request.samples, lambda done, _: on_done(done, "")
     )
-    limits = paper.learned(known)
-    tried = paper.failure_figures(
+    limits = paper_figures.learned(known)
+    tried = paper_figures.failure_figures(
         frames[1::2] or frames, rig, right, bench.configuration, request.samples,
         lambda done, _: on_done(request.samples + done, ""),
     )  # fmt: skip
@@ -122,30 +122,30 @@ def _failure_metrics(bench: Bench, request: PaperRequest, folder: Path, stages: 
             "checks": request.samples,
             "flagged": float(np.mean([limits.flags(f) for f in tried if f.moved_deg == moved])),
         }
-        for moved in paper.MOVES_DEG
+        for moved in paper_figures.MOVES_DEG
     ]
     shares = ", ".join(f"{row['moved_deg']:g}°: {100 * row['flagged']:.1f} %" for row in rows)
     title = (
         f"{bench.window.window_id}: equation (2), limits learned on the other half of the pairs; flagged at {shares}"
     )
-    output.write_output(folder / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
-    return {"limits": asdict(limits), "moves": rows}, paper_charts.failure_figures(tried, limits)
+    user_files.write_output(folder / "metrics.png", plots.failure_metrics(tried, limits, title))
+    return {"limits": asdict(limits), "moves": rows}, evaluation_charts.failure_figures(tried, limits)
 
 
 def _bullseye(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) -> tuple[dict[str, Any], Block]:
     on_done = stages.begin(f"{FAR_DEG:g} deg", request.runs)
     far = Bench(bench.window, bench.depth, bench.images, _reaching(bench.configuration, FAR_DEG))
     outcomes = []
-    for start in starts.start_poses(bench.reference, request.runs, radians(FAR_DEG), 0.0):
+    for start in solve_experiments.start_poses(bench.reference, request.runs, radians(FAR_DEG), 0.0):
         outcomes.append(far.solve(start))
         on_done(len(outcomes), f"{sum(outcome.hit for outcome in outcomes)} hits")
-    of = statistics.summarise(outcomes)
+    of = solve_statistics.summarise(outcomes)
     title = (
         f"{bench.window.window_id}: {request.objective}, {request.runs} runs from {FAR_DEG:g}°: {of.hits} hits, "
         f"{100 * of.classified_correctly:.0f} % classified correctly"
     )
-    spheres = {"Rotation vectors of the starts": starts.sphere_directions(request.runs)}
-    output.write_output(folder / "bullseye.png", plots.bullseye(outcomes, spheres, title))
+    spheres = {"Rotation vectors of the starts": solve_experiments.sphere_directions(request.runs)}
+    user_files.write_output(folder / "bullseye.png", plots.bullseye(outcomes, spheres, title))
     return {"start_deg": FAR_DEG, **_figures(outcomes)}, bullseye({"": outcomes}, spheres)
 
 
@@ -159,7 +159,7 @@ def _drive(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) ->
     for number, (middle_s, of_window, indices) in enumerate(_drive_windows(bench, request)):
         for radius_deg in DRIVE_DEG:
             near = replace(of_window, configuration=_reaching(bench.configuration, radius_deg))
-            poses = starts.start_poses(bench.reference, per_window * count, radians(radius_deg), 0.0)
+            poses = solve_experiments.start_poses(bench.reference, per_window * count, radians(radius_deg), 0.0)
             # Every window gets starts from all over the sphere.
             for start in poses[number::count]:
                 solved[radius_deg].append((middle_s, near.solve(start, indices)))
@@ -185,13 +185,13 @@ def _drive(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) ->
     windows = f"{count} window{'' if count == 1 else 's'}"
     title = f"{bench.window.window_id}: {request.objective}, {windows}"
     named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in solved.items()}
-    output.write_output(folder / "drive.png", paper_plots.drive(named, title))
-    return rows, paper_charts.drive(named)
+    user_files.write_output(folder / "drive.png", plots.drive(named, title))
+    return rows, evaluation_charts.drive(named)
 
 
 def _window_count(bench: Bench, request: PaperRequest) -> int:
     if request.slice_s is None:
-        return len(paper.slices(len(bench.window.pairs), DRIVE_PAIRS))
+        return len(paper_figures.slices(len(bench.window.pairs), DRIVE_PAIRS))
     return windows_of(open_source(request.source).camera_stamps_ns, request.slice_s)
 
 
@@ -208,7 +208,7 @@ def _drive_windows(bench: Bench, request: PaperRequest) -> Iterator[tuple[float,
     """Middle (s after the first frame), bench and indices of the pairs of every window; one is loaded at a time."""
     pairs = bench.window.pairs
     if request.slice_s is None:
-        for indices in paper.slices(len(pairs), min(DRIVE_PAIRS, len(pairs))):
+        for indices in paper_figures.slices(len(pairs), min(DRIVE_PAIRS, len(pairs))):
             middle = pairs[indices[len(indices) // 2]]
             yield (middle.stamp_ns - pairs[0].stamp_ns) * 1e-9, bench, indices
         return
@@ -216,7 +216,9 @@ def _drive_windows(bench: Bench, request: PaperRequest) -> Iterator[tuple[float,
     for number in range(_window_count(bench, request)):
         begin_s, end_s = number * request.slice_s, (number + 1) * request.slice_s
         try:
-            loaded = windows.load_window(request.source, None, WindowConfig().pairs, lambda *_: None, (begin_s, end_s))
+            loaded = window_cutting.load_window(
+                request.source, None, WindowConfig().pairs, lambda *_: None, (begin_s, end_s)
+            )
         except SourceError:
             # A slice in which no camera frame has a sweep is no window.
             continue
@@ -232,7 +234,7 @@ def _reaching(configuration: CalibrationConfig, radius_deg: float) -> Calibratio
 
 
 def _figures(outcomes: Sequence[SolveOutcome]) -> dict[str, Any]:
-    of = statistics.summarise(outcomes)
+    of = solve_statistics.summarise(outcomes)
     errors = np.degrees([outcome.error[:3] for outcome in outcomes])
     return {
         "runs": of.starts,
@@ -252,7 +254,7 @@ def _figures(outcomes: Sequence[SolveOutcome]) -> dict[str, Any]:
 def _show(document: dict[str, Any]) -> None:
     moves = console.table("extrinsic off by", "checks", "flagged by equation (2)", "published", right=(1, 2, 3))
     for row in document["failure_metrics"]["moves"]:
-        published = paper_published.FLAGGED.get(row["moved_deg"])
+        published = paper_figures.FLAGGED.get(row["moved_deg"])
         theirs = "" if published is None else f"{100 * published:.1f} %"
         moves.add_row(f"{row['moved_deg']:g}°", str(row["checks"]), f"{100 * row['flagged']:.1f} %", theirs)
     console.out.print(moves)
@@ -261,15 +263,15 @@ def _show(document: dict[str, Any]) -> None:
         correct = f"{100 * row['classified_correctly']:.0f} %"
         spread = [_spread(*axis) for axis in zip(row["mean_deg"], row["std_deg"], strict=True)]
         solves.add_row(f"{name}, from {row['start_deg']:g}°", str(row["runs"]), str(row["hits"]), correct, *spread)
-        axes = paper_published.ERRORS_DEG.get(row["start_deg"])
+        axes = paper_figures.ERRORS_DEG.get(row["start_deg"])
         if axes is not None:
             solves.add_row("  published", "1400", "", "", *(_spread(*axis) for axis in axes))
         else:
-            solves.add_row("  published", str(paper_published.FAR_RUNS), str(paper_published.FAR_HITS), "100 %")
+            solves.add_row("  published", str(paper_figures.FAR_RUNS), str(paper_figures.FAR_HITS), "100 %")
     console.out.print(solves)
     speed = console.table("frames", "one MI, ms", "published", "one solve, ms", "published", right=range(5))
     for row in document["run_times"]:
-        mi_ms, solve_ms = paper_published.RUN_TIMES_MS.get(row["frames"], (None, None))
+        mi_ms, solve_ms = paper_figures.RUN_TIMES_MS.get(row["frames"], (None, None))
         theirs_mi, theirs_solve = console.figure(mi_ms, 1), console.figure(solve_ms, 0)
         ours_mi, ours_solve = console.figure(row["mi_ms"], 2), console.figure(row["solve_ms"], 0)
         speed.add_row(str(row["frames"]), ours_mi, theirs_mi, ours_solve, theirs_solve)

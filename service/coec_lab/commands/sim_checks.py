@@ -13,7 +13,7 @@ from coec.cli.options import Jobs, Json
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from coec.calibration.commissioning.baseline import Baseline
+    from coec.calibration.baseline import Baseline
     from coec.errors import CalibrationError
 
 
@@ -49,13 +49,15 @@ def checks(
     places. Finished drives are retained in DIR: run the command again, with more rounds, to continue. A DIR holds
     results of one state of the code.
     """
-    from coec.adapters.files import output as files
-    from coec.evaluation import check_drives, check_run, check_statistics
-    from coec.reports import check_tables, console
-    from coec.schemas.base import to_json
-    from coec.schemas.checks import CheckedDrive
-    from coec.simulation.source import require_extra
+    from coec.io import user_files as files
+    from coec.reports import console
+    from coec.schemas.message import to_json
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
+    from coec_lab.experiments import check_drives, check_statistics
+    from coec_lab.experiments import check_drives as check_run
+    from coec_lab.experiments import check_statistics as check_tables
+    from coec_lab.experiments.simulation_schemas import CheckedDrive
+    from coec_lab.simulation.source import require_extra
 
     require_extra()
     series = list(check_drives.drives(rounds, first))
@@ -97,7 +99,7 @@ def _baselines(rigs: Collection[str], jobs: int | None) -> dict[str, Baseline]:
 
 def _commissioned(rig: str) -> tuple[str, Baseline | CalibrationError]:
     from coec.errors import CalibrationError
-    from coec.evaluation import check_run
+    from coec_lab.experiments import check_drives as check_run
 
     try:
         return rig, check_run.commissioned(rig)

@@ -11,8 +11,7 @@ import typer
 from coec.cli.options import DegreesOfFreedom, Depth, Jobs, Json
 
 if TYPE_CHECKING:
-    from coec.evaluation.matrix_drives import MatrixDrive
-    from coec.evaluation.matrix_run import Settings
+    from coec_lab.experiments.matrix_drives import MatrixDrive, Settings
 
 Number = Annotated[
     int,
@@ -53,13 +52,14 @@ def matrix(
     A drive takes about half a minute of one core, the whole matrix most of an hour. Finished drives are retained in
     DIR: run the command again to continue. A DIR holds results of one state of the code; use another after a change.
     """
-    from coec.adapters.files import output as files
-    from coec.evaluation import matrix, matrix_run
-    from coec.reports import console, matrix_plots, matrix_tables
-    from coec.schemas.base import to_json
-    from coec.schemas.matrix import MatrixRow
-    from coec.simulation.source import require_extra
+    from coec.io import user_files as files
+    from coec.reports import console
+    from coec.schemas.message import to_json
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
+    from coec_lab.experiments import matrix_drives as matrix_run
+    from coec_lab.experiments import matrix_statistics, plots
+    from coec_lab.experiments.simulation_schemas import MatrixRow
+    from coec_lab.simulation.source import require_extra
 
     require_extra()
     drives, settings = _selected(number, only, None if dof is None else int(dof), frames, depth)
@@ -72,13 +72,13 @@ def matrix(
             files.write_output(drive_file(output, row.name), to_json(row))
             rows[row.name] = row
             bars.update(task, advance=1, note=row.name)
-    report = matrix.report([rows[name] for name in names])
+    report = matrix_statistics.report([rows[name] for name in names])
     files.write_output(output / "report.json", to_json(report))
-    files.write_output(output / "normalised.png", matrix_plots.matrix_errors(report))
+    files.write_output(output / "normalised.png", plots.matrix_errors(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
-        matrix_tables.show(report)
+        matrix_statistics.show(report)
     return 0
 
 
@@ -92,8 +92,8 @@ def _selected(
     """
     from coec.config import CalibrationConfig
     from coec.errors import UsageError
-    from coec.evaluation import matrix, matrix_drives
-    from coec.evaluation.matrix_run import CHECK_PAIRS, WINDOWS, Settings
+    from coec_lab.experiments import matrix_drives, matrix_statistics
+    from coec_lab.experiments.matrix_drives import CHECK_PAIRS, WINDOWS, Settings
 
     if WINDOWS * frames < CHECK_PAIRS:
         raise UsageError(f"--frames {frames}: a check needs {CHECK_PAIRS} pairs, {WINDOWS} windows have fewer")
@@ -101,5 +101,5 @@ def _selected(
     if not drives:
         names = ", ".join(drive.name for drive in matrix_drives.drives(number)[:3])
         raise UsageError(f"no drive of the matrix is called {only!r}; they are called {names}, ...")
-    dofs = matrix.DOFS if dof is None else (dof,)
+    dofs = matrix_statistics.DOFS if dof is None else (dof,)
     return drives, Settings(dofs, frames, depth or CalibrationConfig().depth.model)

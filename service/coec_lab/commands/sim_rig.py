@@ -28,14 +28,15 @@ def rig_drives(
     window, as on the vehicle. Only the image rows that the LiDAR sees are rendered. Finished drives are retained in
     DIR: run the command again, with more drives, to continue. A DIR holds results of one state of the code.
     """
-    from coec.adapters.files import output as files
-    from coec.evaluation import rig_drive_statistics, rig_drives
-    from coec.evaluation.knocked_drive import DisplacedRigDrive
-    from coec.reports import console, rig_tables
-    from coec.schemas.base import to_json
-    from coec.schemas.rig import RigDriveRow
-    from coec.simulation.source import require_extra
+    from coec.io import user_files as files
+    from coec.reports import console
+    from coec.schemas.message import to_json
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
+    from coec_lab.experiments import rig_drive_statistics, rig_drives
+    from coec_lab.experiments import rig_moves as rig_tables
+    from coec_lab.experiments.rig_drives import DisplacedRigDrive
+    from coec_lab.experiments.simulation_schemas import RigDriveRow
+    from coec_lab.simulation.source import require_extra
 
     require_extra()
     planned = [DisplacedRigDrive(number, camera) for number in range(drives)]
@@ -67,8 +68,9 @@ def rig_moves(
     Nothing is rendered: checks and windows are sampled at random, with all the errors of real ones. A drive takes one
     to three seconds of a core.
     """
-    from coec.evaluation import rig_moves
-    from coec.reports import console, rig_tables
+    from coec.reports import console
+    from coec_lab.experiments import rig_moves
+    from coec_lab.experiments import rig_moves as rig_tables
 
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(rig_moves.FAULTS) * drives, note="")

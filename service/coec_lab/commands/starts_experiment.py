@@ -8,22 +8,22 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from coec.adapters.files import output
 from coec.calibration_options import SolverOptions
 from coec.cli.calibrate import picture_of_lens_error
 from coec.config import WindowConfig
-from coec.errors import CalibrationError
-from coec.evaluation.experiments import Stages
-from coec.evaluation.statistics import SolveOutcome
-from coec.exit_codes import ExitCode
-from coec.library.evaluating import Plan, Subject, bench_of, report_of, subject_of, tried
-from coec.reports import console, evaluation_tables, page, provenance
-from coec.reports.evaluation_page import comparison_page, evaluation_page
+from coec.errors import CalibrationError, ExitCode
+from coec.io import user_files
+from coec.io.recordings import window_cutting
+from coec.reports import console, page, provenance
 from coec.reports.page import Block, Page
-from coec.schemas.base import to_json
-from coec.schemas.evaluation import ComparisonReport, EvaluationReport
-from coec.sources import windows
+from coec.schemas.message import to_json
 from coec_lab.commands.evaluate import ALL
+from coec_lab.experiments import evaluation_tables
+from coec_lab.experiments.evaluation_page import comparison_page, evaluation_page
+from coec_lab.experiments.evaluation_run import Plan, Subject, bench_of, report_of, subject_of, tried
+from coec_lab.experiments.evaluation_schema import ComparisonReport, EvaluationReport
+from coec_lab.experiments.solve_experiments import Stages
+from coec_lab.experiments.solve_statistics import SolveOutcome
 
 METHODS = ("fused", "mi", "intensity")
 """This project's objective, that of the paper, and the one before the paper."""
@@ -58,11 +58,11 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
     """
     is_comparison = request.choices.get("objective") == ALL
     if folder is not None:
-        output.try_folder(folder)
+        user_files.try_folder(folder)
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
-        loaded = windows.load_window(
+        loaded = window_cutting.load_window(
             request.source, request.frames, WindowConfig().pairs, lambda done, _: load(done, "")
         )
         # What all methods share is loaded with the first.
@@ -87,7 +87,7 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
         evaluation_tables.show(document)
     # Printed first, so that the figures are not lost if they cannot be written.
     if folder is not None:
-        output.write_output(folder / "report.json", to_json(document))
+        user_files.write_output(folder / "report.json", to_json(document))
         page.write(folder / "report.html", make_page())
     if document.interrupted:
         console.say("coec: interrupted: the figures are of what was finished")
@@ -122,7 +122,7 @@ def _compare(
             not_evaluated[method] = str(error)
             continue
         if of_method is not None:
-            output.write_output(of_method / "report.json", to_json(evaluated[method].report))
+            user_files.write_output(of_method / "report.json", to_json(evaluated[method].report))
             page.write(of_method / "report.html", evaluated[method].page())
         on_done(1, "")
         if evaluated[method].report.interrupted:
@@ -133,7 +133,7 @@ def _compare(
     ends: tuple[Block, ...] = ()
     if folder is not None and not interrupted:
         # matplotlib takes a second to import.
-        from coec.reports import evaluation_pictures
+        from coec_lab.experiments import evaluation_pictures
 
         outcomes = {method: each.outcomes for method, each in evaluated.items()}
         window_id = subject.window.window_id
@@ -162,7 +162,7 @@ def _evaluate(plan: Plan, choices: SolverOptions, subject: Subject, folder: Path
     worst: tuple[Block, ...] = ()
     if folder is not None and not done.interrupted:
         # matplotlib takes a second to import.
-        from coec.reports import evaluation_pictures
+        from coec_lab.experiments import evaluation_pictures
 
         of_starts = evaluation_pictures.Starts(plan.rotation_deg, plan.translation_m, plan.directions)
         on_plot = stages.begin("draw", None)
@@ -172,6 +172,6 @@ def _evaluate(plan: Plan, choices: SolverOptions, subject: Subject, folder: Path
             evaluation_pictures.write_normalised(folder, bench.window.window_id, done.normalised)
     if folder is not None:
         table = evaluation_tables.csv_of(bench.reference, done.outcomes)
-        output.write_output(folder / "starts.csv", table.encode())
+        user_files.write_output(folder / "starts.csv", table.encode())
     report = report_of(subject, plan, bench, done, stages.elapsed_s())
     return Evaluated(report, done.outcomes, lambda: evaluation_page(report, ends, worst, provenance.here()))

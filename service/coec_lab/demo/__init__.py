@@ -26,7 +26,7 @@ def demo(
 ) -> int:
     """Displace the mount of a simulated vehicle and show the service detect and correct it: no data, two minutes."""
     if rig:
-        from coec.simulation.source import require_extra
+        from coec_lab.simulation.source import require_extra
 
         require_extra()
         from coec_lab.demo import rig as rig_demo

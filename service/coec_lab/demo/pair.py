@@ -23,16 +23,16 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from coec.adapters.files import output as files
-from coec.adapters.files.rig import mask_to_png
-from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.calibration.types import Matrix4
 from coec.config import Config
-from coec.geometry import compile_news
+from coec.geometry import compilation_events
+from coec.io import user_files as files
+from coec.io.rig_files import mask_to_png
+from coec.io.zenoh.query_client import connected
+from coec.io.zenoh.window_fetch import fetch_window
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
-from coec.reports.page.words import count
+from coec.reports.formatting import count
 from coec.reports.progress import COMPILING, COMPILING_S, CompilationProgress
 from coec.schemas.keys import Keys
 from coec_lab.demo import pair_drive, pair_report
@@ -41,7 +41,7 @@ from coec_lab.demo.pair_drive import NS_PER_S, Pace, PairVehicle
 from coec_lab.demo.service import Daemon, DemoError, free_endpoint, running
 
 if TYPE_CHECKING:
-    from coec.simulation.drive import SimulatedDrive
+    from coec_lab.simulation.drive import SimulatedDrive
 
 POLL_S = 0.2
 """Period of the live view, which queries the service as any user would."""
@@ -73,7 +73,7 @@ def run(output: Path, *, as_json: bool) -> int:
     files.try_folder(output)
     started_s = time.monotonic()
     config_of_drive = pair_drive.drive_config()
-    from coec.simulation.drive import SimulatedDrive
+    from coec_lab.simulation.drive import SimulatedDrive
 
     drive = SimulatedDrive(config_of_drive)
     with tempfile.TemporaryDirectory(prefix="coec-demo-") as temporary:
@@ -82,7 +82,7 @@ def run(output: Path, *, as_json: bool) -> int:
         with running(folder / "coec.yaml", folder / "coec.log") as daemon, Screen() as screen:
             screen.show_text("The service starts, the street is built …")
             # Compiles kernels that the renderers then find compiled, while the service compiles its own.
-            with compile_news.listening(screen.on_compiling):
+            with compilation_events.listening(screen.on_compiling):
                 picture, page = pair_report.write_first(output, drive)
             console.say(f"demo: the first picture is {picture}, and {page} shows it until there is a result")
             with connected(config.zenoh.connect, START_S) as session:

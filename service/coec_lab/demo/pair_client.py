@@ -11,14 +11,14 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from coec.adapters.zenoh.client import query_all, query_one
 from coec.calibration.types import Matrix4
 from coec.errors import NotFoundError, RemoteError
 from coec.geometry import se3
+from coec.io.recordings import window_cutting
+from coec.io.zenoh.query_client import query_all, query_one
 from coec.schemas import replies
-from coec.schemas.base import from_json
 from coec.schemas.keys import Keys
-from coec.sources import windows
+from coec.schemas.message import from_json
 from coec_lab.demo.pair_drive import NS_PER_S, Pace, at_rest
 
 ALARM: Final = "miscalibrated"
@@ -153,7 +153,7 @@ class Observer:
             window_id=extrinsic.window_id,
             correction_deg=_degrees(served, self.nominal),
             error_by_axis_deg=_degrees(served, truth),
-            error_deg=windows.rotation_error_deg(served, truth),
+            error_deg=window_cutting.rotation_error_deg(served, truth),
         )
         return Snapshot(moment, status, health, extrinsic)
 

@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from coec.adapters.files.rig import intrinsics_config, matrix_rows
-from coec.adapters.zenoh.cadence import Played
-from coec.adapters.zenoh.player import CAMERA, Frame, Player, StreamKeys
 from coec.calibration.types import Rig
 from coec.config import (
     BudgetConfig,
@@ -30,12 +27,14 @@ from coec.config import (
     WorkerConfig,
     ZenohConfig,
 )
+from coec.io.rig_files import intrinsics_config, matrix_rows
+from coec.io.zenoh.player import CAMERA, Frame, Played, Player, StreamKeys
 from coec.schemas import replies
-from coec.simulation.source import require_extra
 from coec_lab.demo.service import MIN_FREE_BYTES, STORY_CORES
+from coec_lab.simulation.source import require_extra
 
 if TYPE_CHECKING:
-    from coec.simulation.drive import DriveConfig, SimulatedDrive
+    from coec_lab.simulation.drive import DriveConfig, SimulatedDrive
 
 SEED = 1
 LONGEST_S = 240.0
@@ -94,8 +93,8 @@ def drive_config() -> DriveConfig:
         SourceError: the library that casts rays is not installed.
     """
     require_extra()
-    from coec.simulation.drive import DriveConfig
-    from coec.simulation.faults import StepFault
+    from coec_lab.simulation.drive import DriveConfig
+    from coec_lab.simulation.faults import StepFault
 
     return DriveConfig(
         seed=SEED,
@@ -224,7 +223,7 @@ class PairVehicle:
         self._player.close()
 
     def _run(self) -> None:
-        from coec.simulation.parallel import messages_by
+        from coec_lab.simulation.parallel import messages_by
 
         try:
             frames = messages_by(self._drive.config, min(os.cpu_count() or 1, RENDERERS))

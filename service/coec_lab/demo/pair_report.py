@@ -12,45 +12,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.output import write_output as write_file
-from coec.adapters.images.codec import decode_bgr
-from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import cameras
+from coec.io.images import decode_bgr
+from coec.io.mcap.window_reader import read_result, read_window
+from coec.io.recordings import window_cutting
+from coec.io.user_files import write_output as write_file
 from coec.reports import console, page, pictures, provenance
+from coec.reports.charts import Chart, Ground, Limit, Mark, Series
+from coec.reports.formatting import count
 from coec.reports.overlay import render_points as draw_overlay
-from coec.reports.page import (
-    Block,
-    Cell,
-    Chart,
-    Charts,
-    Compare,
-    Facts,
-    Ground,
-    Limit,
-    Mark,
-    Page,
-    Pictures,
-    Section,
-    Series,
-    Table,
-    Text,
-    VerdictBanner,
-)
-from coec.reports.page.words import count
+from coec.reports.page import Block, Cell, Charts, Compare, Facts, Page, Pictures, Section, Table, Text, VerdictBanner
 from coec.reports.page_parts import TONES, copies_of, figures_block, file_picture
 from coec.reports.provenance import Provenance
-from coec.reports.timeline_plot import timeline
 from coec.schemas import replies
-from coec.schemas.base import to_json
-from coec.sources import windows
+from coec.schemas.message import to_json
 from coec_lab.demo import pair_drive
+from coec_lab.demo.demo_plots import timeline
 from coec_lab.demo.pair_client import ALARM, Moment, Observer, PairOutcome, Snapshot, is_repaired
 
 if TYPE_CHECKING:
-    from coec.simulation.drive import SimulatedDrive
+    from coec_lab.simulation.drive import SimulatedDrive
 
 PICTURE = "first_picture"
 """Stem of the picture's file."""
@@ -85,9 +69,9 @@ def write_first(output: Path, drive: SimulatedDrive) -> tuple[Path, Path]:
     Raises:
         OutputError: a file cannot be written.
     """
-    window = windows.window_of_recording(drive, 1, lambda *_: None).window
+    window = window_cutting.window_of_recording(drive, 1, lambda *_: None).window
     start = window.T_camera_lidar_start
-    error_deg = windows.rotation_error_deg(start, drive.truth(window.pairs[0].stamp_ns))
+    error_deg = window_cutting.rotation_error_deg(start, drive.truth(window.pairs[0].stamp_ns))
     title = f"as the workshop calibrated it: {error_deg:.2f} deg from the truth"
     (overlay,) = pictures.overlays(window, (start,), compensated=True)
     picture = pictures.write_overlay(output, PICTURE, overlay, title)
@@ -170,7 +154,7 @@ def _overlays(
     """Writes overlays and close-ups; returns the files, and the close-ups for a slider."""
     window, configuration = read_window(path)
     truth = observer.truth(snapshot.moment.drive_s)
-    before_deg = windows.rotation_error_deg(accused, truth)
+    before_deg = window_cutting.rotation_error_deg(accused, truth)
     poses = (accused, snapshot.T_camera_lidar)
     titles = (
         f"After the displacement: what was served is {before_deg:.2f}° from the truth",

@@ -8,15 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from coec.adapters.files.output import write_output as write_file
 from coec.geometry.se3 import inverse
+from coec.io.user_files import write_output as write_file
 from coec.reports import console, provenance
 from coec.reports.page import Cell, Page, Picture, Pictures, Section, Table, Text, VerdictBanner
 from coec.reports.page import write as write_page
 from coec.reports.page_parts import TONES, read
 from coec.reports.provenance import Provenance
-from coec.reports.rig_plot import PlottedSensor, percent, rig_from_above, state_text
-from coec.simulation.rig_drive import RigDrive
+from coec_lab.demo.demo_plots import PlottedSensor, percent, rig_from_above, state_text
 from coec_lab.demo.rig_drive import (
     SCENARIO,
     Act,
@@ -30,6 +29,7 @@ from coec_lab.demo.rig_drive import (
     outcome_of,
 )
 from coec_lab.demo.service import DemoError, serving
+from coec_lab.simulation.rig_drive import RigDrive
 
 TITLE = "Which sensor moved? A displaced LiDAR and a displaced camera"
 LIDAR_VIEW_DEG = 360.0

@@ -13,20 +13,19 @@ from functools import cached_property
 from itertools import islice
 from math import hypot
 
-from coec.adapters.zenoh.player import Player
-from coec.evaluation.rig_looks import ROWS, TURN_S
-from coec.reports.rig_plot import MOVED, PlottedEdge
+from coec.io.recordings.recording_source import SensorMessage
+from coec.io.zenoh.player import Player
 from coec.schemas.replies import CheckReply
 from coec.schemas.rig_state import RigReply, SensorReply
-from coec.simulation.drawing import FrameRenderers, frame_renderers
-from coec.simulation.faults import SensorFault, StepFault
-from coec.simulation.journey import START_NS
-from coec.simulation.rig_drive import RigDrive, RigDriveConfig
-from coec.simulation.rig_instants import Instant, instants
-from coec.simulation.schedule import Arrival
-from coec.sources.recording import SensorMessage
+from coec_lab.demo.demo_plots import MOVED, PlottedEdge
 from coec_lab.demo.pair_drive import NS_PER_S, RENDERERS
 from coec_lab.demo.service import DemoError, RigService
+from coec_lab.experiments.rig_drives import ROWS, TURN_S
+from coec_lab.simulation.drive import Arrival
+from coec_lab.simulation.faults import SensorFault, StepFault
+from coec_lab.simulation.journey import START_NS
+from coec_lab.simulation.parallel import FrameRenderers, frame_renderers
+from coec_lab.simulation.rig_drive import Instant, RigDrive, RigDriveConfig, instants
 
 AHEAD = 6
 """Instants that are rendered, or wait to be, ahead of the one that is sent. Each costs four seconds of a core, which

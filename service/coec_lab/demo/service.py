@@ -18,19 +18,19 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 
 import coec
-from coec.adapters.files.output import write_output
-from coec.adapters.zenoh.client import connected, query_all, query_one
-from coec.adapters.zenoh.player import SensorKeys
-from coec.cli.rig_configuration import document_of
 from coec.config import Config, load_config
 from coec.errors import CoecError
-from coec.schemas.base import from_json
+from coec.io.user_files import write_output
+from coec.io.zenoh.player import SensorKeys
+from coec.io.zenoh.query_client import connected, query_all, query_one
 from coec.schemas.keys import Keys
+from coec.schemas.message import from_json
 from coec.schemas.replies import HealthReply, StatusReply
 from coec.schemas.rig_state import RigReply
+from coec_lab.commands.rig_play import document_of
 
 if TYPE_CHECKING:
-    from coec.simulation.rig_drive import RigDrive
+    from coec_lab.simulation.rig_drive import RigDrive
 
 STORY_CORES = 64.0
 """Budget of the service: in a demonstration, windows come every few seconds, for which the default is too small."""

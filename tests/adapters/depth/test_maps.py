@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.depth.maps import CachedDepth, PrecomputedDepth, open_depth
-from coec.adapters.depth.network_files import models_folder
-from coec.adapters.images.codec import encode_depth_png, encode_png, probe
 from coec.calibration.types import CameraFrame, DepthMap
 from coec.config import DepthConfig, LimitsConfig
 from coec.errors import DecodeError, ModelError
-from tiny_onnx import MODEL_CARD, first_channel_network
+from coec.io.depth.depth_maps import CachedDepth, PrecomputedDepth, models_folder, open_depth
+from coec.io.images import encode_depth_png, encode_png, probe
+from support.recordings import MODEL_CARD, first_channel_network
 
 LIMITS = LimitsConfig()
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.depth.model_cards import FixedSize, KeepAspect, find_card, list_models, read_card
 from coec.errors import ModelError
-from tiny_onnx import MODEL_CARD
+from coec.io.depth.model_cards import FixedSize, KeepAspect, find_card, list_models, read_card
+from support.recordings import MODEL_CARD
 
 SAMPLE_NETWORKS = (
     "tcsmallnet_dyn.onnx",

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.depth.model_cards import CardInput, FixedSize, find_card
-from coec.adapters.depth.onnx_network import OnnxDepth, Provider, file_identity, to_tensor
-from coec.adapters.images.codec import encode_png, probe
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError, ModelError
-from tiny_onnx import DOUBLE, MODEL_CARD, first_channel_network
+from coec.io.depth.model_cards import CardInput, FixedSize, find_card
+from coec.io.depth.onnx_network import OnnxDepth, Provider, file_identity, to_tensor
+from coec.io.images import encode_png, probe
+from support.recordings import DOUBLE, MODEL_CARD, first_channel_network
 
 LIMITS = LimitsConfig()
 

@@ -11,7 +11,7 @@ import pytest
 
 INFER = """
 import numpy as np
-from coec.adapters.depth.maps import open_depth
+from coec.io.depth.depth_maps import open_depth
 from coec.config import DepthConfig, LimitsConfig
 open_depth(DepthConfig(), LimitsConfig())
 """

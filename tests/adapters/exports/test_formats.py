@@ -18,10 +18,10 @@ from hypothesis import given, strategies
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from coec.adapters.exports import FORMATS
-from coec.adapters.exports.extrinsic import roll_pitch_yaw
 from coec.errors import OutputError
-from exported import exported_extrinsic
+from coec.io.exports.exported_extrinsic import roll_pitch_yaw
+from coec.io.exports.formats import FORMATS
+from support.estimates import exported_extrinsic
 
 Matrix = NDArray[np.float64]
 

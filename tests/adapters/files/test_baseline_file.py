@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from baselines import a_baseline
-from boards import BOARD_LENSES, board_rig
-from coec.adapters.files.baseline_file import (
+from coec.config import StateConfig
+from coec.errors import StateError
+from coec.io.baseline_file import (
     baseline_from_json,
     baseline_hash,
     baseline_of_rig,
@@ -18,8 +18,8 @@ from coec.adapters.files.baseline_file import (
     load_baseline,
     save_baseline,
 )
-from coec.config import StateConfig
-from coec.errors import StateError
+from support.estimates import a_baseline
+from support.scenes import BOARD_LENSES, board_rig
 
 
 def assert_same(a: object, b: object) -> None:

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.adapters.files.conversions import comparable, estimate_of, matrix_of, result_of, transform_of
 from coec.calibration.types import (
     Decision,
     Estimate,
@@ -26,7 +25,8 @@ from coec.calibration.types import (
 from coec.errors import DecodeError
 from coec.geometry.cameras import build
 from coec.geometry.se3 import perturbation
-from coec.schemas.base import from_json, from_msgpack, to_json, to_msgpack
+from coec.io.serialise import comparable, estimate_of, matrix_of, result_of, transform_of
+from coec.schemas.message import from_json, from_msgpack, to_json, to_msgpack
 from coec.schemas.replies import CalibrationResult
 from coec.schemas.replies import StopReason as TheirReason
 

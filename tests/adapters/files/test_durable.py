@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.files import durable
-from coec.adapters.files.durable import LineLog
-from disks import EVERY_OPERATION, Disk
+from coec.io import storage
+from coec.io.storage import LineLog
+from support.disk import EVERY_OPERATION, Disk
 
 
 def log_of(path: Path, lines: list[bytes], limit: int = 100) -> LineLog:
@@ -34,9 +34,9 @@ def root(tmp_path: Path) -> Path:
 
 def test_a_file_is_replaced_whole_and_its_previous_copy_kept(root: Path) -> None:
     path, previous = root / "f", root / "f.previous"
-    durable.replace(path, b"first", previous)
-    durable.replace(path, b"second", previous)
-    durable.replace(path, b"third", previous)
+    storage.replace(path, b"first", previous)
+    storage.replace(path, b"second", previous)
+    storage.replace(path, b"third", previous)
     assert (path.read_bytes(), previous.read_bytes()) == (b"third", b"second")
     assert names(root) == ["f", "f.previous"]
 
@@ -46,18 +46,18 @@ def test_at_every_refusal_the_file_is_old_or_new_and_nothing_else_is_left(
 ) -> None:
     disk = Disk(root, monkeypatch)
     path, previous = root / "f", root / "f.previous"
-    durable.replace(path, b"old old")
+    storage.replace(path, b"old old")
     before = disk.operations
-    durable.replace(path, b"old old", previous)
+    storage.replace(path, b"old old", previous)
     for refused in range(disk.operations - before):
         first = disk.operations
         disk.refuses = [first + refused]
         with suppress(OSError):
-            durable.replace(path, b"new", previous)
+            storage.replace(path, b"new", previous)
         disk.refuses = ()
         assert path.read_bytes() in (b"old old", b"new")
         assert previous.read_bytes() == b"old old"
-        durable.replace(path, b"old old")
+        storage.replace(path, b"old old")
         assert names(root) == ["f", "f.previous"]
 
 
@@ -65,7 +65,7 @@ def test_a_power_cut_in_a_replacement_leaves_the_one_or_the_other(root: Path, mo
     disk = Disk(root, monkeypatch)
     contents = (b"first", b"second, longer", b"3")
     for number, data in enumerate(contents):
-        durable.replace(root / "f", data, root / "f.previous")
+        storage.replace(root / "f", data, root / "f.previous")
         disk.acknowledge(number)
     cuts = list(disk.power_cuts())
     assert len(cuts) > sum(map(len, contents))
@@ -77,16 +77,16 @@ def test_a_power_cut_in_a_replacement_leaves_the_one_or_the_other(root: Path, mo
 
 
 def test_folders_are_made_and_removed(root: Path) -> None:
-    durable.make_folder(root / "a" / "b")
-    durable.make_folder(root / "a" / "b")
-    durable.replace(root / "a" / "b" / "f", b"1")
-    durable.remove_folder(root / "a" / "b")
-    durable.remove_folder(root / "a" / "b")
-    durable.remove(root / "a" / "nothing")
+    storage.make_folder(root / "a" / "b")
+    storage.make_folder(root / "a" / "b")
+    storage.replace(root / "a" / "b" / "f", b"1")
+    storage.remove_folder(root / "a" / "b")
+    storage.remove_folder(root / "a" / "b")
+    storage.remove(root / "a" / "nothing")
     assert names(root / "a") == []
     (root / "file").write_bytes(b"")
     with pytest.raises(NotADirectoryError):
-        durable.make_folder(root / "file")
+        storage.make_folder(root / "file")
 
 
 # --- lines ----------------------------------------------------------------------------------------------------------
@@ -256,8 +256,8 @@ def test_a_replacement_writes_through_no_link(root: Path, other: Path, name: str
         return
     link = root / name
     link.symlink_to(other) if symbolic else link.hardlink_to(other)
-    durable.replace(root / "f", b"mine", root / "f.previous")
-    durable.replace(root / "f", b"mine too", root / "f.previous")
+    storage.replace(root / "f", b"mine", root / "f.previous")
+    storage.replace(root / "f", b"mine too", root / "f.previous")
     assert other.read_bytes() == b"not yours"
     assert (root / "f").read_bytes() == b"mine too"
     assert not (root / "f").is_symlink()
@@ -304,13 +304,13 @@ def test_a_log_that_somebody_else_removed_is_written_again_though_nothing_waits(
 def test_a_part_is_gone_on_with_unless_it_is_a_link(root: Path, other: Path) -> None:
     path = root / "f.part"
     for data in (b"one ", b"two"):
-        with os.fdopen(durable.reopen(path), "a+b") as stream:
+        with os.fdopen(storage.reopen(path), "a+b") as stream:
             stream.write(data)
     assert path.read_bytes() == b"one two"
     for link in (path.symlink_to, path.hardlink_to):
         path.unlink()
         link(other)
-        with os.fdopen(durable.reopen(path), "a+b") as stream:
+        with os.fdopen(storage.reopen(path), "a+b") as stream:
             assert stream.tell() == 0
             stream.write(b"mine")
         assert (other.read_bytes(), path.read_bytes()) == (b"not yours", b"mine")
@@ -320,14 +320,14 @@ def test_a_part_is_gone_on_with_unless_it_is_a_link(root: Path, other: Path) -> 
 def test_files_are_private_whatever_the_umask(root: Path) -> None:
     before = os.umask(0)
     try:
-        durable.make_folder(root / "a" / "b")
+        storage.make_folder(root / "a" / "b")
         path = root / "a" / "b" / "f"
-        durable.replace(path, b"1")
+        storage.replace(path, b"1")
         log = log_of(root / "log", [b"one"])
         log.add(b"one")
         log.flush()
-        os.close(durable.reopen(root / "part"))
-        durable.replace(root / "told", b"1", mode=durable.BY_UMASK)
+        os.close(storage.reopen(root / "part"))
+        storage.replace(root / "told", b"1", mode=storage.BY_UMASK)
     finally:
         os.umask(before)
     files = (path, root / "log", root / "part", root / "told")

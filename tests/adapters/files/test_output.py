@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.files import output
 from coec.errors import OutputError
+from coec.io import user_files
 
 
 def test_a_folder_that_was_tried_is_as_it_was(tmp_path: Path) -> None:
@@ -18,22 +18,22 @@ def test_a_folder_that_was_tried_is_as_it_was(tmp_path: Path) -> None:
     kept.mkdir()
     (kept / "note").write_text("mine")
     for folder in (kept, tmp_path / "one" / "two", tmp_path):
-        output.try_folder(folder)
-    output.try_file(tmp_path / "three" / "rig.json")
+        user_files.try_folder(folder)
+    user_files.try_file(tmp_path / "three" / "rig.json")
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["kept", "kept/note"]
 
 
 def test_what_was_tried_can_be_written(tmp_path: Path) -> None:
     path = tmp_path / "one" / "two" / "result.json"
-    output.try_file(path)
-    assert output.write_output(path, b"{}").read_bytes() == b"{}"
+    user_files.try_file(path)
+    assert user_files.write_output(path, b"{}").read_bytes() == b"{}"
 
 
 def test_a_folder_below_a_file_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(OutputError, match=r"cannot write to .*--output"):
-            output.try_folder(folder)
+            user_files.try_folder(folder)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
@@ -51,11 +51,11 @@ def files_of_at_most(size_bytes: int) -> Iterator[None]:
 @pytest.mark.fault("a disk that fills up while a picture is written", "said, and no half picture is left")
 def test_half_a_file_is_not_left(tmp_path: Path) -> None:
     with files_of_at_most(1000), pytest.raises(OutputError, match="cannot write"):
-        output.write_output(tmp_path / "picture.png", bytes(100_000))
+        user_files.write_output(tmp_path / "picture.png", bytes(100_000))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_device_that_is_full_stays() -> None:
     with pytest.raises(OutputError, match="No space left"):
-        output.write_output(Path("/dev/full"), b"picture")
+        user_files.write_output(Path("/dev/full"), b"picture")
     assert Path("/dev/full").exists()

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from coec.adapters.files.rig import mask_to_png, rig_from_json, rig_of, rig_to_json
 from coec.calibration.types import Rig, SweepTiming
 from coec.config import CameraConfig, CameraIntrinsics, EgoConfig, LidarConfig, PairConfig, SweepConfig
 from coec.errors import ConfigError, WindowError
 from coec.geometry import cameras, se3
+from coec.io.rig_files import mask_to_png, rig_from_json, rig_of, rig_to_json
 
 T = ((0.0, -1.0, 0.0, 0.1), (0.0, 0.0, -1.0, 0.2), (1.0, 0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0))
 PINHOLE = CameraIntrinsics(model="pinhole", width=40, height=30, fx=20, fy=21, cx=19.5, cy=14.5)

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.files import scribe as scribe_module
-from coec.adapters.files.ledger import AppendLog
-from coec.adapters.files.scribe import DiskWriter
 from coec.errors import StateError
-from disks import EVERY_OPERATION, Disk
-from fakes import wait_until
+from coec.io import disk_writer as scribe_module
+from coec.io.disk_writer import DiskWriter
+from coec.io.storage import AppendLog
+from support.disk import EVERY_OPERATION, Disk
+from support.fake_worker import wait_until
 
 
 class Book:

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.files.durable import MAX_QUARANTINED
-from coec.adapters.files.state_file import BROKEN, MAX_STATE_BYTES, OLDER, StateFile
 from coec.errors import StateError
-from disks import EVERY_OPERATION, Disk
+from coec.io.storage import BROKEN, MAX_QUARANTINED, MAX_STATE_BYTES, OLDER, StateFile
+from support.disk import EVERY_OPERATION, Disk
 
 FIRST: dict[str, object] = {"pairs": {"front": {"matrix": [[1.0, 0.1], [1e-17, -0.0]], "name": "Ä"}}}
 SECOND: dict[str, object] = {"pairs": {"front": {"matrix": [[2.0, 0.30000000000000004], [3, None]]}}}

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from boards import BOARD_LENSES
-from coec.adapters.foxglove.intrinsics import viewer_camera
 from coec.geometry.cameras import build
 from coec.geometry.projection import project
+from coec.io.viewer_scene import viewer_camera
+from support.scenes import BOARD_LENSES
 
 POINTS_M = np.random.default_rng(3).uniform([-1.0, -0.6, 1.0], [1.0, 0.6, 3.0], size=(200, 3))
 RATIONAL = build(

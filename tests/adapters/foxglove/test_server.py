@@ -17,22 +17,29 @@ pytest.importorskip("foxglove", reason="needs the optional extra `foxglove`")
 
 from adapters.foxglove.test_shown import EXTRINSICS, places, projected
 from adapters.foxglove.test_timeline import FULL
-from boards import BOARD_LENSES, BOARD_MOVED, BOARD_NOMINAL, board_frame_pair, board_rig, board_sweep
-from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.intrinsics import viewer_camera
-from coec.adapters.foxglove.server import ViewerServer
-from coec.adapters.foxglove.shown import PairPicture, picture_of
-from coec.adapters.foxglove.timeline import timeline_schema
-from coec.adapters.foxglove.topics import PICTURE_TOPICS, POINTS_TOPICS, TOPIC_DESCRIPTIONS, DisplayedPose, topics_for
-from coec.adapters.images.codec import encode_png, probe
 from coec.calibration.types import Rig
 from coec.config import LimitsConfig
 from coec.errors import UnavailableError
 from coec.geometry import se3
 from coec.geometry.cameras import build
 from coec.geometry.projection import project
-from fakes import wait_until
-from foxglove_viewer import BINARY, TEXT, Viewer
+from coec.io import viewer_scene
+from coec.io.foxglove import ViewerServer
+from coec.io.images import encode_png, probe
+from coec.io.viewer_scene import (
+    PICTURE_TOPICS,
+    POINTS_TOPICS,
+    TOPIC_DESCRIPTIONS,
+    DisplayedPose,
+    PairPicture,
+    picture_of,
+    timeline_schema,
+    topics_for,
+    viewer_camera,
+)
+from support.fake_worker import wait_until
+from support.readers import BINARY, TEXT, Viewer
+from support.scenes import BOARD_LENSES, BOARD_MOVED, BOARD_NOMINAL, board_frame_pair, board_rig, board_sweep
 
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""
@@ -99,20 +106,20 @@ def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: ViewerServ
             viewer,
             screen,
             told,
-            topics.IMAGE_TOPIC,
-            topics.CLOUD_TOPIC,
-            topics.TRANSFORMS_TOPIC,
-            topics.CALIBRATION_TOPIC,
+            viewer_scene.IMAGE_TOPIC,
+            viewer_scene.CLOUD_TOPIC,
+            viewer_scene.TRANSFORMS_TOPIC,
+            viewer_scene.CALIBRATION_TOPIC,
         )
-        image = viewer.next_on(topics.IMAGE_TOPIC)
+        image = viewer.next_on(viewer_scene.IMAGE_TOPIC)
         assert (image.format, image.data, image.frame_id) == ("jpeg", told.image.data, "cam_served")
-        cloud = viewer.next_on(topics.CLOUD_TOPIC)
+        cloud = viewer.next_on(viewer_scene.CLOUD_TOPIC)
         assert [(field.name, field.offset, field.type) for field in cloud.fields] == [
             ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("range", 12, 7),
         ]  # fmt: skip
         assert (cloud.frame_id, cloud.point_stride) == ("velo", 16)
         np.testing.assert_array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 4), told.cloud)
-        transforms = viewer.next_on(topics.TRANSFORMS_TOPIC).transforms
+        transforms = viewer.next_on(viewer_scene.TRANSFORMS_TOPIC).transforms
         assert [(one.parent_frame_id, one.child_frame_id) for one in transforms] == [
             ("velo", "cam_served"), ("velo", "cam_nominal"),
         ]  # fmt: skip
@@ -121,7 +128,7 @@ def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: ViewerServ
             R = se3.rotation_from_quaternion_xyzw(np.array([turn.x, turn.y, turn.z, turn.w]))
             T_lidar_camera = se3.transform_from(R, np.array([place.x, place.y, place.z]))
             np.testing.assert_allclose(T_lidar_camera @ T_camera_lidar, np.eye(4), atol=1e-12)
-        calibration = viewer.next_on(topics.CALIBRATION_TOPIC)
+        calibration = viewer.next_on(viewer_scene.CALIBRATION_TOPIC)
         camera = rig.camera
         assert (calibration.distortion_model, calibration.width, calibration.height) == ("kannala_brandt", 640, 400)
         assert list(calibration.K) == [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
@@ -134,8 +141,8 @@ def test_intrinsics_of_a_lens_that_viewers_do_not_know_are_those_of_one_that_the
     screen = ViewerServer(HOST, 0, "coec test", rig.camera)
     try:
         with Viewer(screen.url) as viewer:
-            shown_to(viewer, screen, told, topics.CALIBRATION_TOPIC)
-            calibration = viewer.next_on(topics.CALIBRATION_TOPIC)
+            shown_to(viewer, screen, told, viewer_scene.CALIBRATION_TOPIC)
+            calibration = viewer.next_on(viewer_scene.CALIBRATION_TOPIC)
     finally:
         screen.close()
     assert calibration.distortion_model == "kannala_brandt"
@@ -156,24 +163,28 @@ def test_intrinsics_that_viewers_cannot_have_are_no_topic() -> None:
     screen = ViewerServer(HOST, 0, "coec test", odd)
     try:
         with Viewer(screen.url) as viewer:
-            shown_to(viewer, screen, replace(told, rig=replace(rig, camera=odd)), topics.IMAGE_TOPIC)
-            viewer.next_on(topics.IMAGE_TOPIC)
-            assert set(viewer.channels) == set(topics_for(odd)) == set(TOPIC_DESCRIPTIONS) - {topics.CALIBRATION_TOPIC}
+            shown_to(viewer, screen, replace(told, rig=replace(rig, camera=odd)), viewer_scene.IMAGE_TOPIC)
+            viewer.next_on(viewer_scene.IMAGE_TOPIC)
+            assert (
+                set(viewer.channels)
+                == set(topics_for(odd))
+                == set(TOPIC_DESCRIPTIONS) - {viewer_scene.CALIBRATION_TOPIC}
+            )
     finally:
         screen.close()
 
 
 def test_the_timeline_arrives_with_its_schema_and_remarks_with_their_level(screen: ViewerServer) -> None:
     with Viewer(screen.url) as viewer:
-        viewer.subscribe([topics.HEALTH_TOPIC, topics.LOG_TOPIC])
+        viewer.subscribe([viewer_scene.HEALTH_TOPIC, viewer_scene.LOG_TOPIC])
         wait_until(lambda: len(screen.requested_topics) == 2, "subscriptions")
         screen.send_entry(FULL)
         screen.send_log(2, "It has moved.", "front")
-        assert viewer.next_on(topics.HEALTH_TOPIC) == FULL.document()
-        channel = viewer.channels[topics.HEALTH_TOPIC]
+        assert viewer.next_on(viewer_scene.HEALTH_TOPIC) == FULL.document()
+        channel = viewer.channels[viewer_scene.HEALTH_TOPIC]
         assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
         assert json.loads(channel["schema"]) == timeline_schema()
-        remark = viewer.next_on(topics.LOG_TOPIC)
+        remark = viewer.next_on(viewer_scene.LOG_TOPIC)
         assert (remark.message, remark.name, remark.level) == ("It has moved.", "front", 4)
         assert set(viewer.channels) == set(TOPIC_DESCRIPTIONS)
         assert viewer.info["capabilities"] == [], "viewers change nothing"
@@ -182,8 +193,8 @@ def test_the_timeline_arrives_with_its_schema_and_remarks_with_their_level(scree
 def test_what_nobody_looks_at_is_known(screen: ViewerServer) -> None:
     assert screen.requested_topics == frozenset()
     with Viewer(screen.url) as viewer:
-        viewer.subscribe([topics.IMAGE_TOPIC])
-        wait_until(lambda: screen.requested_topics == {topics.IMAGE_TOPIC}, "one subscription")
+        viewer.subscribe([viewer_scene.IMAGE_TOPIC])
+        wait_until(lambda: screen.requested_topics == {viewer_scene.IMAGE_TOPIC}, "one subscription")
     wait_until(lambda: screen.requested_topics == frozenset(), "its end with the viewer's")
 
 
@@ -213,14 +224,14 @@ def test_who_does_not_read_costs_nothing(screen: ViewerServer, record_property: 
     assert len(large.image.data) > NOISY_BYTES
     process = psutil.Process(os.getpid())
     with Viewer(screen.url) as deaf, Viewer(screen.url) as other:
-        deaf.subscribe([topics.IMAGE_TOPIC])
-        wait_until(lambda: topics.IMAGE_TOPIC in screen.requested_topics, "his subscription")
-        other.subscribe([topics.IMAGE_TOPIC, topics.HEALTH_TOPIC])
-        wait_until(lambda: topics.HEALTH_TOPIC in screen.requested_topics, "the other's")
+        deaf.subscribe([viewer_scene.IMAGE_TOPIC])
+        wait_until(lambda: viewer_scene.IMAGE_TOPIC in screen.requested_topics, "his subscription")
+        other.subscribe([viewer_scene.IMAGE_TOPIC, viewer_scene.HEALTH_TOPIC])
+        wait_until(lambda: viewer_scene.HEALTH_TOPIC in screen.requested_topics, "the other's")
         before = process.memory_info().rss
         for number in range(PICTURES_SENT):
             screen.send_picture(replace(large, stamp_ns=number))
-            assert stamp_ns(other.next_on(topics.IMAGE_TOPIC)) == number
+            assert stamp_ns(other.next_on(viewer_scene.IMAGE_TOPIC)) == number
         grown_mb = (process.memory_info().rss - before) / 1e6
     assert grown_mb < KEPT_MB < PICTURES_SENT * NOISY_BYTES / 1e6
     record_property("figure", f"{grown_mb:.0f} MB of {PICTURES_SENT * len(large.image.data) / 1e6:.0f} MB shown")
@@ -240,11 +251,11 @@ NONSENSE = (
 def test_nonsense_is_of_no_consequence(screen: ViewerServer, code: int) -> None:
     told, _ = picture()
     with Viewer(screen.url) as other:
-        other.subscribe([topics.IMAGE_TOPIC])
+        other.subscribe([viewer_scene.IMAGE_TOPIC])
         for nonsense in NONSENSE:
             with Viewer(screen.url) as fool, suppress(OSError):
                 fool.send(nonsense, code)
-        wait_until(lambda: screen.requested_topics == {topics.IMAGE_TOPIC}, "the other's subscription")
+        wait_until(lambda: screen.requested_topics == {viewer_scene.IMAGE_TOPIC}, "the other's subscription")
         screen.send_picture(told)
-        assert stamp_ns(other.next_on(topics.IMAGE_TOPIC)) == told.stamp_ns
+        assert stamp_ns(other.next_on(viewer_scene.IMAGE_TOPIC)) == told.stamp_ns
         assert set(other.channels) == set(TOPIC_DESCRIPTIONS)

@@ -7,7 +7,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from boards import (
+from coec.calibration.types import EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
+from coec.config import LimitsConfig
+from coec.errors import DecodeError
+from coec.geometry.cameras import Camera, in_image
+from coec.geometry.projection import project
+from coec.io import viewer_scene
+from coec.io.images import decode_bgr, encode_jpeg
+from coec.io.viewer_scene import (
+    MAX_CLOUD_POINTS,
+    MAX_POINTS,
+    MAX_SILHOUETTES,
+    PICTURE_TOPICS,
+    STAMP_END_NS,
+    DisplayedPose,
+    PointMarks,
+    TitledExtrinsic,
+    marks_of,
+    picture_of,
+    silhouettes_of,
+)
+from support.scenes import (
     BOARD_LENSES,
     BOARD_M,
     BOARD_MOVED,
@@ -19,25 +39,6 @@ from boards import (
     board_rig,
     board_sweep,
 )
-from coec.adapters.foxglove import topics
-from coec.adapters.foxglove.shown import (
-    MAX_CLOUD_POINTS,
-    MAX_POINTS,
-    MAX_SILHOUETTES,
-    STAMP_END_NS,
-    PointMarks,
-    TitledExtrinsic,
-    marks_of,
-    picture_of,
-    silhouettes_of,
-)
-from coec.adapters.foxglove.topics import PICTURE_TOPICS, DisplayedPose
-from coec.adapters.images.codec import decode_bgr, encode_jpeg
-from coec.calibration.types import EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
-from coec.config import LimitsConfig
-from coec.errors import DecodeError
-from coec.geometry.cameras import Camera, in_image
-from coec.geometry.projection import project
 
 EXTRINSICS = {
     DisplayedPose.SERVED: TitledExtrinsic(BOARD_MOVED, "served"),
@@ -119,11 +120,11 @@ def test_an_extrinsic_that_there_is_none_of_is_a_title() -> None:
 def test_nothing_is_made_that_nobody_looks_at() -> None:
     pair, rig = board_frame_pair(BOARD_LENSES["pinhole"]), board_rig(BOARD_LENSES["pinhole"])
     picture = picture_of(
-        pair, rig, EXTRINSICS, {topics.POINTS_TOPICS[DisplayedPose.NOMINAL]}, LimitsConfig(), compensated=True
+        pair, rig, EXTRINSICS, {viewer_scene.POINTS_TOPICS[DisplayedPose.NOMINAL]}, LimitsConfig(), compensated=True
     )
     assert (list(picture.marks), picture.image, picture.cloud) == ([DisplayedPose.NOMINAL], None, None)
     picture = picture_of(
-        pair, rig, EXTRINSICS, {topics.CLOUD_TOPIC, topics.IMAGE_TOPIC}, LimitsConfig(), compensated=True
+        pair, rig, EXTRINSICS, {viewer_scene.CLOUD_TOPIC, viewer_scene.IMAGE_TOPIC}, LimitsConfig(), compensated=True
     )
     assert not picture.marks
     assert picture.image is pair.camera.image, "JPEG goes through as it came"
@@ -140,7 +141,7 @@ def test_raw_pixels_are_sent_as_jpeg() -> None:
     pair = board_frame_pair(camera)
     pair = replace(pair, camera=replace(pair.camera, image=raw))
     image = picture_of(
-        pair, board_rig(camera), EXTRINSICS, {topics.IMAGE_TOPIC}, LimitsConfig(), compensated=True
+        pair, board_rig(camera), EXTRINSICS, {viewer_scene.IMAGE_TOPIC}, LimitsConfig(), compensated=True
     ).image
     assert image is not None
     assert image.format is ImageFormat.JPEG

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from coec.adapters.foxglove.timeline import (
-    MissedFrames,
-    PoseAxes,
-    StreamAges,
-    TimelineEntry,
-    TimelineFigure,
-    timeline_schema,
-)
+from coec.io.viewer_scene import MissedFrames, PoseAxes, StreamAges, TimelineEntry, TimelineFigure, timeline_schema
 
 FULL = TimelineEntry(
     pair="front",

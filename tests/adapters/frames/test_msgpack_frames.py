@@ -13,19 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.adapters.frames.incoming import Refusal
-from coec.adapters.frames.msgpack_frames import (
-    decode_camera,
-    decode_ego,
-    decode_lidar,
-    encode_camera,
-    encode_ego,
-    encode_lidar,
-)
-from coec.adapters.images.codec import encode_depth_png, encode_jpeg, probe
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
+from coec.io.frame_validation import Refusal
+from coec.io.images import encode_depth_png, encode_jpeg, probe
+from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar, encode_camera, encode_ego, encode_lidar
 
 LIMITS = LimitsConfig()
 JPEG = encode_jpeg(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8))

@@ -13,7 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coec.adapters.images.codec import (
+from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
+from coec.config import LimitsConfig
+from coec.errors import DecodeError
+from coec.io.images import (
     Inspector,
     decode_bgr,
     decode_depth,
@@ -24,9 +27,6 @@ from coec.adapters.images.codec import (
     probe,
     raw_image,
 )
-from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
-from coec.config import LimitsConfig
-from coec.errors import DecodeError
 
 LIMITS = LimitsConfig()
 Encoder = Callable[[NDArray[np.uint8]], bytes]

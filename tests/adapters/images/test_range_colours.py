@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from coec.adapters.images.range_colours import WHOLE_SCALE, RangeScale, scale_of, stable_scale
+from coec.io.images import WHOLE_SCALE, RangeScale, scale_of, stable_scale
 
 VISION = {
     "usual": np.eye(3),

@@ -4,21 +4,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.images.codec import (
+from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
+from coec.config import LimitsConfig
+from coec.errors import DecodeError
+from coec.io.images import (
+    BYTES_PER_PIXEL,
+    MOSAICS,
     CompressingReducer,
     Inspector,
     decode_bgr,
     decode_grey_reduced,
+    eight_bits,
     encode_depth_png,
     encode_jpeg,
     probe,
     raw_image,
 )
-from coec.adapters.images.codec import decode_grey as grey_of
-from coec.adapters.images.raw import BYTES_PER_PIXEL, MOSAICS, eight_bits
-from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
-from coec.config import LimitsConfig
-from coec.errors import DecodeError
+from coec.io.images import decode_grey as grey_of
 
 LIMITS = LimitsConfig()
 H, W = 26, 38

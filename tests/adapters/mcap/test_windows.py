@@ -20,18 +20,6 @@ import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from coec.adapters.mcap.files import McapDamagedError, read_records
-from coec.adapters.mcap.windows import (
-    PART_SUFFIX,
-    RecordedWindow,
-    WindowWriter,
-    is_window,
-    pairs_since,
-    read_result,
-    read_window,
-    salvage,
-    write_result,
-)
 from coec.calibration.types import (
     CameraFrame,
     EgoMotion,
@@ -45,8 +33,11 @@ from coec.calibration.types import (
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import RecordingError, WindowError
 from coec.geometry import cameras, se3
+from coec.io.mcap.reader import McapDamagedError, read_records
+from coec.io.mcap.window_reader import PART_SUFFIX, is_window, pairs_since, read_result, read_window
+from coec.io.mcap.window_writer import RecordedWindow, WindowWriter, salvage, write_result
 from coec.schemas.replies import CalibrationResult, MetricReply, MovedWithin, Reason, Transform, Verdict
-from readers import read_recording
+from support.readers import read_recording
 
 WIDTH, HEIGHT = 64, 48
 START_NS = 1_600_000_000_123_456_789

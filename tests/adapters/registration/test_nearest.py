@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("small_gicp", reason="needs the optional extra `lidars`")
 
-from coec.adapters.registration.nearest import Trees
+from coec.io.nearest_neighbours import Trees
 
 
 def test_the_nearest_are_those_of_all_distances_and_the_same_again() -> None:

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.files.rig import camera_of
-from coec.adapters.ros.camera_info import (
+from coec.errors import DecodeError, SourceError
+from coec.geometry import cameras
+from coec.geometry.projection import project
+from coec.io.rig_files import camera_of
+from coec.io.ros.camera_info import (
     MAX_INFO_BYTES,
     CameraInfoContent,
     decode_info,
@@ -18,10 +21,7 @@ from coec.adapters.ros.camera_info import (
     intrinsics_of_info,
     is_rectified,
 )
-from coec.errors import DecodeError, SourceError
-from coec.geometry import cameras
-from coec.geometry.projection import project
-from ros_messages import Packer
+from support.ros import Packer
 
 K = (500.0, 0.0, 319.5, 0.0, 510.0, 239.5, 0.0, 0.0, 1.0)
 P = (480.0, 0.0, 321.0, 0.0, 0.0, 481.0, 238.0, 0.0, 0.0, 0.0, 1.0, 0.0)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.adapters.ros.diagnostics import (
+from coec.io.ros.message_encoding import (
     MAX_MESSAGE,
     SENSOR_LEVELS,
     DiagnosticLevel,
@@ -28,7 +28,7 @@ from coec.schemas.replies import (
     Reason,
 )
 from coec.schemas.rig_state import SensorState
-from rig_replies import moved_lidar_sensor, sensor_reply
+from support.messages import moved_lidar_sensor, sensor_reply
 
 STATES = st.sampled_from(get_args(HealthState))
 SERVICES: st.SearchStrategy[ServicePhase] = st.sampled_from(get_args(ServicePhase))

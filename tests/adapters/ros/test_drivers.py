@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from coec.adapters.ros import incoming, messages
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig
-from ros_messages import CODES, STAMP_NS, STAMP_REST_NS, STAMP_S, cloud
+from coec.io.ros import message_decoding, messages
+from support.ros import CODES, STAMP_NS, STAMP_REST_NS, STAMP_S, cloud
 
 BEGIN_S = STAMP_S + STAMP_REST_NS * 1e-9
 STEPS = np.linspace(0.0, 1.0, 12)
@@ -183,7 +183,7 @@ def message(driver: Driver, *, big: bool, padding: int) -> bytes:
 def test_the_clouds_of_every_driver_are_read(name: str, padding: int, big: bool) -> None:
     driver = DRIVERS[name]
 
-    frame = incoming.decode(messages.POINT_CLOUD, message(driver, big=big, padding=padding), LimitsConfig())
+    frame = message_decoding.decode(messages.POINT_CLOUD, message(driver, big=big, padding=padding), LimitsConfig())
 
     assert isinstance(frame, LidarFrame)
     assert frame.xyz_m.dtype == np.float32

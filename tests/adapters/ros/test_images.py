@@ -3,22 +3,21 @@
 import numpy as np
 import pytest
 
-from coec.adapters.images.codec import encode_png
-from coec.adapters.images.raw import BYTES_PER_PIXEL
-from coec.adapters.ros import incoming, messages, outgoing
-from coec.adapters.ros.images import ENCODINGS
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
+from coec.io.images import BYTES_PER_PIXEL, encode_png
+from coec.io.ros import message_decoding, message_encoding, messages
+from coec.io.ros.message_decoding import ENCODINGS
 from coec.schemas import frames
-from ros_messages import JPEG, compressed_image, raw_image
+from support.ros import JPEG, compressed_image, raw_image
 
 LIMITS = LimitsConfig()
 WIDTH, HEIGHT = 6, 4
 
 
 def decoded(type_name: str, payload: bytes) -> EncodedImage:
-    frame = incoming.decode(type_name, payload, LIMITS)
+    frame = message_decoding.decode(type_name, payload, LIMITS)
     assert isinstance(frame, CameraFrame)
     return frame.image
 
@@ -38,7 +37,9 @@ def test_every_encoding_with_any_step_in_either_byte_order(encoding: str, paddin
 
     assert got == EncodedImage(form, WIDTH, HEIGHT, pixels.tobytes())
     frame = CameraFrame(0, "camera", got)
-    assert incoming.decode(*outgoing.encode_image(frame), LIMITS) == frame, "a window records it as it came"
+    assert message_decoding.decode(*message_encoding.encode_image(frame), LIMITS) == frame, (
+        "a window records it as it came"
+    )
 
 
 @pytest.mark.parametrize("encoding", ["32FC1", "rgb16", "nv21", "RGB8", "", "x" * 4000])

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from rosbags.typesys.stores import ros2_humble as ros
 
-import ros_messages
-from bags import STORE, TREE
-from coec.adapters.ros.incoming import decode
-from coec.adapters.ros.later import shifted
-from coec.adapters.ros.messages import COMPRESSED_IMAGE, ODOMETRY, POINT_CLOUD, TF
-from coec.adapters.ros.topics import TopicMessage
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from ros_messages import STAMP_NS, STAMP_S, packed_cloud
+from coec.io.ros.message_decoding import decode
+from coec.io.ros.messages import COMPRESSED_IMAGE, ODOMETRY, POINT_CLOUD, TF
+from coec.io.ros.topics import TopicMessage, shifted
+from support import ros as ros_messages
+from support.recordings import STORE, TREE
+from support.ros import STAMP_NS, STAMP_S, packed_cloud
 
 LATER_NS = 86_400 * 10**9 + 900_000_000
 LATER_S, LATER_NSEC = divmod(STAMP_NS + LATER_NS, 10**9)

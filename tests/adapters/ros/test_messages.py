@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap_ros2.decoder import DecoderFactory
 
-from coec.adapters.frames.incoming import Refusal
-from coec.adapters.images.codec import encode_depth_png, probe
-from coec.adapters.ros import incoming, messages, outgoing
-from coec.adapters.ros.diagnostics import DiagnosticLevel, DiagnosticStatus
-from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, build
-from ros_messages import (
+from coec.io.frame_validation import Refusal
+from coec.io.images import encode_depth_png, probe
+from coec.io.ros import message_decoding, message_encoding, messages
+from coec.io.ros.message_encoding import DiagnosticLevel, DiagnosticStatus
+from coec.io.ros.point_clouds import WRITTEN_TIME
+from support.ros import (
     JPEG,
     STAMP_NS,
     STAMP_REST_NS,
@@ -54,14 +54,14 @@ MESSAGES = [
 
 
 def sweep(payload: bytes) -> LidarFrame:
-    frame = incoming.decode(messages.POINT_CLOUD, payload, LIMITS)
+    frame = message_decoding.decode(messages.POINT_CLOUD, payload, LIMITS)
     assert isinstance(frame, LidarFrame)
     return frame
 
 
 def reason_of(type_name: str, payload: bytes, limits: LimitsConfig = LIMITS) -> str:
     with pytest.raises(DecodeError) as refused:
-        incoming.decode(type_name, payload, limits)
+        message_decoding.decode(type_name, payload, limits)
     assert refused.value.reason in set(Refusal)
     return refused.value.reason
 
@@ -69,7 +69,7 @@ def reason_of(type_name: str, payload: bytes, limits: LimitsConfig = LIMITS) -> 
 def refusal_or_none(type_name: str, payload: bytes) -> str | None:
     """The reason, or None for what was read; any other exception fails the test."""
     try:
-        incoming.decode(type_name, payload, LIMITS)
+        message_decoding.decode(type_name, payload, LIMITS)
     except DecodeError as error:
         return error.reason
     return None
@@ -80,7 +80,7 @@ def refusal_or_none(type_name: str, payload: bytes) -> str | None:
 
 @pytest.mark.parametrize("form", ["jpeg", "", "bgr8; jpeg compressed bgr8", "rgb8; png compressed "])
 def test_a_compressed_image_is_known_by_its_bytes(form: str) -> None:
-    frame = incoming.decode(messages.COMPRESSED_IMAGE, compressed_image(form=form), LIMITS)
+    frame = message_decoding.decode(messages.COMPRESSED_IMAGE, compressed_image(form=form), LIMITS)
 
     assert frame == CameraFrame(STAMP_NS, "camera", EncodedImage(ImageFormat.JPEG, 64, 48, JPEG))
 
@@ -88,7 +88,7 @@ def test_a_compressed_image_is_known_by_its_bytes(form: str) -> None:
 def test_the_padding_of_rows_is_removed() -> None:
     data = bytes(range(6)) + b"\xaa\xaa" + bytes(range(6, 12)) + b"\xaa\xaa"
     for sent in (data, data[:-2]):  # some drivers leave out the padding of the last row
-        frame = incoming.decode(messages.IMAGE, raw_image("bgr8", 2, 2, 8, sent), LIMITS)
+        frame = message_decoding.decode(messages.IMAGE, raw_image("bgr8", 2, 2, 8, sent), LIMITS)
 
         assert isinstance(frame, CameraFrame)
         assert frame.image == EncodedImage(ImageFormat.BGR8, 2, 2, bytes(range(12)))
@@ -233,11 +233,13 @@ def test_a_wrong_cloud_is_refused_by_reason(payload: bytes, reason: str) -> None
 def test_ego_motion(type_name: str, payload: bytes, frame_id: str) -> None:
     motion = EgoMotion(STAMP_NS, frame_id, (1.5, 0.0, -0.25), (0.0, 0.5, 0.125))
 
-    assert incoming.decode(type_name, payload, LIMITS) == motion
+    assert message_decoding.decode(type_name, payload, LIMITS) == motion
 
 
 def test_an_imu_tells_rotation_only() -> None:
-    assert incoming.decode(messages.IMU, imu(), LIMITS) == EgoMotion(STAMP_NS, "imu_link", None, (0.0, 0.5, 0.125))
+    assert message_decoding.decode(messages.IMU, imu(), LIMITS) == EgoMotion(
+        STAMP_NS, "imu_link", None, (0.0, 0.5, 0.125)
+    )
 
 
 def test_an_imu_that_has_no_turn_rates_says_so_and_is_refused() -> None:
@@ -284,7 +286,7 @@ def test_a_type_that_is_not_read_is_refused() -> None:
 )
 def test_a_type_that_people_take_for_the_right_one_is_refused_with_what_to_do(type_name: str, advice: str) -> None:
     with pytest.raises(DecodeError, match=advice):
-        incoming.decode(type_name, b"\0\1\0\0", LIMITS)
+        message_decoding.decode(type_name, b"\0\1\0\0", LIMITS)
 
 
 def test_a_message_beyond_the_limit_is_not_even_looked_at() -> None:
@@ -296,7 +298,7 @@ def test_a_message_beyond_the_limit_is_not_even_looked_at() -> None:
 @pytest.mark.fault("a ROS message cut off at any byte", "it is refused with a reason")
 @pytest.mark.parametrize(("type_name", "payload"), MESSAGES)
 def test_a_message_cut_at_any_byte_is_refused(type_name: str, payload: bytes) -> None:
-    incoming.decode(type_name, payload, LIMITS)
+    message_decoding.decode(type_name, payload, LIMITS)
     for size in range(0, len(payload) - 1, max(1, len(payload) // 400)):
         assert reason_of(type_name, payload[:size])
 
@@ -304,7 +306,7 @@ def test_a_message_cut_at_any_byte_is_refused(type_name: str, payload: bytes) ->
 @pytest.mark.fault("a length of 4 GB anywhere in a ROS message", "nothing is allocated for it")
 @pytest.mark.parametrize(("type_name", "payload"), MESSAGES)
 def test_a_huge_length_anywhere_allocates_nothing(type_name: str, payload: bytes) -> None:
-    incoming.decode(type_name, payload, LIMITS)  # builds the decoder, which is not the sender's memory
+    message_decoding.decode(type_name, payload, LIMITS)  # builds the decoder, which is not the sender's memory
     tracemalloc.start()
     try:
         for at in range(4, min(len(payload) - 4, 300)):
@@ -393,18 +395,18 @@ def read_by_others(type_name: str, payload: bytes) -> Any:
 def test_an_image_there_and_back(encoded: EncodedImage) -> None:
     frame = CameraFrame(STAMP_NS, "camera", encoded)
 
-    type_name, payload = outgoing.encode_image(frame)
+    type_name, payload = message_encoding.encode_image(frame)
 
-    assert incoming.decode(type_name, payload, LIMITS) == frame
+    assert message_decoding.decode(type_name, payload, LIMITS) == frame
     assert bytes(read_by_others(type_name, payload).data) == encoded.data
 
 
 def test_a_depth_map_there_and_back() -> None:
     depth = probe(encode_depth_png(np.full((12, 16), 7, np.uint16)), LIMITS)
 
-    payload = outgoing.encode_depth(STAMP_NS, "camera", depth)
+    payload = message_encoding.encode_depth(STAMP_NS, "camera", depth)
 
-    frame = incoming.decode(messages.COMPRESSED_IMAGE, payload, LIMITS)
+    frame = message_decoding.decode(messages.COMPRESSED_IMAGE, payload, LIMITS)
     assert isinstance(frame, CameraFrame)
     assert frame.image == depth
     assert read_by_others(messages.COMPRESSED_IMAGE, payload).format == "16UC1; png"
@@ -421,7 +423,9 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
     xyz_m = rng.normal(size=(500, 3)).astype(np.float32)
     frame = LidarFrame(STAMP_NS, "lidar", xyz_m, **{name: columns[name] for name in names})
 
-    back = incoming.decode(messages.POINT_CLOUD, outgoing.encode_cloud(frame), LIMITS, point_time=WRITTEN_TIME)
+    back = message_decoding.decode(
+        messages.POINT_CLOUD, message_encoding.encode_cloud(frame), LIMITS, point_time=WRITTEN_TIME
+    )
 
     assert isinstance(back, LidarFrame)
     assert (back.stamp_ns, back.frame_id) == (STAMP_NS, "lidar")
@@ -434,20 +438,20 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
 def test_an_odometry_there_and_back() -> None:
     motion = EgoMotion(STAMP_NS, "base_link", (1 / 3, 0.0, -2.0), (1e-9, 0.5, 3.0))
 
-    type_name, payload = outgoing.encode_motion(motion)
+    type_name, payload = message_encoding.encode_motion(motion)
 
     assert type_name == messages.ODOMETRY
-    assert incoming.decode(messages.ODOMETRY, payload, LIMITS) == motion
+    assert message_decoding.decode(messages.ODOMETRY, payload, LIMITS) == motion
     assert read_by_others(messages.ODOMETRY, payload).child_frame_id == "base_link"
 
 
 def test_a_rotation_there_and_back() -> None:
     motion = EgoMotion(STAMP_NS, "imu_link", None, (1e-9, 0.5, -3.0))
 
-    type_name, payload = outgoing.encode_motion(motion)
+    type_name, payload = message_encoding.encode_motion(motion)
 
     assert type_name == messages.IMU
-    assert incoming.decode(type_name, payload, LIMITS) == motion
+    assert message_decoding.decode(type_name, payload, LIMITS) == motion
     read = read_by_others(type_name, payload)
     assert (read.orientation_covariance[0], read.linear_acceleration_covariance[0]) == (-1, -1)
     assert read.angular_velocity_covariance[0] == 0
@@ -457,7 +461,7 @@ def test_a_rotation_there_and_back() -> None:
 def test_camera_info(model: str) -> None:
     camera, distortion_model, d = CAMERAS[model]
 
-    message = read_by_others(messages.CAMERA_INFO, outgoing.encode_camera_info(rig(camera), STAMP_NS))
+    message = read_by_others(messages.CAMERA_INFO, message_encoding.encode_camera_info(rig(camera), STAMP_NS))
 
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (STAMP_S, STAMP_REST_NS)
     assert (message.width, message.height, message.header.frame_id) == (640, 480, "camera")
@@ -469,13 +473,13 @@ def test_camera_info(model: str) -> None:
 def test_every_camera_model_has_a_distortion_model() -> None:
     from coec.geometry.cameras import MODELS
 
-    assert set(outgoing.DISTORTION) == set(MODELS)
-    for name, (_, parameters) in outgoing.DISTORTION.items():
+    assert set(message_encoding.DISTORTION) == set(MODELS)
+    for name, (_, parameters) in message_encoding.DISTORTION.items():
         assert set(parameters) == set(MODELS[name].parameters) - {"width", "height", "fx", "fy", "cx", "cy"}
 
 
 def test_tf_maps_the_child_to_the_parent() -> None:
-    payload = outgoing.encode_tf_static(rig(CAMERAS["pinhole"][0]), T_CAMERA_LIDAR, STAMP_NS)
+    payload = message_encoding.encode_tf_static(rig(CAMERAS["pinhole"][0]), T_CAMERA_LIDAR, STAMP_NS)
 
     (transform,) = read_by_others(messages.TF, payload).transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("camera", "lidar")
@@ -486,9 +490,12 @@ def test_tf_maps_the_child_to_the_parent() -> None:
 
 def test_several_frames_lie_in_one_message() -> None:
     lidar, radar = np.eye(4), T_CAMERA_LIDAR
-    frames = [outgoing.PlacedFrame("base", "lidar", lidar), outgoing.PlacedFrame("lidar", "camera_calibrated", radar)]
+    frames = [
+        message_encoding.PlacedFrame("base", "lidar", lidar),
+        message_encoding.PlacedFrame("lidar", "camera_calibrated", radar),
+    ]
 
-    told = read_by_others(messages.TF, outgoing.encode_transforms(frames, STAMP_NS)).transforms
+    told = read_by_others(messages.TF, message_encoding.encode_transforms(frames, STAMP_NS)).transforms
 
     assert [(one.header.frame_id, one.child_frame_id) for one in told] == [
         ("base", "lidar"),
@@ -504,7 +511,7 @@ def test_diagnostics() -> None:
     )
     fine = DiagnosticStatus(DiagnosticLevel.OK, "coec: rear_calibration", "healthy", "truck-7/rear", {})
 
-    statuses = read_by_others(messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP_NS, [stale, fine])).status
+    statuses = read_by_others(messages.DIAGNOSTICS, message_encoding.encode_diagnostics(STAMP_NS, [stale, fine])).status
 
     assert [(one.name, one.message, one.hardware_id) for one in statuses] == [
         ("coec: front_calibration", "not looked yet", "truck-7"),
@@ -517,16 +524,16 @@ def test_diagnostics() -> None:
 @pytest.mark.parametrize("model", ["pinhole", "radtan", "kannala_brandt"])
 def test_what_ros_knows_is_said_as_it_is(model: str) -> None:
     camera = CAMERAS[model][0]
-    assert outgoing.ros_camera(camera) == (camera, 0.0)
+    assert message_encoding.ros_camera(camera) == (camera, 0.0)
 
 
 def test_a_double_sphere_is_said_as_equidistant() -> None:
     camera = build("double_sphere", width=640, height=480, fx=300.0, fy=310.0, cx=320.0, cy=235.0, xi=-0.2, alpha=0.59)
 
-    said, residual_px = outgoing.ros_camera(camera)
+    said, residual_px = message_encoding.ros_camera(camera)
 
     assert 0.0 < residual_px < 0.01
-    info = read_by_others(messages.CAMERA_INFO, outgoing.encode_camera_info(rig(said), STAMP_NS))
+    info = read_by_others(messages.CAMERA_INFO, message_encoding.encode_camera_info(rig(said), STAMP_NS))
     assert info.distortion_model == "equidistant"
     assert len(info.d) == 4
     assert info.k[0] == said.fx != 300.0
@@ -536,5 +543,5 @@ def test_a_lens_that_ros_has_no_word_for_is_not_said() -> None:
     size = {"width": 640, "height": 480, "fx": 700.0, "fy": 700.0, "cx": 320.0, "cy": 235.0}
     camera = build("mei", **size, xi=2.2, k1=0.0168, k2=1.6549, p1=0.05, p2=0.0004)
 
-    with pytest.raises(outgoing.UnsupportedCameraError, match=r"more than 0\.5 px"):
-        outgoing.ros_camera(camera)
+    with pytest.raises(message_encoding.UnsupportedCameraError, match=r"more than 0\.5 px"):
+        message_encoding.ros_camera(camera)

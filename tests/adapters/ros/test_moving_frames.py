@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.ros.moving_frames import MAX_BETWEEN_S, MovingFrame
-from coec.adapters.ros.transforms import MAX_TRANSFORMS
 from coec.calibration.types import EgoMotion
 from coec.errors import DecodeError
 from coec.geometry import se3
-from ros_messages import PoseValues, transforms
+from coec.io.ros.transforms import MAX_BETWEEN_S, MAX_TRANSFORMS, MovingFrame
+from support.ros import PoseValues, transforms
 
 START = 1_700_000_000 * 10**9
 MS = 10**6

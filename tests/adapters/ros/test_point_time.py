@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.adapters.ros import incoming, messages
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig, TimeUnit
 from coec.errors import DecodeError
-from ros_messages import STAMP_NS, STAMP_REST_NS, STAMP_S, Columns, packed_cloud
+from coec.io.ros import message_decoding, messages
+from support.ros import STAMP_NS, STAMP_REST_NS, STAMP_S, Columns, packed_cloud
 
 LIMITS = LimitsConfig()
 POINTS = 5
@@ -26,7 +26,7 @@ def cloud_timed(name: str, form: str, values: list[float], *, stamp_ns: int = ST
 
 
 def sweep(payload: bytes, said: PointTimeConfig | None = None) -> LidarFrame:
-    frame = incoming.decode(messages.POINT_CLOUD, payload, LIMITS, point_time=said)
+    frame = message_decoding.decode(messages.POINT_CLOUD, payload, LIMITS, point_time=said)
     assert isinstance(frame, LidarFrame)
     return frame
 

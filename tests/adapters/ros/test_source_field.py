@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.adapters.ros.incoming import decode
-from coec.adapters.ros.messages import POINT_CLOUD
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from ros_messages import CODES, cloud
+from coec.io.ros.message_decoding import decode
+from coec.io.ros.messages import POINT_CLOUD
+from support.ros import CODES, cloud
 
 COUNT = 6
 X = np.arange(1.0, COUNT + 1)
@@ -77,6 +77,6 @@ def test_a_cloud_of_one_lidar_is_taken_as_it_is(name: str, sources: list[int]) -
 
 
 def test_the_list_of_sources_is_short_whatever_the_field_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.adapters.ros.source_field.MAX_LISTED", 2)
+    monkeypatch.setattr("coec.io.ros.point_clouds.MAX_LISTED", 2)
     with pytest.raises(DecodeError, match=r"has 0, 2, \.\.\.;"):
         taken(a_cloud(), None)

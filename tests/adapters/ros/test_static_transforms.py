@@ -8,17 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coec.adapters.ros.static_transforms import (
+from coec.errors import DecodeError
+from coec.geometry import se3
+from coec.io.ros.transforms import (
+    MAX_MESSAGE_BYTES,
     MAX_STATIC_TRANSFORMS,
     StaticTransform,
     StaticTransforms,
     decode_static_transforms,
 )
-from coec.adapters.ros.transforms import MAX_MESSAGE_BYTES
-from coec.errors import DecodeError
-from coec.geometry import se3
-from ros_messages import Packer
-from strategies import twists
+from support.ros import Packer
+from support.strategies import twists
 
 T = se3.exp(np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]))
 

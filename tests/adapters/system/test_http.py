@@ -11,11 +11,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from coec.adapters.system import http as served
-from coec.adapters.system.http import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpRequest, HttpResponse, HttpServer
 from coec.errors import UnavailableError
-from fakes import wait_until
-from ports import free_port
+from coec.io import http_server as served
+from coec.io.http_server import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpRequest, HttpResponse, HttpServer
+from support.fake_worker import wait_until
+from support.router import free_port
 
 BODY = b"x" * 3_000_000
 """Larger than what the system takes at once."""

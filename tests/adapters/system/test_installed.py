@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.installed import NativeLibrary, bsd_licence, installed_packages, pinned_hashes
 from coec.errors import NotFoundError
+from coec.io.installed_packages import NativeLibrary, bsd_licence, installed_packages, pinned_hashes
 
 BSD = "Redistribution and use in source\nand binary forms, with or without modification, are permitted"
 NAMES = "Neither the name of the copyright holder nor"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.listening import listening_addresses
+from coec.io.system import listening_addresses
 
 HEAD = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode\n"
 

@@ -12,9 +12,9 @@ from typing import TextIO
 
 import pytest
 
-from coec.adapters.system import logs
-from coec.adapters.system.logs import Form
-from hostile import HOSTILE, obeyed_characters
+from coec.io import logs
+from coec.io.logs import Form
+from support.strategies import HOSTILE, obeyed_characters
 
 NASTY = "two\nlines \x1b[31mred\x1b[0m\r and a \u202ebackwards"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.notify import ServiceManagerNotifier
+from coec.io.system import ServiceManagerNotifier
 
 
 def test_the_manager_is_told_by_datagrams(tmp_path: Path) -> None:

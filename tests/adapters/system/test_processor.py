@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from coec.adapters.system.processor import processor_time_s
+from coec.io.system import processor_time_s
 
 
 def test_processor_time_is_that_of_the_process_with_all_its_threads() -> None:

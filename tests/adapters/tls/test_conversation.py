@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from certificates import TestAuthority, make_authority
-from coec.adapters.tls import conversation
-from coec.adapters.tls.conversation import (
+from coec.errors import ConfigError, NotProvenError
+from coec.io.zenoh import command_auth
+from coec.io.zenoh.command_auth import (
     MAX_HANDSHAKES,
     MIN_HANDSHAKE_AGE_S,
     SECOND_QUERY_S,
@@ -21,7 +21,7 @@ from coec.adapters.tls.conversation import (
     Credentials,
     TooManyHandshakesError,
 )
-from coec.errors import ConfigError, NotProvenError
+from support.router import TestAuthority, make_authority
 
 TEXT = b"hold everything"
 
@@ -249,4 +249,4 @@ def test_more_than_one_record_is_not_said(authority: TestAuthority, listener: Co
     speaker = CommandSender(authority.credentials("operator"), "vehicle")
     came = flight(listener.receive("1", speaker.first_flight()))
     with pytest.raises(NotProvenError, match="more than 16384 bytes"):
-        speaker.send(came, bytes(conversation.MAX_PAYLOAD_BYTES + 1))
+        speaker.send(came, bytes(command_auth.MAX_PAYLOAD_BYTES + 1))

@@ -17,12 +17,23 @@ import psutil
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.bus import JSON, MSGPACK, WAITING, Answer, Bus, QueryLane, Request, Route, open_session
-from coec.adapters.zenoh.inputs import InputSample, on_key
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError, UnavailableError
-from fakes import wait_until
-from ports import Relay, free_port
+from coec.io.zenoh.bus import (
+    JSON,
+    MSGPACK,
+    WAITING,
+    Answer,
+    Bus,
+    InputSample,
+    QueryLane,
+    Request,
+    Route,
+    on_key,
+    open_session,
+)
+from support.fake_worker import wait_until
+from support.router import Relay, free_port
 
 DEADLINE_S = 20.0
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-import flooding
-from certificates import TestAuthority
 from conftest import REPOSITORY
+from support import flooding
+from support.router import TestAuthority
 
 RULES = REPOSITORY / "deploy" / "nftables.conf"
 SECONDS = 18

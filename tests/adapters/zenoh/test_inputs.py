@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 
-from coec.adapters.ros.wire.rmw_zenoh import TopicKey
-from coec.adapters.zenoh.bus import Bus, open_session
-from coec.adapters.zenoh.inputs import InputSample, input_of
 from coec.config import Config, LimitsConfig, ZenohConfig
 from coec.errors import UsageError
-from ports import free_port
+from coec.io.ros.wire_format import TopicKey
+from coec.io.zenoh.bus import Bus, InputSample, input_of, open_session
+from support.router import free_port
 
 IMAGE = "0/front/image_raw/sensor_msgs::msg::dds_::Image_/"
 IMAGE += "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"

@@ -12,18 +12,17 @@ from pathlib import Path
 import pytest
 import zenoh
 
-import rmw_zenoh_defaults
-from coec.adapters.ros.wire.qos import Qos
-from coec.adapters.zenoh.bus import MSGPACK, Answer, Bus, QueryLane, Route, is_connected, open_session
-from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.ros_publisher import RosPublishers
-from coec.adapters.zenoh.ros_side import RosSide
 from coec.config import Config, LimitsConfig, ZenohConfig
-from coec.schemas.ros_names import TF_STATIC
+from coec.io.ros.wire_format import Qos
+from coec.io.zenoh.bus import MSGPACK, Answer, Bus, QueryLane, Route, is_connected, open_session
+from coec.io.zenoh.query_client import connected
+from coec.io.zenoh.ros_node import RosPublishers, RosSide
+from coec.schemas.keys import TF_STATIC
 from conftest import REPOSITORY
-from fakes import wait_until
-from ports import free_port
-from ros_nodes import RosDriver
+from support import ros
+from support.fake_worker import wait_until
+from support.ros import RosDriver
+from support.router import free_port
 
 LIMITS = LimitsConfig()
 PATIENCE_S = 30.0
@@ -65,7 +64,7 @@ def plain(endpoint: str) -> Iterator[zenoh.Session]:
 
 
 ROUTERS: dict[str, Opened] = {
-    "rmw_zenoh's": rmw_zenoh_defaults.rmw_router,
+    "rmw_zenoh's": ros.rmw_router,
     "shipped": shipped,
     "embedded": embedded,
     "plain": plain,
@@ -85,7 +84,7 @@ def endpoint() -> str:
 def test_default_nodes_and_the_service_reach_each_other(kind: str, endpoint: str) -> None:
     with ExitStack() as stack:
         stack.enter_context(ROUTERS[kind](endpoint))
-        node = stack.enter_context(rmw_zenoh_defaults.rmw_node(endpoint))
+        node = stack.enter_context(ros.rmw_node(endpoint))
         service = stack.enter_context(open_session(ZenohConfig(connect=(endpoint,)), LIMITS))
         side = RosSide(service, ROS)
         stack.callback(side.close)
@@ -124,7 +123,7 @@ def test_default_nodes_and_the_service_reach_each_other(kind: str, endpoint: str
 def test_default_nodes_reach_each_other(kind: str, endpoint: str) -> None:
     with ExitStack() as stack:
         stack.enter_context(ROUTERS[kind](endpoint))
-        one, other = (stack.enter_context(rmw_zenoh_defaults.rmw_node(endpoint)) for _ in range(2))
+        one, other = (stack.enter_context(ros.rmw_node(endpoint)) for _ in range(2))
         got: list[bytes] = []
 
         def take(sample: zenoh.Sample) -> None:
@@ -153,7 +152,7 @@ def test_a_session_waits_for_its_router_and_finds_it_again(endpoint: str) -> Non
         )
         bus.publish("test/lost", Answer(b"", MSGPACK))  # to nobody, and at once
         for at in (endpoint, endpoint, second):
-            with rmw_zenoh_defaults.rmw_router(at), connected((at,), PATIENCE_S) as client:
+            with ros.rmw_router(at), connected((at,), PATIENCE_S) as client:
                 driver = RosDriver(client, TOPIC, "CompressedImage", 1)
                 wait_until(lambda: bool(list(client.get("test/value", timeout=1.0))), "the answer", PATIENCE_S)
                 wait_until(lambda: bool(list(client.liveliness().get("test/alive"))), "the token", PATIENCE_S)

@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from coec.adapters.zenoh import presence
-from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.presence import SingletonGuard, next_step, outranking
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import UnavailableError
-from coec.schemas.base import to_json
+from coec.io.zenoh import singleton
+from coec.io.zenoh.bus import open_session
+from coec.io.zenoh.singleton import SingletonGuard, next_step, outranking
 from coec.schemas.keys import Claim, Keys
-from fakes import wait_until
-from ports import free_port
-from statuses import status_reply
+from coec.schemas.message import to_json
+from support.fake_worker import wait_until
+from support.messages import status_reply
+from support.router import free_port
 
 KEYS = Keys("coec", "vehicle")
 LIMITS = LimitsConfig()
@@ -164,7 +164,7 @@ def test_a_token_without_an_answer_ends_nothing(
     caplog: pytest.LogCaptureFixture,
     key: str,
 ) -> None:
-    monkeypatch.setattr(presence, "PROOF_S", 0.2)
+    monkeypatch.setattr(singleton, "PROOF_S", 0.2)
     one = daemon(sessions[0])
     with held(router, key):
         assert serves(one)
@@ -178,7 +178,7 @@ def test_a_token_without_an_answer_ends_nothing(
 def test_a_token_without_an_answer_ends_no_service_that_runs(
     router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(presence, "WATCH_S", 0.02)
+    monkeypatch.setattr(singleton, "WATCH_S", 0.02)
     one = daemon(sessions[0])
     assert serves(one)
     one.thread.start()
@@ -205,7 +205,7 @@ def test_a_service_of_an_earlier_version_is_seen_by_its_status(
 @pytest.mark.fault("more tokens of daemons than are kept", "a daemon that is there is seen all the same")
 def test_tokens_hide_no_daemon(router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made) -> None:
     assert serves(daemon(sessions[0]))
-    flood = [KEYS.claim(Claim(f"{number:x}", 1, serving=True)) for number in range(1, 3 * presence.MAX_OTHERS)]
+    flood = [KEYS.claim(Claim(f"{number:x}", 1, serving=True)) for number in range(1, 3 * singleton.MAX_OTHERS)]
     with held(router, *flood), pytest.raises(UnavailableError, match=r"started 2023-11-14 22:13:20 UTC"):
         daemon(sessions[1]).claim(threading.Event())
 
@@ -221,7 +221,7 @@ def test_a_wider_query_gets_no_claim(sessions: list[zenoh.Session], daemon: Made
 
 @pytest.mark.fault("a router whose rules let no daemon query another", "its tokens count without an answer, as before")
 def test_where_queries_are_forbidden_tokens_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(presence, "PROOF_S", 0.2)
+    monkeypatch.setattr(singleton, "PROOF_S", 0.2)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     file = tmp_path / "router.json5"
     settings = {"mode": "router", "listen": {"endpoints": [endpoint]}, "access_control": hiding("query")}
@@ -248,8 +248,8 @@ def test_a_token_of_another_form_is_nobody(router: zenoh.Session, sessions: list
 def test_two_that_started_before_their_router_see_each_other_when_it_is_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(presence, "WATCH_S", 0.02)
-    monkeypatch.setattr(presence, "CONNECT_S", 0.1)
+    monkeypatch.setattr(singleton, "WATCH_S", 0.02)
+    monkeypatch.setattr(singleton, "CONNECT_S", 0.1)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = ZenohConfig(connect=(endpoint,))
     with open_session(config, LIMITS) as here, open_session(config, LIMITS) as there:
@@ -290,9 +290,9 @@ def hiding(*messages: str) -> dict[str, object]:
 def test_tokens_that_a_router_hides_are_told_of(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, messages: tuple[str, ...]
 ) -> None:
-    monkeypatch.setattr(presence, "WATCH_S", 0.02)
-    monkeypatch.setattr(presence, "CONNECT_S", 0.5)
-    monkeypatch.setattr(presence, "SEEN_S", 0.2)
+    monkeypatch.setattr(singleton, "WATCH_S", 0.02)
+    monkeypatch.setattr(singleton, "CONNECT_S", 0.5)
+    monkeypatch.setattr(singleton, "SEEN_S", 0.2)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     file = tmp_path / "router.json5"
     settings = {"mode": "router", "listen": {"endpoints": [endpoint]}, "access_control": hiding(*messages)}

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.system.listening import IpAddress, Transport
-from coec.adapters.zenoh.reach import Reach
-from coec.adapters.zenoh.settings import settings_of
 from coec.config import LimitsConfig, ZenohConfig
+from coec.io.system import IpAddress, Transport
+from coec.io.zenoh.session import Reach, settings_of
 
 LIMITS = LimitsConfig()
 

@@ -12,16 +12,16 @@ from typing import Any, cast
 import pytest
 import zenoh
 
-from coec.adapters.zenoh import client
-from coec.adapters.zenoh.client import JSON, Replies, ReplyBounds, connected, query_all, query_one
-from coec.adapters.zenoh.words import MAX_WAITING_BYTES, HeartbeatReceiver
 from coec.errors import NotFoundError, RemoteError
-from coec.schemas.base import to_json
+from coec.io.zenoh import query_client
+from coec.io.zenoh.query_client import JSON, Replies, ReplyBounds, connected, query_all, query_one
+from coec.io.zenoh.subscriptions import MAX_WAITING_BYTES, HeartbeatReceiver
+from coec.schemas.heartbeat import MAX_HEARTBEAT_BYTES
 from coec.schemas.keys import Keys
-from coec.schemas.last_word import MAX_HEARTBEAT_BYTES
+from coec.schemas.message import to_json
 from coec.schemas.replies import ErrorReply
 from e2e.processes import Router
-from fakes import wait_until
+from support.fake_worker import wait_until
 
 PATIENCE_S = 20.0
 SMALL = ReplyBounds(replies=5, total_bytes=1000, reply_bytes=400)
@@ -101,9 +101,9 @@ def test_an_error_reply_ends_the_query_and_is_bounded() -> None:
     replies.add(an_error(to_json(ErrorReply(code="busy", message="later"))))
     replies.add(a_reply("a/1", 1, may_be_copied=False))
     assert (ended, refused(replies).reply_code) == ([True], "busy")
-    assert refused(collected(an_error(bytes(client.MAX_ERROR_BYTES + 1)))).reply_code == "unknown"
-    assert refused(collected(an_error(client.TIMEOUT_PAYLOAD))).reply_code == "timeout"
-    assert len(collected(an_error(client.TIMEOUT_PAYLOAD), a_reply("a/1", 1)).result()) == 1
+    assert refused(collected(an_error(bytes(query_client.MAX_ERROR_BYTES + 1)))).reply_code == "unknown"
+    assert refused(collected(an_error(query_client.TIMEOUT_PAYLOAD))).reply_code == "timeout"
+    assert len(collected(an_error(query_client.TIMEOUT_PAYLOAD), a_reply("a/1", 1)).result()) == 1
 
 
 @contextmanager
@@ -123,7 +123,7 @@ def own_key() -> str:
 
 @pytest.mark.fault("a program that answers with endless replies", "the query ends at the bound, long before its time")
 def test_a_flood_of_replies_ends_the_query(router: Router, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client, "OF_MANY_KEYS", SMALL)
+    monkeypatch.setattr(query_client, "OF_MANY_KEYS", SMALL)
     key, over = own_key(), threading.Event()
 
     def flood(query: zenoh.Query) -> None:
@@ -143,14 +143,14 @@ def test_a_flood_of_replies_ends_the_query(router: Router, monkeypatch: pytest.M
 @pytest.mark.fault("a reply larger than any message", "Zenoh drops it, and the client says that this may be the reason")
 def test_an_answer_larger_than_a_message_is_no_answer(router: Router) -> None:
     key = own_key()
-    too_large = bytes(client.MAX_MESSAGE_BYTES + 2**20)
+    too_large = bytes(query_client.MAX_MESSAGE_BYTES + 2**20)
     with (
         answering(router, key, lambda query: query.reply(key, too_large)),
         connected([router.endpoint], 5.0) as session,
         pytest.raises(NotFoundError),
     ):
         query_one(session, key, 5.0)
-    assert str(client.MAX_MESSAGE_BYTES) in str(client.no_reply_error(key, service_is_there=True))
+    assert str(query_client.MAX_MESSAGE_BYTES) in str(query_client.no_reply_error(key, service_is_there=True))
 
 
 @pytest.mark.fault("words of the largest size, faster than they are read", "those beyond 64 MiB are counted as lost")
@@ -172,8 +172,8 @@ def test_words_that_wait_are_bounded_in_bytes() -> None:
 def test_one_token_of_many_says_that_a_service_is_there(router: Router) -> None:
     keys = Keys("coec", "tokens")
     with connected([router.endpoint], 5.0) as session:
-        assert not client.is_alive(session, keys, PATIENCE_S)
+        assert not query_client.is_alive(session, keys, PATIENCE_S)
         tokens = [router.session.liveliness().declare_token(keys.alive(f"pair-{index}")) for index in range(100)]
-        wait_until(lambda: client.is_alive(session, keys, PATIENCE_S), "the tokens are seen")
+        wait_until(lambda: query_client.is_alive(session, keys, PATIENCE_S), "the tokens are seen")
         for token in tokens:
             token.undeclare()

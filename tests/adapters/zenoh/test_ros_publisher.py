@@ -11,18 +11,14 @@ import pytest
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
-from coec.adapters.ros.dialects import dialect_of
-from coec.adapters.ros.messages import TF
-from coec.adapters.ros.wire.dialect import Dialect
-from coec.adapters.ros.wire.qos import STATIC, Qos
-from coec.adapters.ros.wire.rmw_zenoh import MessageAttachment, Node, RmwZenoh, gid_of
-from coec.adapters.ros.wire.ros2dds import Ros2dds
-from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
 from coec.config import LimitsConfig, RosConfig, ZenohConfig
-from fakes import wait_until
-from pair_bench import pair_configuration
-from ports import free_port
+from coec.io.ros.messages import TF
+from coec.io.ros.wire_format import STATIC, Dialect, MessageAttachment, Node, Qos, RmwZenoh, Ros2dds, gid_of
+from coec.io.zenoh.bus import open_session
+from coec.io.zenoh.ros_node import RosNode, RosPublishers, dialect_of
+from support.fake_worker import wait_until
+from support.router import free_port
+from support.vehicles import pair_configuration
 
 TIMEOUT_S = 20.0
 STRING = "std_msgs/msg/String"

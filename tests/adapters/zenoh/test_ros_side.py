@@ -9,14 +9,13 @@ from contextlib import ExitStack
 import pytest
 import zenoh
 
-from coec.adapters.zenoh import ros_topics
-from coec.adapters.zenoh.bus import Bus, open_session
-from coec.adapters.zenoh.ros_side import RosSide
-from coec.adapters.zenoh.ros_topics import RosTopicList, listed
 from coec.config import Config, LimitsConfig, ZenohConfig
-from coec.schemas.ros_names import ros_name
-from fakes import wait_until
-from ports import free_port
+from coec.io.zenoh import ros_node
+from coec.io.zenoh.bus import Bus, open_session
+from coec.io.zenoh.ros_node import RosSide, RosTopicList, listed
+from coec.schemas.keys import ros_name
+from support.fake_worker import wait_until
+from support.router import free_port
 
 OTHER = "aa0ba1fb1b3a2e2c9d8f5e6c3b4a5d6e"
 IMAGE_HASH = "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"
@@ -176,7 +175,7 @@ def test_a_token_that_tells_of_no_publisher_is_counted(session: zenoh.Session, s
 def test_of_too_many_tokens_the_first_are_kept(
     session: zenoh.Session, side: RosSide, stack: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ros_topics, "MAX_PUBLISHERS", 100)
+    monkeypatch.setattr(ros_node, "MAX_PUBLISHERS", 100)
     for number in range(300):
         declared = session.liveliness().declare_token(DRIVER.replace("/10/", f"/{number}/"))
         stack.callback(declared.undeclare)

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.router import open_router
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
-from ports import free_port
+from coec.io.zenoh.bus import open_session
+from coec.io.zenoh.session import open_router
+from support.router import free_port
 
 SECRET = "c2VjcmV0"
 

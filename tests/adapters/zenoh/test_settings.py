@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.zenoh.settings import settings_of, unguarded
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
+from coec.io.zenoh.session import settings_of, unguarded
 
 LIMITS = LimitsConfig()
 EVERYBODY = "tcp/[::]:7447"

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.matching import has_subscribers
+from coec.io.zenoh.ros_node import has_subscribers
 from e2e.processes import environment
-from fakes import wait_until
-from ports import free_port
+from support.fake_worker import wait_until
+from support.router import free_port
 
 ROUTERS, MESSAGES = 3, 8
 PAYLOAD = bytes(2_000_000)
@@ -23,8 +23,8 @@ POOL_MIB = 16
 
 RECEIVER = """
 import sys
-from coec.adapters.zenoh.bus import Bus, open_session
-from coec.adapters.zenoh.inputs import on_key
+from coec.io.zenoh.bus import Bus, open_session
+from coec.io.zenoh.bus import on_key
 from coec.config import LimitsConfig, ZenohConfig
 from pathlib import Path
 

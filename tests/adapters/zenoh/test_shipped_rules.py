@@ -25,20 +25,17 @@ from zenoh.ext import (
     declare_advanced_subscriber,
 )
 
-from certificates import TestAuthority, make_authority
-from coec.adapters.tls.conversation import CommandSender
-from coec.adapters.zenoh.bus import JSON, open_session
-from coec.adapters.zenoh.client import RouterAddress, connected_by, is_alive
-from coec.adapters.zenoh.inputs import on_key
-from coec.adapters.zenoh.presence import SingletonGuard
-from coec.adapters.zenoh.proven import send_authenticated
-from coec.adapters.zenoh.ros_side import RosSide
 from coec.config import IDENTITY, Config, SenderConfig, ZenohConfig
 from coec.errors import ConnectionFailedError, UnavailableError
-from doors import ShippedRouter, shipped_router
-from fakes import wait_until
-from ros_nodes import RosDriver, type_chunks
-from vehicles import KEYS, PAIR, VEHICLE_LIMITS, ServingVehicle, serving
+from coec.io.zenoh.bus import JSON, on_key, open_session
+from coec.io.zenoh.command_auth import CommandSender
+from coec.io.zenoh.query_client import RouterAddress, connected_by, is_alive, send_authenticated
+from coec.io.zenoh.ros_node import RosSide
+from coec.io.zenoh.singleton import SingletonGuard
+from support.fake_worker import wait_until
+from support.ros import RosDriver, type_chunks
+from support.router import ShippedRouter, TestAuthority, make_authority, shipped_router
+from support.vehicles import KEYS, PAIR, VEHICLE_LIMITS, ServingVehicle, serving
 
 PATIENCE_S = 20.0
 REFUSED_S = 0.5

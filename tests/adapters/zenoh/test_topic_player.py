@@ -8,13 +8,13 @@ import threading
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
-from coec.adapters.ros.messages import TF
-from coec.adapters.ros.topics import TopicMessage
-from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.topic_player import TopicPlayer, dialect_of
 from coec.config import LimitsConfig, ZenohConfig
-from coec.schemas.ros_names import TF_STATIC
-from ports import free_port
+from coec.io.ros.messages import TF
+from coec.io.ros.topics import TopicMessage
+from coec.io.zenoh.bus import open_session
+from coec.io.zenoh.player import TopicPlayer, dialect_of
+from coec.schemas.keys import TF_STATIC
+from support.router import free_port
 
 SECONDS = 20.0
 

@@ -7,18 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from baselines import a_baseline
-from coec.calibration.commissioning.baseline import (
-    PIXEL_SHARE,
-    Accuracy,
-    drift,
-    mismatch,
-    uncommissioned,
-)
+from coec.calibration.baseline import PIXEL_SHARE, Accuracy, drift, mismatch, uncommissioned
 from coec.calibration.types import Window
 from coec.config import VerdictConfig
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
+from support.estimates import a_baseline
 
 
 class TestAccuracy:

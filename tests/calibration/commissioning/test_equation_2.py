@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from coec.calibration.commissioning.equation_2 import PaperLimits
+from coec.calibration.baseline import PaperLimits
 
 
 @dataclass(frozen=True)

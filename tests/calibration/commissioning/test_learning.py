@@ -12,23 +12,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.files.baseline_file import baseline_hash
-from coec.adapters.images.codec import CachedGreys, GreyImages
-from coec.calibration.commissioning import learning, verdict_limits
-from coec.calibration.commissioning.baseline import PRIOR_SPREAD_POSE, Baseline, learned_hash
-from coec.calibration.commissioning.learning import commission, learn_accuracy
-from coec.calibration.commissioning.quantiles import distance2_quantile
-from coec.calibration.commissioning.verdict_limits import learned
-from coec.calibration.estimators import prepare_window_data
+from coec.calibration import commissioning
+from coec.calibration.baseline import PRIOR_SPREAD_POSE, Baseline, distance2_quantile, learned_hash
+from coec.calibration.commissioning import commission, learn_accuracy, learned
 from coec.calibration.monitor.check import CheckInput, gather
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, diagnose, observe
 from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.solver import prepare_window_data
 from coec.calibration.types import Decision, Estimate, Metric, Rig, Verdict, Window
 from coec.config import CalibrationConfig, LimitsConfig, SearchConfig
 from coec.errors import CalibrationError
-from coec.evaluation.detection import MIN_RECORDED, interval, table, try_detection
 from coec.geometry import se3
-from estimates import estimate
+from coec.io.baseline_file import baseline_hash
+from coec.io.images import CachedGreys, GreyImages
+from coec_lab.experiments.detection import MIN_RECORDED, interval, table, try_detection
+from support.estimates import estimate
 
 CONFIG = CalibrationConfig(search=SearchConfig(reach_deg=8.0))
 """The starts are 5 degrees away: looking no further keeps the solves short."""
@@ -38,9 +36,9 @@ CONFIG = CalibrationConfig(search=SearchConfig(reach_deg=8.0))
 def few_checks() -> Iterator[None]:
     """What is learned from few checks is less precise, and learned in the same way."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning, "CHECKS", 5)
-        patch.setattr(learning, "FAR_CHECKS", 3)
-        patch.setattr(verdict_limits, "SOLVES", 2)
+        patch.setattr(commissioning, "CHECKS", 5)
+        patch.setattr(commissioning, "FAR_CHECKS", 3)
+        patch.setattr(commissioning, "SOLVES", 2)
         yield
 
 
@@ -121,13 +119,13 @@ def test_spread_of_a_pair_is_found_from_checks_at_halves(sharp_street: Window, m
         mean = evidence.says.mean(axis=0)
         return SimpleNamespace(offset_rotation=np.where(np.arange(6) < 3, mean, 0.0), offset_pose=mean)
 
-    monkeypatch.setattr(learning, "check_at", check_of)
+    monkeypatch.setattr(commissioning, "check_at", check_of)
     drives = true * np.random.default_rng(1).normal(size=(100, 48, 6))
     learned_from = [learn_accuracy(cast(CheckInput, _Scripted(says, sharp_street.rig)), np.eye(4)) for says in drives]
     variance = np.mean([pose.spread**2 for _, pose in learned_from], axis=0)
-    free = learning.BLOCKS - 1
-    expected = learning.PRIOR_BLOCKS * PRIOR_SPREAD_POSE**2 + free * true**2
-    np.testing.assert_allclose(variance * (learning.PRIOR_BLOCKS + free), expected, rtol=0.15)
+    free = commissioning.BLOCKS - 1
+    expected = commissioning.PRIOR_BLOCKS * PRIOR_SPREAD_POSE**2 + free * true**2
+    np.testing.assert_allclose(variance * (commissioning.PRIOR_BLOCKS + free), expected, rtol=0.15)
     for says, (rotation, pose) in zip(drives, learned_from, strict=True):
         np.testing.assert_allclose(pose.bias, says.mean(axis=0))
         assert np.isfinite(rotation.spread[:3]).all()
@@ -137,7 +135,7 @@ def test_spread_of_a_pair_is_found_from_checks_at_halves(sharp_street: Window, m
 def test_detection_learns_on_some_pairs_and_tries_others(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
-    evidence = gather(prepare_window_data(sharp_street, stereo, images, CONFIG, Silence()), learning.FAR_RAD)
+    evidence = gather(prepare_window_data(sharp_street, stereo, images, CONFIG, Silence()), commissioning.FAR_RAD)
     heard: list[tuple[int, int]] = []
     tried = try_detection(evidence, sharp_street.T_camera_lidar_start, CONFIG, 1, 3, lambda *step: heard.append(step))
     rows = {row.name: row for row in table(tried)}
@@ -178,11 +176,13 @@ def limits_of(says: NDArray[np.float64], rig: Rig, monkeypatch: pytest.MonkeyPat
     def depth_of(*_: object) -> SimpleNamespace:
         return SimpleNamespace(agreement_rad=0.0, mi=1.0, f1=1.0, f2=1.0)
 
-    monkeypatch.setattr(learning, "check_at", check_of)
-    monkeypatch.setattr(learning, "depth_cue", depth_of)
-    monkeypatch.setattr(learning, "CHECKS", 12)
+    monkeypatch.setattr(commissioning, "check_at", check_of)
+    monkeypatch.setattr(commissioning, "depth_cue", depth_of)
+    monkeypatch.setattr(commissioning, "CHECKS", 12)
     evidence = cast(CheckInput, _Scripted(says, rig))
-    limits = learning.learn_limits(evidence, np.eye(4), CONFIG, learn_accuracy(evidence, np.eye(4)), FALSE_ALARM_RATE)
+    limits = commissioning.learn_limits(
+        evidence, np.eye(4), CONFIG, learn_accuracy(evidence, np.eye(4)), FALSE_ALARM_RATE
+    )
     return limits.max_distance2_rotation, limits.max_farthest2_pose
 
 
@@ -196,7 +196,7 @@ def test_limits_are_those_of_blocks_of_time_that_were_left_out(
     same = limits_of(noise, sharp_street.rig, monkeypatch)
     other = limits_of(noise + apart, sharp_street.rig, monkeypatch)
     mixed = limits_of(noise + apart[rng.permutation(48)], sharp_street.rig, monkeypatch)
-    known_by = learning.PRIOR_BLOCKS + learning.BLOCKS - 1
+    known_by = commissioning.PRIOR_BLOCKS + commissioning.BLOCKS - 1
     least = distance2_quantile(1.0 - FALSE_ALARM_RATE / 2.0, 3, known_by)
     assert same[0] >= least
     assert other[0] > 1.5 * mixed[0] or other[1] > 1.5 * mixed[1]

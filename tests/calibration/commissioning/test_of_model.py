@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from baselines import a_baseline
-from boards import BOARD_LENSES, board_rig
-from coec.adapters.files.baseline_file import baseline_hash
-from coec.calibration.commissioning.baseline import Accuracy, Baseline, uncommissioned
-from coec.calibration.commissioning.of_model import MIN_VEHICLES, for_rig, model_baseline
+from coec.calibration.baseline import MIN_VEHICLES, Accuracy, Baseline, for_rig, model_baseline, uncommissioned
 from coec.errors import CalibrationError
 from coec.geometry import se3
+from coec.io.baseline_file import baseline_hash
+from support.estimates import a_baseline
+from support.scenes import BOARD_LENSES, board_rig
 
 AMONG = np.array([0.003, 0.002, 0.004, 0.01, 0.02, 0.03])
 """How biases of vehicles differ, rad and m."""

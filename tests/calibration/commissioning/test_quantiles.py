@@ -2,7 +2,7 @@
 
 import pytest
 
-from coec.calibration.commissioning.quantiles import chi2_quantile, distance2_quantile, normal_quantile
+from coec.calibration.baseline import chi2_quantile, distance2_quantile, normal_quantile
 
 
 @pytest.mark.parametrize(("probability", "value"), [(0.5, 0.0), (0.975, 1.959964), (0.01, -2.326348)])

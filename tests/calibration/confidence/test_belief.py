@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.calibration.confidence.belief import CENTRE_EVEN, centre_weight, posterior_weight
+from coec.calibration.uncertainty.nuisance_parameters import CENTRE_EVEN, centre_weight, posterior_weight
 
 KNOWN_M = 0.01
 """What a rule leaves."""

@@ -7,12 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.budget import COLUMN_SHARE, EDGE_PX, HELD, STAMP_S, TERMS, systematic_shifts
-from coec.calibration.confidence.grain import LENS_PX, SensorResolution, column_rad, sensor_resolution
-from coec.calibration.objective.cells import PointsInView
+from coec.calibration.objective.mutual_information import PointsInView
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Window
-from estimates import ESTIMATE_RIG
-from landscapes import Array
+from coec.calibration.uncertainty.systematic import (
+    COLUMN_SHARE,
+    EDGE_PX,
+    HELD,
+    LENS_PX,
+    STAMP_S,
+    TERMS,
+    SensorResolution,
+    column_rad,
+    sensor_resolution,
+    systematic_shifts,
+)
+from support.estimates import ESTIMATE_RIG
+from support.scenes import Array
 
 FRAMES = 4
 UP_OF_LIDAR = np.array([0.0, -1.0, 0.0])

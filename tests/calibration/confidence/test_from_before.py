@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from coec.calibration.confidence.from_before import mode_next_to_prior
+from coec.calibration.uncertainty.modes import mode_next_to_prior
 from coec.geometry import se3
-from corners import IDENTITY_POSE, corner_edge_levels, corner_motions, corner_pixels, corner_points, corner_window
+from support.scenes import (
+    IDENTITY_POSE,
+    corner_edge_levels,
+    corner_motions,
+    corner_pixels,
+    corner_points,
+    corner_window,
+)
 
 
 def test_it_is_the_true_one_where_the_place_was_known_and_the_search_went_astray(rng: np.random.Generator) -> None:

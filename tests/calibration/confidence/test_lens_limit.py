@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.lens_limit import require_fit
+from coec.calibration.uncertainty.systematic import require_fit
 from coec.errors import LensError
 from coec.geometry.cameras import Camera, build
 from coec.geometry.cameras.double_sphere_fit import DoubleSphereFit, fit_double_sphere

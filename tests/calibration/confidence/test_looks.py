@@ -10,14 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.conftest import window_of
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.confidence.looks import effective_sample_size, independent_samples_at
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.objective.edges import EdgeCue, build_edges
 from coec.calibration.types import Window
+from coec.calibration.uncertainty.scatter import effective_sample_size, independent_samples_at
 from coec.config import LimitsConfig
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
-from drives import rendered_source
+from coec.io.images import GreyImages
+from support.simulated_drives import rendered_source
 
 FRAMES = 10
 MOTORWAY = "sim:seed=3&seconds=12&camera_hz=0.5&lidar_hz=0.5&scene=highway&camera=pinhole640x400&lidar=64"

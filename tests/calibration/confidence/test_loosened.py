@@ -7,19 +7,21 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.loosened import (
+from coec.calibration.uncertainty.nuisance_parameters import (
+    CLOCKS,
     CLOCKS_FREE,
     HELD_FREE,
     LEAST_PX,
+    LENS,
     LENS_FREE,
+    SHIFTS,
     RelaxedAssumption,
     relax_assumptions,
     weight_beyond_turn,
 )
-from coec.calibration.confidence.told import CLOCKS, LENS, SHIFTS
 from coec.config import VerdictConfig
 from coec.geometry import se3
-from corners import (
+from support.scenes import (
     CORNER_CAMERA,
     CORNER_FRAMES,
     IDENTITY_POSE,

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.modes import Rivals, with_modes
-from coec.calibration.objective.cells import Cells
-from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.objective.mutual_information import Cells, Evaluation
+from coec.calibration.uncertainty.modes import Rivals, with_modes
 from coec.geometry import se3
-from landscapes import NO_SIGHT_LINES, Array
+from support.scenes import NO_SIGHT_LINES, Array
 
 AWAY = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0])
 SIGMA = 1e-3

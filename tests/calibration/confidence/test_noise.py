@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.landscape import scatter
-from coec.calibration.confidence.noise import measure_noise
-from landscapes import Array, landscape, paraboloids
+from coec.calibration.uncertainty.covariance import measure_noise
+from coec.calibration.uncertainty.scatter import scatter
+from support.scenes import Array, landscape, paraboloids
 
 FRAMES, SECTORS = 20, 16
 SPREAD = 1e-3

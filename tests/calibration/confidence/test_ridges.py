@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.noise import measure_noise
-from coec.calibration.confidence.ridges import widened
-from landscapes import Array, landscape, paraboloids
+from coec.calibration.uncertainty.covariance import measure_noise, widened
+from support.scenes import Array, landscape, paraboloids
 
 SHAPE = (20, 16, 3)
 TOP = 6e-4

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.shifted import translation_profile
-from coec.calibration.objective.cells import Cells
-from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.objective.mutual_information import Cells, Evaluation
+from coec.calibration.uncertainty.modes import translation_profile
 from coec.config import CalibrationConfig
 from coec.geometry import se3
-from landscapes import Array
+from support.scenes import Array
 
 CONFIG = CalibrationConfig.model_validate({"search": {"dof": 6}})
 ASIDE_M = CONFIG.verdict.max_sigma_m

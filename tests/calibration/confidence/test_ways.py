@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.told import PRINCIPAL_POINT, SIZE, AssumedEdges
-from coec.calibration.confidence.ways import BEGINS, ParameterSubset, ends_along, local_ascent
+from coec.calibration.uncertainty.nuisance_parameters import (
+    BEGINS,
+    PRINCIPAL_POINT,
+    SIZE,
+    AssumedEdges,
+    ParameterSubset,
+    ends_along,
+    local_ascent,
+)
 
 SUMMIT = np.array([0.016, -0.012])
 """Where the principal point is, in focal lengths from where it was assumed."""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames import between
-from coec.calibration.frames.between import BetweenPairs, thinned_sweep
+from coec.calibration.frames import window
+from coec.calibration.frames.window import BetweenPairs, thinned_sweep
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame
 from coec.config import WindowConfig
 from coec.errors import DecodeError
@@ -104,7 +104,7 @@ def street(rings: int, columns: int, *, numbered: bool) -> LidarFrame:
 def test_range_edges_of_a_thinned_sweep_are_edges_of_the_whole(numbered: bool) -> None:
     whole = street(64, 1800, numbered=numbered)
     thinned = thinned_sweep(whole, FORWARD, np.radians(45.0))
-    assert 0.5 * between.POINTS < len(thinned.xyz_m) < 1.2 * between.POINTS
+    assert 0.5 * window.POINTS < len(thinned.xyz_m) < 1.2 * window.POINTS
     assert thinned.intensity is None
     assert thinned.time_offset_s is not None
     assert whole.time_offset_s is not None
@@ -116,7 +116,7 @@ def test_range_edges_of_a_thinned_sweep_are_edges_of_the_whole(numbered: bool) -
     assert found <= set(of_whole.index.tolist())
     # At the border of what is kept, a neighbour may be missing.
     angle = np.arccos(whole.xyz_m[:, 0] / np.linalg.norm(whole.xyz_m, axis=1))
-    kept = set(index[angle[index] < np.radians(45.0) + between.BEYOND_RAD - NEIGHBOUR_RAD].tolist())
+    kept = set(index[angle[index] < np.radians(45.0) + window.BEYOND_RAD - NEIGHBOUR_RAD].tolist())
     seen = kept & set(of_whole.index.tolist())
     assert seen <= found, "none of the lines that are kept is torn"
     assert len(seen) > 100
@@ -126,7 +126,7 @@ def test_a_sweep_of_few_points_stays_whole_where_it_is_in_view() -> None:
     sweep = street(16, 400, numbered=True)
     ahead = thinned_sweep(sweep, FORWARD, np.radians(45.0)).xyz_m
     angle = np.arccos(sweep.xyz_m[:, 0] / np.linalg.norm(sweep.xyz_m, axis=1))
-    np.testing.assert_array_equal(ahead, sweep.xyz_m[angle <= np.radians(45.0) + between.BEYOND_RAD])
+    np.testing.assert_array_equal(ahead, sweep.xyz_m[angle <= np.radians(45.0) + window.BEYOND_RAD])
     np.testing.assert_array_equal(thinned_sweep(sweep, FORWARD, np.pi).xyz_m, sweep.xyz_m)
 
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames.concatenation import SeveralOrigins
-from coec.calibration.frames.origin import OriginCheck, apparent_origin
+from coec.calibration.frames.lidar_origin import OriginCheck, SeveralOrigins, apparent_origin
 from coec.calibration.types import LidarFrame
 from coec.geometry import se3
-from sweeps import ROOF_POSE, sweep_in_frame, turning_sweep
+from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
 
 LEFT = se3.exp(np.array([0.05, 0.0, 1.2, 0.6, 0.9, 1.2]))
 RIGHT = se3.exp(np.array([-0.04, 0.02, -1.2, 0.6, -0.9, 1.2]))

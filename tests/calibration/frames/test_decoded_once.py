@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames import decoded_once
-from coec.calibration.frames.decoded_once import CachedImages
+from coec.calibration import solver
+from coec.calibration.solver import CachedImages
 from coec.calibration.types import CameraFrame
 
 
@@ -45,7 +45,7 @@ def test_an_image_is_decoded_once_for_both_looks_and_then_forgotten() -> None:
 
 def test_no_more_is_kept_than_may_be_and_what_goes_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
     reader, frames = Counted(), [cast(CameraFrame, Frame(value)) for value in range(3)]
-    monkeypatch.setattr(decoded_once, "MAX_CACHED_BYTES", 2 * 20)
+    monkeypatch.setattr(solver, "MAX_CACHED_BYTES", 2 * 20)
     once = CachedImages(reader)
     for frame in frames:
         once.first(frame)

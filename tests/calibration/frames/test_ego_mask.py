@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import scenarios
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.estimators import prepare_window_data
 from coec.calibration.frames.ego_mask import GRID_WIDTH, MIN_FRAMES, DeadRegions, lit_pixels
 from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.solver import prepare_window_data
 from coec.calibration.types import Window
 from coec.config import CalibrationConfig, LimitsConfig
-from coec.sources import windows
+from coec.io.images import GreyImages
+from coec.io.recordings import window_cutting
+from support import degradations
 
 Grey = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -197,7 +197,7 @@ def test_a_window_without_a_mask_gets_the_one_its_frames_tell(sharp_street: Wind
 
 def test_frames_of_a_vehicle_that_is_known_to_stand_do_not_count(sharp_street: Window, stereo: DepthModel) -> None:
     bare = replace(sharp_street, rig=replace(sharp_street.rig, mask=None))
-    standing = scenarios.with_motion(bare, lambda motion: replace(motion, linear_mps=(0.0, 0.0, 0.0)))
+    standing = degradations.with_motion(bare, lambda motion: replace(motion, linear_mps=(0.0, 0.0, 0.0)))
     assert prepare_window_data(standing, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is None
 
 
@@ -209,7 +209,7 @@ def test_the_mask_of_the_rig_is_left_alone(sharp_street: Window, stereo: DepthMo
 
 def test_a_bonnet_painted_over_the_street_is_masked(sharp_street: Window, stereo: DepthModel) -> None:
     bare = replace(sharp_street, rig=replace(sharp_street.rig, mask=None))
-    painted = scenarios.body(bare, np.random.default_rng(4))
+    painted = degradations.body(bare, np.random.default_rng(4))
     mask = prepare_window_data(painted, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask
     assert mask is not None
     camera = bare.rig.camera
@@ -225,7 +225,7 @@ def test_a_bonnet_painted_over_the_street_is_masked(sharp_street: Window, stereo
 
 # ----------------------------------------------------------------------------------------------------- recordings
 def recorded(source: str) -> list[Grey]:
-    window = windows.load_window(source, None, 25, lambda *_: None).window
+    window = window_cutting.load_window(source, None, 25, lambda *_: None).window
     return [GREY.grey(pair.camera) for pair in window.pairs]
 
 

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate, compensation
-from coec.calibration.frames.sweep_times import azimuth_offsets_s
+from coec.calibration.frames.pairing import azimuth_offsets_s
 from coec.calibration.types import Compensation, EgoMotion, FramePair, SweepTiming, Window
 from coec.geometry import se3
-from coec.geometry.deskew import deskew
+from coec.geometry.sweep_kernels import deskew
 
 TWIST = np.array([0.02, -0.05, 0.4, 9.0, 0.5, -0.1])
 """A sharp turn at 9 m/s: rad/s and m/s."""

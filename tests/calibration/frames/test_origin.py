@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames.origin import GIVE_UP, ApparentOrigin, OriginCheck, apparent_origin, from_origin
+from coec.calibration.frames.lidar_origin import GIVE_UP, ApparentOrigin, OriginCheck, apparent_origin, from_origin
 from coec.calibration.types import LidarFrame
 from coec.geometry import se3
-from sweeps import ROOF_POSE, TILTED_ROOF_POSE, sweep_in_frame, turning_sweep
+from support.scenes import ROOF_POSE, TILTED_ROOF_POSE, sweep_in_frame, turning_sweep
 
 
 @pytest.mark.parametrize("T", [ROOF_POSE, TILTED_ROOF_POSE])

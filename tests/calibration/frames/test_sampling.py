@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from coec.calibration.frames.sampling import CheckSampler, drives, stands
+from coec.calibration.frames.window import CheckSampler, drives, stands
 from coec.calibration.types import EgoMotion, FramePair, Window
 from coec.config import MonitorConfig, WindowConfig
 

@@ -11,16 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.conftest import window_of
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.types import Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
-from coec.simulation.drive import SimulatedDrive
-from coec.simulation.source import open_sim
-from coec.sources import open_source
-from coec.sources.spec import parse_spec
-from drives import rendered_source
+from coec.io.images import GreyImages
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import parse_spec
+from coec_lab.simulation.drive import SimulatedDrive
+from coec_lab.simulation.source import open_sim
+from support.simulated_drives import rendered_source
 
 CONFIG = CalibrationConfig()
 DRIVE = "sim:seed=0&seconds=600&camera_hz=0.5&lidar_hz=0.5&camera=fisheye700&lidar=32"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.lidar_to_lidar.registration import register
-from coec.calibration.lidar_to_lidar.types import LidarEdge, LidarRig, SweepPair
+from coec.calibration.rig.lidar_registration import register
+from coec.calibration.rig.lidar_sampling import LidarEdge, LidarRig, SweepPair
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
 from coec.geometry import se3
 

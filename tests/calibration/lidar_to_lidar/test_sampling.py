@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 
-from coec.calibration.lidar_to_lidar.sampling import (
+from coec.calibration.rig.lidar_sampling import (
     CANDIDATES_HELD,
     PAIRS,
     SWEEPS_HELD,

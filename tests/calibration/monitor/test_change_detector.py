@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.monitor.change_detector import (
     TESTS_PER_CHECK,
     MonitorOutcome,
@@ -23,7 +22,6 @@ from coec.calibration.monitor.change_detector import (
     is_acquitted,
 )
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, observe
-from coec.calibration.monitor.mount_scatter import LOOSE_AT
 from coec.calibration.monitor.sensor_faults import (
     BENT_MOUNT,
     DARK,
@@ -33,11 +31,13 @@ from coec.calibration.monitor.sensor_faults import (
     TIME_OFFSET,
     Cause,
 )
+from coec.calibration.monitor.sequential_tests import LOOSE_AT
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import Window
 from coec.config import CalibrationConfig, LimitsConfig, MonitorConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
+from coec.io.images import GreyImages
 
 LEVELS = alarm_levels(MonitorConfig())
 RIGHT = np.zeros(6)

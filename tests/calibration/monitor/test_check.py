@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
-from coec.calibration.estimators import prepare_window_data
-from coec.calibration.monitor.check import Check, CheckInput, Expected, check_at, gather
+from coec.calibration.baseline import Accuracy, MonitorLimits
+from coec.calibration.monitor.check import Check, CheckInput, Expected, Support, check_at, gather, support
+from coec.calibration.monitor.check_edges import MIN_CONTRAST
 from coec.calibration.monitor.check_verdict import (
     MIN_EDGES_IN_VIEW,
     MIN_INDEPENDENT_SAMPLES,
@@ -22,14 +21,14 @@ from coec.calibration.monitor.check_verdict import (
     opinion,
     over_limits,
 )
-from coec.calibration.monitor.neighbourhood import MIN_CONTRAST
-from coec.calibration.monitor.support import Support, support
-from coec.calibration.objective.curvature import axis_derivatives, measure_curvature
+from coec.calibration.objective.derivatives import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.solver import prepare_window_data
 from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
+from coec.io.images import GreyImages
 
 CONFIG = CalibrationConfig()
 

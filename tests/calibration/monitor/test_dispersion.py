@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coec.calibration.monitor.dispersion import POWER, REFERENCE_CONTRAST, dispersion
+from coec.calibration.monitor.check_verdict import POWER, REFERENCE_CONTRAST, dispersion
 
 
 def test_a_scene_that_stands_out_as_a_street_does_scatters_as_one() -> None:

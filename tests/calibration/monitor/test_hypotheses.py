@@ -7,8 +7,15 @@ from math import radians
 import pytest
 
 from coec.calibration.monitor.change_detector import ROTATIONS
-from coec.calibration.monitor.hypotheses import STAY, Hypotheses, Hypothesis, after_check
-from coec.calibration.monitor.likelihood import CheckMeasurement, OffsetPosterior, Three
+from coec.calibration.monitor.sequential_tests import (
+    STAY,
+    CheckMeasurement,
+    Hypotheses,
+    Hypothesis,
+    OffsetPosterior,
+    Three,
+    after_check,
+)
 
 NOISE, PLACE, RIG = (radians(0.05) ** 2,) * 3, (radians(0.07) ** 2,) * 3, (radians(0.12) ** 2,) * 3
 KNOWN: Three = (1e-9, 1e-9, 1e-9)

@@ -7,17 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.estimators import WindowData, prepare_window_data
 from coec.calibration.monitor.check import check_at, gather, join, seen_part
+from coec.calibration.monitor.check_edges import OUTLINE_RAD, REACH_RAD, outline, prepare_images, prepare_sweep, union
 from coec.calibration.monitor.check_verdict import diagnose, observe
-from coec.calibration.monitor.neighbourhood import REACH_RAD
-from coec.calibration.monitor.sensors import OUTLINE_RAD, outline, prepare_images, prepare_sweep, union
 from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.solver import WindowData, prepare_window_data
 from coec.calibration.types import CameraFrame, DepthMap, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import Rectangle
+from coec.io.images import GreyImages
 
 CONFIG = CalibrationConfig()
 IMAGES = GreyImages(LimitsConfig())

@@ -11,12 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import scenarios
-from coec.adapters.depth.maps import CachedDepth, open_depth
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.commissioning.baseline import Baseline
-from coec.calibration.commissioning.learning import learn_accuracy
-from coec.calibration.estimators import prepare_window_data
+from coec.calibration.baseline import Baseline
+from coec.calibration.commissioning import learn_accuracy
 from coec.calibration.monitor.change_detector import (
     MonitorOutcome,
     MonitorState,
@@ -41,10 +37,14 @@ from coec.calibration.monitor.sensor_faults import (
     scene_baseline,
 )
 from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.solver import prepare_window_data
 from coec.calibration.types import LidarFrame, Window
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, MonitorConfig
 from coec.geometry import se3
-from coec.sources import windows
+from coec.io.depth.depth_maps import CachedDepth, open_depth
+from coec.io.images import GreyImages
+from coec.io.recordings import window_cutting
+from support import degradations
 
 LEVELS = alarm_levels(MonitorConfig())
 Change = Callable[[Window, np.random.Generator], Window]
@@ -61,7 +61,7 @@ class Drive:
 
 @pytest.fixture(scope="module")
 def drive(sample_data: Path) -> Drive:
-    whole = windows.load_window(
+    whole = window_cutting.load_window(
         f"kitti360:{sample_data / 'kitti360'}?camera=image_00", None, 25, lambda *_: None
     ).window
     depth = CachedDepth(open_depth(DepthConfig(model="stereo"), LimitsConfig()), 10)
@@ -87,7 +87,7 @@ def turned(degrees: tuple[float, float, float]) -> Change:
 
 
 def late_camera_by_a_period(window: Window, rng: np.random.Generator) -> Window:
-    return scenarios.late_camera(window, rng, 100_000_000)
+    return degradations.late_camera(window, rng, 100_000_000)
 
 
 def ground_alone(window: Window, rng: np.random.Generator) -> Window:
@@ -98,7 +98,7 @@ def ground_alone(window: Window, rng: np.random.Generator) -> Window:
         del index
         return np.flatnonzero(sweep.xyz_m[:, 2] < -1.4)
 
-    return scenarios.with_points(window, chosen)
+    return degradations.with_points(window, chosen)
 
 
 def unchanged(window: Window, rng: np.random.Generator) -> Window:
@@ -124,16 +124,16 @@ class TestScenarios:
         [
             (turned((0.7, -0.5, 0.5)), "bent_mount"),
             (turned((0.0, 0.6, 0.0)), "bent_mount"),
-            (scenarios.dirt, "lens_dirty"),
-            (scenarios.covered_lens, "lens_covered"),
-            (scenarios.frozen_camera, "camera_frozen"),
-            (scenarios.sixteen_beams, "lidar_beams_lost"),
-            (scenarios.half_the_azimuths, "lidar_beams_lost"),
-            (scenarios.wrong_ego_motion, "ego_motion_wrong"),
-            (scenarios.fast_ego_motion, "ego_motion_wrong"),
-            (scenarios.late_camera, "time_offset"),
+            (degradations.dirt, "lens_dirty"),
+            (degradations.covered_lens, "lens_covered"),
+            (degradations.frozen_camera, "camera_frozen"),
+            (degradations.sixteen_beams, "lidar_beams_lost"),
+            (degradations.half_the_azimuths, "lidar_beams_lost"),
+            (degradations.wrong_ego_motion, "ego_motion_wrong"),
+            (degradations.fast_ego_motion, "ego_motion_wrong"),
+            (degradations.late_camera, "time_offset"),
             (late_camera_by_a_period, "time_offset"),
-            (scenarios.night, "dark"),
+            (degradations.night, "dark"),
             (ground_alone, "open_field"),
         ],
     )
@@ -146,11 +146,11 @@ class TestScenarios:
         "change",
         [
             unchanged,
-            scenarios.rain_drops,
-            scenarios.blown_out_sky,
-            scenarios.boxes_in_the_image,
-            scenarios.unorganised,
-            scenarios.clusters_moved_in_the_cloud,
+            degradations.rain_drops,
+            degradations.blown_out_sky,
+            degradations.boxes_in_the_image,
+            degradations.unorganised,
+            degradations.clusters_moved_in_the_cloud,
         ],
     )
     def test_what_happens_on_every_drive_is_no_cause(self, drive: Drive, change: Change) -> None:
@@ -158,7 +158,7 @@ class TestScenarios:
         assert diagnose(state) is None
         assert state.outcome is MonitorOutcome.CLEAR
 
-    @pytest.mark.parametrize("change", [turned((5.0, -5.0, 3.0)), scenarios.images_of_other_frames])
+    @pytest.mark.parametrize("change", [turned((5.0, -5.0, 3.0)), degradations.images_of_other_frames])
     def test_what_no_check_can_explain_is_never_certain_and_never_clear(self, drive: Drive, change: Change) -> None:
         after = states(drive, change, checks=30)
         assert {state.outcome for state in after[2:]} <= {MonitorOutcome.AT_ODDS, MonitorOutcome.SUSPECT}

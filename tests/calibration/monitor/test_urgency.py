@@ -2,8 +2,7 @@
 
 from dataclasses import replace
 
-from coec.calibration.frames.window import PairSelected, SliceClosed, WindowCutter
-from coec.calibration.monitor.urgency import TRIES, UrgentWindow
+from coec.calibration.frames.window import TRIES, PairSelected, SliceClosed, UrgentWindow, WindowCutter
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, ImageQuality, Window
 from coec.config import MonitorConfig, WindowConfig
 

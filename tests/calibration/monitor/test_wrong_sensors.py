@@ -10,17 +10,18 @@ import pytest
 
 from calibration.conftest import window_of
 from calibration.test_lifecycle import RULES
-from coec.adapters.images.codec import GreyImages
-from coec.calibration import lifecycle
-from coec.calibration.frames.sampling import CheckSampler, stands
-from coec.calibration.lifecycle import CalibrationStatus, HealthState, PairState, Provenance
+from coec.calibration import state as lifecycle
+from coec.calibration.frames.window import CheckSampler, stands
 from coec.calibration.monitor.change_detector import MonitorState
 from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.ports import DepthModel
+from coec.calibration.state import CalibrationStatus, PairState, Provenance
+from coec.calibration.state_machine import HealthState
 from coec.calibration.types import FramePair, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.geometry import se3
-from drives import rendered_source
+from coec.io.images import GreyImages
+from support.simulated_drives import rendered_source
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

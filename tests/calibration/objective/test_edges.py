@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.objective.edges import (
     BANDS,
@@ -27,6 +26,7 @@ from coec.geometry.edges.charts import CELLS_PER_BLUR, MAX_CHART_POINTS
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, VOID, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
 from coec.geometry.projection import project, unproject
+from coec.io.images import GreyImages
 
 GREY = GreyImages(LimitsConfig())
 

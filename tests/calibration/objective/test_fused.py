@@ -6,22 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.calibrator import calibrate
-from coec.calibration.estimators import SAME_BASIN_RAD
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.objective.cells import COLUMNS, ROWS
 from coec.calibration.objective.edges import EdgeCue
 from coec.calibration.objective.fused import OTHER_POSES, FusedObjective, Fusion, Scale
 from coec.calibration.objective.mutual_information import (
+    COLUMNS,
+    ROWS,
     MutualInformation,
     SearchBox,
     build_mutual_information,
     distance_and_depth,
 )
+from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.search.global_search import sample_reach
-from coec.calibration.search.mount_prior import MOUNT_RAD
+from coec.calibration.search.prior import MOUNT_RAD
+from coec.calibration.solver import SAME_BASIN_RAD
 from coec.calibration.types import (
     CameraFrame,
     Decision,
@@ -38,6 +38,7 @@ from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
 from coec.geometry.edges.charts import charted_significances
+from coec.io.images import GreyImages
 
 FUSED = CalibrationConfig(objective=ObjectiveConfig(kind="fused"))
 SIX = CalibrationConfig(objective=ObjectiveConfig(kind="fused"), search=SearchConfig(dof=6))

@@ -19,12 +19,12 @@ from coec.calibration.rig.attribution import (
     sensors,
     served,
 )
-from coec.calibration.rig.evidence import information_of, observation_of_window
-from coec.calibration.rig.types import Edge, RigGraph, RigidLink, Sensor, SensorKind
+from coec.calibration.rig.edge_observations import information_of, observation_of_window
+from coec.calibration.rig.graph import Edge, RigGraph, RigidLink, Sensor, SensorKind
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4, Uncertainty
 from coec.geometry import se3
-from rigs import NS, PLACE, POSES, SIGMA, TURN, checked_rig, edge_check, graph, moved_poses
+from support.rigs import NS, PLACE, POSES, SIGMA, TURN, checked_rig, edge_check, graph, moved_poses
 
 STAR = (("front", "roof"), ("left", "roof"), ("rear", "roof"))
 MOVED = {SensorHealth.CAMERA_MOVED, SensorHealth.LIDAR_MOVED}

@@ -9,13 +9,12 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.calibration.rig.before import CREEP, SHAKEN, PreMoveKnowledge, remembered
-from coec.calibration.rig.joint import estimate_jointly
-from coec.calibration.rig.types import RigGraph, RigidLink, was
+from coec.calibration.rig.graph import RigGraph, RigidLink, was
+from coec.calibration.rig.joint_estimate import CREEP, SHAKEN, PreMoveKnowledge, estimate_jointly, remembered
 from coec.calibration.tracker import NS_PER_H, Measurement
 from coec.calibration.types import Matrix4, Uncertainty
 from coec.geometry import se3
-from rigs import NS, POSES, SIGMA, TURN, edge_windows, graph, moved_poses
+from support.rigs import NS, POSES, SIGMA, TURN, edge_windows, graph, moved_poses
 
 CAMERAS = ("front", "left", "rear")
 STAR = graph([(camera, "roof") for camera in CAMERAS])

@@ -9,14 +9,22 @@ import numpy as np
 import pytest
 
 from coec.calibration.monitor.change_detector import Observation
-from coec.calibration.monitor.likelihood import BAD_SHARE, WEAK_TIMES
 from coec.calibration.monitor.sensor_faults import CAUSES
-from coec.calibration.rig.evidence import BIAS_TIMES, EdgeObservation, observation_of_check, observation_of_window
-from coec.calibration.rig.steps import MAX_OBSERVATIONS, REACH, EdgeHistory, steps_at
+from coec.calibration.monitor.sequential_tests import BAD_SHARE, WEAK_TIMES
+from coec.calibration.rig.edge_observations import (
+    BIAS_TIMES,
+    MAX_OBSERVATIONS,
+    REACH,
+    EdgeHistory,
+    EdgeObservation,
+    observation_of_check,
+    observation_of_window,
+    steps_at,
+)
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Uncertainty
 from coec.geometry import se3
-from rigs import BIAS, NS, PLACE, POSES, SIGMA, TURN, edge_check, graph
+from support.rigs import BIAS, NS, PLACE, POSES, SIGMA, TURN, edge_check, graph
 
 POSE = POSES["front"] @ se3.inverse(POSES["roof"])
 EDGE = graph([("front", "roof")]).edges[0]

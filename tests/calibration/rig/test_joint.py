@@ -9,11 +9,11 @@ from math import radians
 import numpy as np
 import pytest
 
-from coec.calibration.rig.joint import estimate_jointly
-from coec.calibration.rig.types import Edge, RigGraph, RigidLink, Sensor
+from coec.calibration.rig.graph import Edge, RigGraph, RigidLink, Sensor
+from coec.calibration.rig.joint_estimate import estimate_jointly
 from coec.calibration.types import Uncertainty
 from coec.geometry import se3
-from rigs import POSES, SIGMA, TURN, edge_windows, graph, moved_poses
+from support.rigs import POSES, SIGMA, TURN, edge_windows, graph, moved_poses
 
 LOOPED = [(camera, lidar) for camera in ("front", "left", "rear") for lidar in ("roof", "bumper")]
 EXACT = np.full(6, 1e-5)

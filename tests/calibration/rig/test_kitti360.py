@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.depth.maps import open_depth
-from coec.calibration.rig.joint import estimate_jointly
-from coec.calibration.rig.types import Edge, RigGraph, RigidLink, Sensor, SensorKind
+from coec.calibration.rig.graph import Edge, RigGraph, RigidLink, Sensor, SensorKind
+from coec.calibration.rig.joint_estimate import estimate_jointly
 from coec.calibration.tracker import Measurement
 from coec.config import CalibrationConfig, LimitsConfig
-from coec.evaluation.experiments import Bench, greys_of, inferred
 from coec.geometry import se3
-from coec.sources import windows
+from coec.io.depth.depth_maps import open_depth
+from coec.io.recordings import window_cutting
+from coec_lab.experiments.solve_experiments import Bench, greys_of, inferred
 
 BAR = np.array([np.radians(0.02)] * 3 + [0.002] * 3)
 """What the rectification of a stereo camera is good for (rad, m)."""
 
 
 def _calibrated(source: str) -> tuple[Measurement, np.ndarray]:
-    loaded = windows.load_window(source, None, 25, lambda *_: None)
+    loaded = window_cutting.load_window(source, None, 25, lambda *_: None)
     configuration = CalibrationConfig()
     depth = inferred(loaded.window, open_depth(configuration.depth, LimitsConfig()), lambda *_: None)
     bench = Bench(loaded.window, depth, greys_of(loaded.window), configuration)

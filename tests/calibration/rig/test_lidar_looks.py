@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.calibration.lidar_to_lidar.types import KNOWN_BEFORE
-from coec.calibration.rig.lidar_looks import (
+from coec.calibration.rig.edge_observations import (
     UNDETERMINED_TIMES,
     determined_covariance,
     observation_of_registration,
     window_of,
 )
+from coec.calibration.rig.lidar_sampling import KNOWN_BEFORE
 from coec.geometry import se3
 
 SHARP = np.diag([*np.radians([0.03] * 3), 0.005, 0.005, 0.005]) ** 2

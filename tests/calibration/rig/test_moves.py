@@ -7,12 +7,12 @@ from math import log, pi
 import numpy as np
 import pytest
 
-from coec.calibration.commissioning.quantiles import normal_quantile
-from coec.calibration.rig.moves import M_PER_RAD, SCALES, movers, patterns, who_moved
-from coec.calibration.rig.steps import EdgeSteps
-from coec.calibration.search.mount_prior import MOUNT_RAD
+from coec.calibration.baseline import normal_quantile
+from coec.calibration.rig.edge_observations import EdgeSteps
+from coec.calibration.rig.moved_sensors import M_PER_RAD, SCALES, movers, patterns, who_moved
+from coec.calibration.search.prior import MOUNT_RAD
 from coec.geometry import se3
-from rigs import POSES, graph
+from support.rigs import POSES, graph
 
 STAR = (("front", "roof"), ("left", "roof"), ("rear", "roof"))
 COARSE = np.diag(np.array([0.008] * 3 + [0.05] * 3) ** 2)

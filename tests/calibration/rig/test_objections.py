@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from coec.calibration.rig.attribution import SensorHealth
-from coec.calibration.rig.objections import RigAlarm, misfits, rig_alarms
-from coec.runtime.api.rig_troubles import MOVED, SUSPECTED, rig_problems
-from driven_rig import LOOPS, RigDrive
-from rigs import TURN, graph, moved_poses
+from coec.calibration.rig.rig_estimator import RigAlarm, misfits, rig_alarms
+from coec.service.api.problems import MOVED, SUSPECTED, rig_problems
+from support.rigs import LOOPS, TURN, RigDrive, graph, moved_poses
 
 EDGE = "roof-bumper"
 RIG = graph([*LOOPS, ("roof", "bumper")])

@@ -7,15 +7,26 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from coec.calibration.rig import vehicle
+from coec.calibration.rig import rig_estimator
 from coec.calibration.rig.attribution import SensorHealth
-from coec.calibration.rig.objections import misfits
-from coec.calibration.rig.types import RigidLink
-from coec.calibration.rig.vehicle import ServedEdge
+from coec.calibration.rig.graph import RigidLink
+from coec.calibration.rig.rig_estimator import ServedEdge, misfits
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from driven_rig import LOOPS, STAR, RigDrive, known_of, pose_of, windowed_measurement
-from rigs import NS, POSES, SIGMA, TURN, graph, moved_poses
+from support.rigs import (
+    LOOPS,
+    NS,
+    POSES,
+    SIGMA,
+    STAR,
+    TURN,
+    RigDrive,
+    graph,
+    known_of,
+    moved_poses,
+    pose_of,
+    windowed_measurement,
+)
 
 
 @pytest.mark.fault("the LiDAR of a rig is knocked by 1°", "one event, one correction for all of its cameras")
@@ -100,7 +111,7 @@ def test_what_was_found_of_after_a_knock_before_it_was_named_is_not_taken_for_be
     drive.add_checks(after, 1)
     edge = drive.state.graph.edge["front-roof"]
     found = ServedEdge(pose_of(edge, after), SIGMA, round(knocked_s * NS), known_of(edge, after, drive.at_s))
-    drive.state = vehicle.after_served(drive.state, edge.name, found, round(drive.at_s * NS))
+    drive.state = rig_estimator.after_served(drive.state, edge.name, found, round(drive.at_s * NS))
     drive.add_checks(after, 3)
     before = drive.state.before
     assert before is not None
@@ -112,9 +123,9 @@ def test_what_was_found_of_after_a_knock_before_it_was_named_is_not_taken_for_be
 
 def test_a_pair_whose_two_sensors_both_moved_is_one_that_moved() -> None:
     rig = graph(LOOPS)
-    assert vehicle.pairs_of(rig, ("front", "roof")) == ("front-bumper", "front-roof", "left-roof", "rear-roof")
+    assert rig_estimator.pairs_of(rig, ("front", "roof")) == ("front-bumper", "front-roof", "left-roof", "rear-roof")
     bar = RigidLink("bar", "front", "roof", POSES["front"] @ se3.inverse(POSES["roof"]), np.full(6, 1e-4))
-    assert "front-roof" not in vehicle.pairs_of(graph(LOOPS, [bar]), ("front", "roof")), "they moved as one"
+    assert "front-roof" not in rig_estimator.pairs_of(graph(LOOPS, [bar]), ("front", "roof")), "they moved as one"
 
 
 def test_windows_that_began_before_the_move_put_nothing_right() -> None:
@@ -141,7 +152,7 @@ def test_it_stays_moved_for_as_long_as_a_pair_serves_what_was_before() -> None:
     assert drive.health()["roof"] is SensorHealth.LIDAR_MOVED
     told = drive.state.correction.pairs["left-roof"]
     served = ServedEdge(told.T_a_b, SIGMA, round((knocked_s + 6.0) * NS))
-    drive.state = vehicle.after_served(drive.state, "left-roof", served, round(drive.at_s * NS))
+    drive.state = rig_estimator.after_served(drive.state, "left-roof", served, round(drive.at_s * NS))
     drive.add_checks(after, 1)
     assert drive.health()["roof"] is SensorHealth.CALIBRATED
 
@@ -175,7 +186,7 @@ def test_a_camera_whose_pair_repairs_itself_at_once_is_named_all_the_same() -> N
     assert drive.state.move is None, "looks alone say too little yet"
     edge = drive.state.graph.edge["front-roof"]
     window = windowed_measurement(edge, after, knocked_s, SIGMA)
-    drive.state = vehicle.after_window(drive.state, edge.name, window, round(drive.at_s * NS))
+    drive.state = rig_estimator.after_window(drive.state, edge.name, window, round(drive.at_s * NS))
     assert drive.health()["front"] is SensorHealth.CAMERA_MOVED
     move = drive.state.move
     assert move is not None
@@ -183,7 +194,7 @@ def test_a_camera_whose_pair_repairs_itself_at_once_is_named_all_the_same() -> N
     assert np.degrees(move.moved["front"].x[:3]) == pytest.approx([0.0, 1.0, 0.0], abs=0.25)
     assert (move.event.stepped_ns, move.over_ns) == (window.start_ns, None)
     served = ServedEdge(window.measurement.T_camera_lidar, SIGMA, window.start_ns)
-    drive.state = vehicle.after_served(drive.state, edge.name, served, round(drive.at_s * NS))
+    drive.state = rig_estimator.after_served(drive.state, edge.name, served, round(drive.at_s * NS))
     drive.add_checks(after, 3)
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
     assert drive.state.correction is None, "what one pair tells by itself needs nobody to tell it"
@@ -221,7 +232,9 @@ def test_a_window_that_does_not_fit_the_others_is_said_of_the_pairs_of_its_loop(
     drive.add_checks(POSES, 4)
     assert misfits(drive.state) == ()
     edge = drive.state.graph.edge["left-roof"]
-    drive.state = vehicle.after_window(drive.state, edge.name, windowed_measurement(edge, POSES, 5.0, TURN), 20 * NS)
+    drive.state = rig_estimator.after_window(
+        drive.state, edge.name, windowed_measurement(edge, POSES, 5.0, TURN), 20 * NS
+    )
     assert set(misfits(drive.state)) == {"front-roof", "left-roof", "front-bumper", "left-bumper"}
     assert drive.state.correction is None
 
@@ -231,7 +244,7 @@ def test_a_first_calibration_far_from_nominal_is_no_move() -> None:
     wide = np.array([np.radians(3.0)] * 3 + [0.2] * 3)
     built = {edge.name: ServedEdge(se3.perturb(pose_of(edge, POSES), TURN), wide, None) for edge in rig.edges}
     drive = RigDrive(rig)
-    drive.state = vehicle.initial_rig(rig, built, {})
+    drive.state = rig_estimator.initial_rig(rig, built, {})
     drive.add_checks(POSES, 6)
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
     for edge in rig.edges:

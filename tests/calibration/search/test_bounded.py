@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.search.bounded import Box, maximum_in
+from coec.calibration.search.local_search import Box, maximum_in
 
 TOP = np.array([0.4, -1.2])
 

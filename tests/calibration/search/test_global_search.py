@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.conftest import window_of
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.objective.edges import EdgeCue, build_edges, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
@@ -16,7 +15,8 @@ from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import se3
 from coec.geometry.edges.charts import charted_significances
-from coec.sources import open_source
+from coec.io.images import GreyImages
+from coec.io.recordings.layouts import open_source
 
 START = se3.perturbation(np.array([0.4, -0.3, 1.2, 0.5, -1.0, 2.0]))
 TURN = SearchBox(np.radians(28.0), 0.0)

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from calibration.search.test_global_search import away_from
-from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.objective.edges import build_edges
-from coec.calibration.search import step_time as searched
-from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.search.step_time import DatedEdges, StepTime, step_time
+from coec.calibration.search import change_point as searched
+from coec.calibration.search.change_point import ChangePoint, DatedEdges, StepTime, step_time
 from coec.calibration.types import FramePair, Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import se3
+from coec.io.images import GreyImages
 
 WINDOW = (0, 3, 6, 9)
 """Pairs of the street that are the window's; the others lie between."""

@@ -11,7 +11,7 @@ import random
 import sys
 from pathlib import Path
 
-WORKER = "coec.runtime.worker.process"
+WORKER = "coec.service.worker.worker_main"
 
 LIES = (
     b"\xc1 no msgpack at all",

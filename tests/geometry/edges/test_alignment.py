@@ -21,7 +21,7 @@ from coec.geometry.edges.alignment import (
 )
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.projection import project
-from oracles import alignment_sums
+from support.oracles import alignment_sums
 
 WIDTH, HEIGHT = 96, 64
 SENSOR = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 61.0, "cx": 47.2, "cy": 30.9}

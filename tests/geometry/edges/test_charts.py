@@ -23,7 +23,7 @@ from coec.geometry.edges.charts import (
 )
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, VOID
 from coec.geometry.projection import project, unproject
-from oracles import charted_sums, gaussian_blur, stereographic_ray
+from support.oracles import charted_sums, gaussian_blur, stereographic_ray
 
 WIDTH, HEIGHT = 96, 64
 SENSOR = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 61.0, "cx": 47.2, "cy": 30.9}

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from coec.geometry import se3
 from coec.geometry.cameras import build
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
-from coec.geometry.edges.climbs import MAX_SWEEPS, AscentStart, ascend
+from coec.geometry.edges.alignment import MAX_SWEEPS, AscentStart, EdgeFrames, ascend, frame_alignment
 
 WIDTH, HEIGHT, EDGES = 96, 64, 300
 TRUTH = se3.perturbation(np.array([0.02, -0.03, 0.01, 0.0, 0.0, 0.0]))

@@ -19,7 +19,7 @@ from coec.geometry.edges.image_edges import (
     _less,
     halved,
 )
-from oracles import doubled, gaussian_blur, local_mean, sobel_magnitude, standardised_over
+from support.oracles import doubled, gaussian_blur, local_mean, sobel_magnitude, standardised_over
 
 HEIGHT, WIDTH = 61, 84
 CUT_PX = 7

@@ -6,8 +6,8 @@ import pytest
 from pydantic import ValidationError
 
 from coec.config import AuthorityConfig, SenderConfig
-from coec.runtime.api.authority import Authority, NotAllowedError
 from coec.schemas.commands import COMMAND_NAMES
+from coec.service.api.authorization import Authority, NotAllowedError
 
 FILES = {"certificate": "v.pem", "private_key": "v-key.pem", "root_ca": "ca.pem"}
 OUTSIDE = "it connects to tcp/10.0.0.2:7447"

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.exports.told import ExportFrames
-from coec.adapters.ros.wire.publisher import Publisher
-from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.calibration.types import Reason
-from coec.runtime.api.awaited import PendingPairAnswers, PendingPairError
-from coec.runtime.nominal.watch import NominalStatus
+from coec.io.exports.exported_extrinsic import ExportFrames
+from coec.io.ros.wire_format import Publisher
+from coec.io.zenoh.ros_node import RosTopicList
 from coec.schemas.commands import COMMAND_NAMES
+from coec.service.api.pair_answers import PendingPairAnswers, PendingPairError
+from coec.service.discovery_listener import NominalStatus
 from runtime.waiting import CAMERA, INFO, POINTS, World, configured
 
 NO_INFO = Reason("no_camera_info", "No CameraInfo on /front/camera_info yet.")

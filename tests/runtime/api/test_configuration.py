@@ -8,7 +8,7 @@ import pytest
 
 from coec.cli.check_config import example
 from coec.config import ZenohConfig
-from coec.runtime.api.configuration import redacted_configuration
+from coec.service.configuration import redacted_configuration
 
 KEY = "tls/vehicle:7448#connect_private_key_base64=c2VjcmV0;connect_certificate_file=/etc/c.pem"
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from coec.config import IDENTITY, CameraConfig, CameraIntrinsics, EgoConfig, LidarConfig, PairConfig
-from coec.runtime.api.health import data_quality_of, needs_of
-from coec.runtime.ingest.decoder import EGO, StreamCounts
-from coec.runtime.ingest.stream_statistics import StreamStatistics
-from estimates import estimate
+from coec.service.api.reply_builders import data_quality_of, needs_of
+from coec.service.ingest.decoder import EGO, StreamCounts
+from coec.service.ingest.pair_stream import StreamStatistics
+from support.estimates import estimate
 
 PAIR = PairConfig(
     name="front",

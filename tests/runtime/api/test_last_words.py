@@ -6,18 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.zenoh.bus import Answer
-from coec.adapters.zenoh.client import connected, query_all
 from coec.config import Config, UplinkConfig, ZenohConfig
 from coec.errors import DecodeError, NotFoundError
-from coec.runtime.api.last_words import Heartbeats
-from coec.schemas import last_word
+from coec.io.zenoh.bus import Answer
+from coec.io.zenoh.query_client import connected, query_all
+from coec.schemas import heartbeat as last_word
 from coec.schemas.keys import Keys
+from coec.service.api.uplink import Heartbeats
 from e2e.processes import Router
-from fakes import wait_until
-from last_words import heartbeat, packed_heartbeat
-from pair_bench import PairBench
-from vehicles import PAIR, serving
+from support.fake_worker import wait_until
+from support.messages import heartbeat, packed_heartbeat
+from support.vehicles import PAIR, PairBench, serving
 
 KEYS = Keys("coec", "vehicle")
 PERIOD = UplinkConfig(last_word_s=30.0)

@@ -7,9 +7,6 @@ from typing import get_args
 
 import pytest
 
-from coec.runtime.api import metrics
-from coec.runtime.api.metrics import FAMILIES, LabelledHistogram, MetricsInput, TextFormat
-from coec.runtime.timings import LONG_S, QUICK_S, Histogram
 from coec.schemas.replies import (
     Axes,
     AxisReply,
@@ -25,9 +22,11 @@ from coec.schemas.replies import (
     WorkerStatus,
 )
 from coec.schemas.rig_state import RigReply, SensorState
-from open_metrics import Family, MalformedError, parse_open_metrics
-from rig_replies import moved_lidar_reply, reply_before_checks
-from statuses import status_reply
+from coec.service.api import metrics
+from coec.service.api.metrics import FAMILIES, LabelledHistogram, MetricsInput, TextFormat
+from coec.service.timing import LONG_S, QUICK_S, Histogram
+from support.messages import moved_lidar_reply, reply_before_checks, status_reply
+from support.readers import Family, MalformedError, parse_open_metrics
 
 
 def a_health(state: str = "healthy", level: int = 0) -> HealthReply:

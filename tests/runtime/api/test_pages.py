@@ -11,14 +11,13 @@ from itertools import count
 import pytest
 from pydantic import ValidationError
 
-from coec.adapters.system.http import HttpRequest, HttpResponse
 from coec.config import MetricsConfig
-from coec.runtime.api.http_door import MetricsServer
-from coec.runtime.api.metrics import TextFormat
-from coec.runtime.api.pages import accepted_format, pages
-from coec.runtime.api.router_watch import RouterMonitor
-from ports import free_port
+from coec.io.http_server import HttpRequest, HttpResponse
+from coec.service.api.metrics import TextFormat
+from coec.service.api.metrics_server import MetricsServer, accepted_format, pages
+from coec.service.api.problems import RouterMonitor
 from runtime.api.test_metrics import a_busy_status, a_health
+from support.router import free_port
 
 
 def health_page(state: str, **healths: tuple[str, int]) -> HttpResponse:

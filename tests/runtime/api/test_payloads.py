@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coec.errors import UsageError
-from coec.runtime.api.payloads import MAX_SENDER, parse_payload, proven_sender, sender_of
 from coec.schemas.commands import COMMAND_NAMES, MAX_REASON
+from coec.service.api.authorization import MAX_SENDER, parse_payload, proven_sender, sender_of
 
 
 @pytest.mark.parametrize("name", COMMAND_NAMES)

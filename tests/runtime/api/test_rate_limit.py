@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coec.runtime.api.rate_limit import BURST, PER_S, SENDERS, RateLimit
+from coec.service.api.command_execution import BURST, PER_S, SENDERS, RateLimit
 
 
 class Clock:

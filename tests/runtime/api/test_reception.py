@@ -15,20 +15,18 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from certificates import TestAuthority
-from coec.adapters.tls.conversation import CommandSender
-from coec.adapters.zenoh.bus import JSON, WAITING, QueryLane, open_session
-from coec.adapters.zenoh.client import connected, query_one
-from coec.adapters.zenoh.proven import send_authenticated
 from coec.config import AuthorityConfig, SenderConfig, ZenohConfig
 from coec.errors import NotProvenError, RemoteError
-from coec.runtime.api import commands
-from coec.runtime.api.rate_limit import BURST, RateLimit
-from coec.schemas.base import to_json
+from coec.io.zenoh.bus import JSON, WAITING, QueryLane, open_session
+from coec.io.zenoh.command_auth import CommandSender
+from coec.io.zenoh.query_client import connected, query_one, send_authenticated
 from coec.schemas.commands import ProvenCommand
-from fakes import wait_until
-from ports import free_port
-from vehicles import KEYS, PAIR, VEHICLE_LIMITS, ServingVehicle, serving
+from coec.schemas.message import to_json
+from coec.service.api import command_execution
+from coec.service.api.command_execution import BURST, RateLimit
+from support.fake_worker import wait_until
+from support.router import TestAuthority, free_port
+from support.vehicles import KEYS, PAIR, VEHICLE_LIMITS, ServingVehicle, serving
 
 PATIENCE_S = 20.0
 HOLD = KEYS.command(PAIR, "hold")
@@ -139,7 +137,7 @@ def test_a_name_that_is_claimed_is_not_proven(authority: TestAuthority, router: 
 def test_a_proven_sender_is_not_held_up_by_those_who_are_not(
     authority: TestAuthority, router: zenoh.Session, vehicle: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(commands, "RateLimit", partial(RateLimit, clock=lambda: 0.0))
+    monkeypatch.setattr(command_execution, "RateLimit", partial(RateLimit, clock=lambda: 0.0))
     there = vehicle(authority.of_service(OPERATOR, anonymous="always"))
     told = [plainly(router)["code"] for _ in range(BURST + 2)]
     assert told == ["held"] * BURST + ["too_many"] * 2

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from coec.calibration.lifecycle import Health, HealthState
+from coec.calibration.state import Health
+from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Reason
-from coec.runtime.api.health import HARMLESS, with_problems
-from coec.runtime.api.troubles import PROBLEMS
+from coec.service.api.problems import PROBLEMS
+from coec.service.api.reply_builders import HARMLESS, with_problems
 
 HEALTHY = Health(HealthState.HEALTHY, ())
 

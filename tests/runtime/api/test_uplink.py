@@ -7,9 +7,9 @@ from contextlib import suppress
 
 import pytest
 
-from coec.adapters.zenoh.bus import Answer
 from coec.config import UplinkConfig
-from coec.runtime.api.uplink import BURST_BYTES, Uplink, UplinkBusyError
+from coec.io.zenoh.bus import Answer
+from coec.service.api.uplink import BURST_BYTES, Uplink, UplinkBusyError
 
 RATE = 100_000
 PIECE = 2**20

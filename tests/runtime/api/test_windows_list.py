@@ -12,17 +12,16 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from coec.adapters.mcap.windows import RecordedWindow
-from coec.adapters.zenoh.bus import Answer
 from coec.config import StateConfig
-from coec.runtime.api.snapshots import answer_of
-from coec.runtime.api.windows_list import WindowsList
-from coec.runtime.recording.snippet_store import SnippetStore
-from coec.runtime.recording.window_index import WindowVersion
-from coec.runtime.recording.window_store import WindowStore
-from coec.schemas.base import from_msgpack
+from coec.io.mcap.window_writer import RecordedWindow
+from coec.io.zenoh.bus import Answer
 from coec.schemas.keys import Format
+from coec.schemas.message import from_msgpack
 from coec.schemas.replies import SnippetInfo, WindowsReply
+from coec.service.api.pair_answers import WindowsList
+from coec.service.api.reply_builders import answer_of
+from coec.service.recording.snippets import SnippetStore
+from coec.service.recording.window_store import WindowStore, WindowVersion
 
 S = 1_000_000_000
 
@@ -80,7 +79,7 @@ def test_a_list_of_thousands_is_packed_once(
         packed += 1
         return answer_of(model, form)
 
-    monkeypatch.setattr("coec.runtime.api.windows_list.answer_of", counted)
+    monkeypatch.setattr("coec.service.api.pair_answers.answer_of", counted)
     told = WindowsList("v7", "front", WindowStore(folder, StateConfig(min_free_bytes=0)), None)
     took_s = []
     for _ in range(20):

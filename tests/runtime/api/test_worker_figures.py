@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from coec.config import CalibrationConfig, WorkerConfig
-from coec.runtime.api import metrics
-from coec.runtime.api.metrics import MetricsInput
-from coec.runtime.api.status import worker_status_of
-from coec.runtime.worker import jobs
-from coec.runtime.worker.queue import WAITING, Lane
-from coec.runtime.worker.supervisor import Worker
 from coec.schemas.replies import WorkerStatus
-from statuses import status_reply
+from coec.service.api import metrics
+from coec.service.api.metrics import MetricsInput
+from coec.service.api.reply_builders import worker_status_of
+from coec.service.worker import worker_jobs
+from coec.service.worker.job_queue import WAITING, Lane
+from coec.service.worker.supervisor import Worker
+from support.messages import status_reply
 
 
 def lines_of(worker: WorkerStatus) -> list[str]:
@@ -25,8 +25,8 @@ def lines_of(worker: WorkerStatus) -> list[str]:
 def test_every_end_is_counted_by_fate_and_cause_and_what_waits_by_kind() -> None:
     worker = Worker(WorkerConfig(), "{}")
     for number in range(WAITING[Lane.CHECK] + 1):
-        worker.submit(jobs.check("front", CalibrationConfig(), np.eye(4), (), lambda _: None))
-        worker.submit(jobs.solve("front", Path(f"w{number}"), f"w{number}", lambda _: None, live=False))
+        worker.submit(worker_jobs.check("front", CalibrationConfig(), np.eye(4), (), lambda _: None))
+        worker.submit(worker_jobs.solve("front", Path(f"w{number}"), f"w{number}", lambda _: None, live=False))
     status = worker_status_of(worker)
     assert (status.state, status.queued, status.job, status.job_age_s) == ("starting", 9, None, None)
     assert status.waiting == {"check": 4, "backlog": 5}

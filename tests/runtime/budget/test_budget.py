@@ -5,15 +5,13 @@ from __future__ import annotations
 import pytest
 
 from coec.config import BudgetConfig, MonitorConfig, WindowConfig
-from coec.runtime.api import metrics
-from coec.runtime.api.metrics import MetricsInput
-from coec.runtime.api.status import budget_status_of
-from coec.runtime.budget.budget import Budget
-from coec.runtime.budget.prices import COST_SAMPLES, CostModel
-from coec.runtime.budget.spending import USAGE_BIN_S, USAGE_OVER_S, CpuUsage
-from coec.runtime.worker import jobs
-from coec.runtime.worker.costs import START, Cost
-from statuses import status_reply
+from coec.service.api import metrics
+from coec.service.api.metrics import MetricsInput
+from coec.service.api.reply_builders import budget_status_of
+from coec.service.cpu_budget import COST_SAMPLES, USAGE_BIN_S, USAGE_OVER_S, Budget, CostModel, CpuUsage
+from coec.service.worker import worker_jobs
+from coec.service.worker.worker_jobs import START, Cost
+from support.messages import status_reply
 
 S = 1_000_000_000
 
@@ -45,11 +43,11 @@ def test_what_everything_would_take_is_told_with_what_it_stretches(budget: Budge
     clock.now_s = 100.0
     for pair in ("front", "rear"):
         assert budget.try_acquire(pair, S, suspected=False)
-        budget.pay(Cost(jobs.Kind.CHECK, pair, 2.0))
+        budget.pay(Cost(worker_jobs.Kind.CHECK, pair, 2.0))
         budget.release(pair)
     for _ in range(25):
-        budget.pay(Cost(jobs.PREFETCH, "front", 0.1))
-    budget.pay(Cost(jobs.Kind.SOLVE, "front", 6.5))
+        budget.pay(Cost(worker_jobs.PREFETCH, "front", 0.1))
+    budget.pay(Cost(worker_jobs.Kind.SOLVE, "front", 6.5))
     budget.pay(Cost(START, "", 3.5))
     clock.now_s = 103.0
     told = budget_status_of(budget.report())
@@ -82,7 +80,7 @@ def test_pictures_and_windows_of_earlier_runs_keep_nobody_waiting(budget: Budget
 def test_what_has_begun_counts_until_it_has_ended(budget: Budget) -> None:
     for pair in ("front", "rear"):
         assert budget.try_acquire(pair, S, suspected=False)
-        budget.pay(Cost(jobs.Kind.CHECK, pair, 2.0))
+        budget.pay(Cost(worker_jobs.Kind.CHECK, pair, 2.0))
         budget.release(pair)
     assert budget.try_acquire("front", S, suspected=False), "1 s lies in store"
     assert not budget.try_acquire("rear", S, suspected=False), "2 s of which are spoken for"

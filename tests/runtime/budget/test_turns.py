@@ -11,8 +11,7 @@ from statistics import mean
 import pytest
 
 from coec.config import BudgetConfig
-from coec.runtime.budget.store import BUCKET_DEPTH_S, CHECKS_SHARE, Debt, TokenBucket
-from coec.runtime.budget.turns import CheckScheduler
+from coec.service.cpu_budget import BUCKET_DEPTH_S, CHECKS_SHARE, CheckScheduler, Debt, TokenBucket
 
 S = 1_000_000_000
 FRAME_S = 0.5

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.files.conversions import result_of
-from coec.adapters.files.state_file import StateFile
 from coec.errors import StateError
-from coec.runtime.decisions.chain import GENESIS, HashChain
-from coec.schemas.base import SCHEMA_VERSION, to_json
+from coec.io.serialise import result_of
+from coec.io.storage import StateFile
+from coec.schemas.message import SCHEMA_VERSION, to_json
 from coec.schemas.replies import CalibrationResult, HistoryEntry
-from disks import EVERY_OPERATION, Disk
-from estimates import ESTIMATE_RIG, estimate
+from coec.service.records.history import GENESIS, HashChain
+from support.disk import EVERY_OPERATION, Disk
+from support.estimates import ESTIMATE_RIG, estimate
 
 
 def result(window: int) -> CalibrationResult:

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from coec.errors import StateError
-from coec.runtime.decisions.check_log import CheckLog
 from coec.schemas.replies import CheckReply, MetricReply
-from disks import EVERY_OPERATION, Disk
+from coec.service.records.history import CheckLog
+from support.disk import EVERY_OPERATION, Disk
 
 NONE = (None,) * 6
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coec.adapters.files.conversions import result_of, transform_of
-from coec.adapters.files.state_file import StateFile
 from coec.errors import StateError
-from coec.runtime.decisions.history import PairHistory
+from coec.io.serialise import result_of, transform_of
+from coec.io.storage import StateFile
 from coec.schemas.replies import CalibrationResult, HistoryEntry
-from disks import EVERY_OPERATION, Disk
-from estimates import ESTIMATE_RIG, estimate
+from coec.service.records.history import PairHistory
+from support.disk import EVERY_OPERATION, Disk
+from support.estimates import ESTIMATE_RIG, estimate
 
 LIMIT = 4
 

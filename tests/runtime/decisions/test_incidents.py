@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.files.conversions import transform_of
 from coec.errors import NotFoundError, StateError
-from coec.runtime.decisions.incidents import POINTS_AFTER, POINTS_BEFORE, Incidents
+from coec.io.serialise import transform_of
 from coec.schemas.replies import EvidenceEvent, MetricsPoint, Reason
-from disks import EVERY_OPERATION, Disk
+from coec.service.records.incidents import POINTS_AFTER, POINTS_BEFORE, Incidents
+from support.disk import EVERY_OPERATION, Disk
 
 
 def event(stamp: int, before: str | None = "front-1") -> EvidenceEvent:

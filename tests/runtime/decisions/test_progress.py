@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from coec.calibration.types import Reason
-from coec.runtime.decisions.progress import Attempts, CheckProgress
-from coec.runtime.ingest.chooser import SelectionStatistics
-from coec.runtime.ingest.decoder import CAMERA, LIDAR, StreamCounts
-from coec.runtime.ingest.stream_statistics import StreamStatistics
+from coec.service.engine.check_progress import Attempts, CheckProgress
+from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
+from coec.service.ingest.frame_selector import SelectionStatistics
+from coec.service.ingest.pair_stream import StreamStatistics
 
 S = 1_000_000_000
 PERIOD_S = 5.0

@@ -6,7 +6,7 @@ from itertools import permutations
 
 import pytest
 
-from coec.runtime.decisions.queue import Effect, ResultSchedule
+from coec.service.engine.schedule import Effect, ResultSchedule
 
 
 @pytest.mark.parametrize("order", list(permutations(range(4))))

@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.files.conversions import result_of
-from coec.adapters.files.state_file import StateFile
-from coec.calibration.lifecycle import (
-    AppliedChange,
+from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState
+from coec.calibration.monitor.sequential_tests import Hypotheses, Hypothesis, OffsetPosterior
+from coec.calibration.state import (
     CalibrationStatus,
     ExtrinsicHold,
     Health,
-    HealthState,
     PairRules,
     PairState,
     Provenance,
@@ -25,15 +23,15 @@ from coec.calibration.lifecycle import (
     initial_state,
     overdue,
 )
-from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState
-from coec.calibration.monitor.hypotheses import Hypotheses, Hypothesis
-from coec.calibration.monitor.likelihood import OffsetPosterior
+from coec.calibration.state_machine import AppliedChange, HealthState
 from coec.calibration.types import Decision, Reason, Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import StateError
-from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.decisions.stored_pair import Clocks
-from estimates import ESTIMATE_RIG, estimate
+from coec.io.serialise import result_of
+from coec.io.storage import StateFile
+from coec.service.records.state_store import StateStore
+from coec.service.records.stored_pair import Clocks
+from support.estimates import ESTIMATE_RIG, estimate
 
 RULES = PairRules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
 NEVER = PairRules(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.registration import nearest
 from coec.geometry import se3
-from coec.runtime.edges import plan
-from coec.runtime.edges.plan import plan_lidar_pairs
-from lidar_bench import LIDAR_POSES, LIDARS, LidarBench, lidar_pair, with_extra
+from coec.io import nearest_neighbours
+from coec.service.engine import lidar_pairs
+from coec.service.engine.lidar_pairs import plan_lidar_pairs
+from support.rigs import LIDAR_POSES, LIDARS, LidarBench, lidar_pair, with_extra
 
 __all__ = ["with_extra"]
 
@@ -29,7 +29,7 @@ def test_every_two_lidars_of_the_pairs_in_their_order() -> None:
 
 @pytest.mark.fault("the extra lidars is not installed", "status and rig say so; nothing breaks")
 def test_what_is_not_installed_is_said_and_breaks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nearest, "installed", lambda: False)
+    monkeypatch.setattr(nearest_neighbours, "installed", lambda: False)
     bench = LidarBench(tmp_path)
     bench.drive(0.0, 20.0)
     assert bench.edges.problem is not None
@@ -61,7 +61,7 @@ def test_their_number_is_bounded() -> None:
         lidar = lidars[0].lidar.model_copy(update={"name": f"lidar{number}", "key": f"in/lidar{number}"})
         lidars.append(lidars[0].model_copy(update={"name": f"front-lidar{number}", "lidar": lidar}))
     found = plan_lidar_pairs(lidars, 15.0)
-    assert [one.why_not for one in found].count(None) == plan.MAX_LIDAR_PAIRS
+    assert [one.why_not for one in found].count(None) == lidar_pairs.MAX_LIDAR_PAIRS
     assert {one.why_not.code for one in found if one.why_not is not None} == {"too_many"}
 
 

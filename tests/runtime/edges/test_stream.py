@@ -8,16 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.calibration.lidar_to_lidar.types import LidarRig, RangeBias
+from coec.calibration.rig.lidar_sampling import LidarRig, RangeBias
 from coec.calibration.types import Reason
 from coec.geometry import se3
-from coec.runtime.edges.stream import COUNTS_AFTER_NS, RESTS, SWEEP_SETS_WAITING, LidarPairStream
-from coec.runtime.worker.costs import Cost
-from coec.runtime.worker.jobs import Answer, Kind, Registered
-from coec.schemas.base import from_json, to_json
+from coec.schemas.message import from_json, to_json
 from coec.schemas.rig_state import RigReply
-from lidar_bench import LIDAR_POSES, LIDARS, LidarBench, registration, relative_pose, true_registration, with_extra
-from rigs import NS
+from coec.service.engine.lidar_pairs import COUNTS_AFTER_NS, RESTS, SWEEP_SETS_WAITING, LidarPairStream
+from coec.service.worker.worker_jobs import Answer, Cost, Kind, Registered
+from support.rigs import LIDAR_POSES, LIDARS, NS, LidarBench, registration, relative_pose, true_registration, with_extra
 
 pytestmark = pytest.mark.usefixtures("with_extra")
 __all__ = ["with_extra"]

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from coec.adapters.ros import outgoing
-from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import InputSample
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig, PairConfig
-from coec.runtime.ingest.decoder import CAMERA, Decoder
+from coec.io.logs import LossCounter
+from coec.io.ros import message_encoding
+from coec.io.zenoh.bus import InputSample
+from coec.service.ingest.decoder import CAMERA, Decoder
 
 PAIR = PairConfig.model_validate(
     {
@@ -36,7 +36,7 @@ def beside(number: int, sender: int = 1, source_ns: int = SENT_NS) -> bytes:
 
 
 def image(stamp_ns: int = 5) -> bytes:
-    return outgoing.encode_image(replace(FRAME, stamp_ns=stamp_ns))[1]
+    return message_encoding.encode_image(replace(FRAME, stamp_ns=stamp_ns))[1]
 
 
 class Desk:

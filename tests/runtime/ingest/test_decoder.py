@@ -9,11 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.adapters.frames import msgpack_frames
-from coec.adapters.ros import outgoing
-from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import InputSample
-from coec.adapters.zenoh.ros_topics import RosTopicList
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import (
@@ -27,14 +22,17 @@ from coec.config import (
     PairingConfig,
     PointTimeConfig,
 )
-from coec.runtime.api.streams import stream_problems
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame
-from coec.runtime.ingest.frame_budget import FrameBudget
-from coec.runtime.ingest.inbox import Call, Inbox, Parcel
-from coec.runtime.ingest.senders import RECENT
-from coec.runtime.ingest.sensor import SensorStream
-from ros_messages import packed_cloud, transforms
-from sweeps import ROOF_POSE, sweep_in_frame, turning_sweep
+from coec.io import msgpack_frames
+from coec.io.logs import LossCounter
+from coec.io.ros import message_encoding
+from coec.io.zenoh.bus import InputSample
+from coec.io.zenoh.ros_node import RosTopicList
+from coec.service.api.problems import stream_problems
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, RECENT, Decoder, Frame
+from coec.service.ingest.frame_buffers import FrameBudget
+from coec.service.ingest.intake import Call, Inbox, Parcel, SensorStream
+from support.ros import packed_cloud, transforms
+from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
 
 MSGPACK, CDR = "application/msgpack", "application/cdr"
 PAIR = PairConfig(
@@ -76,12 +74,12 @@ def desk() -> Desk:
 
 
 def test_the_samples_encoding_is_believed(desk: Desk) -> None:
-    type_name, image = outgoing.encode_image(camera())
+    type_name, image = message_encoding.encode_image(camera())
     assert desk.take(CAMERA, msgpack_frames.encode_camera(camera()), MSGPACK) == camera()
     assert desk.take(CAMERA, image, f"{CDR};{type_name}") == camera()
     assert desk.take(CAMERA, image, CDR) == camera(), "the type of the configuration"
     assert isinstance(desk.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK), LidarFrame)
-    assert isinstance(desk.take(EGO, outgoing.encode_motion(MOTION)[1], CDR), EgoMotion)
+    assert isinstance(desk.take(EGO, message_encoding.encode_motion(MOTION)[1], CDR), EgoMotion)
     assert not desk.losses.snapshot()
 
 
@@ -139,7 +137,7 @@ def test_a_cloud_of_two_lidars_is_refused(desk: Desk, caplog: pytest.LogCaptureF
 
 def test_else_the_configurations(desk: Desk) -> None:
     assert desk.take(CAMERA, msgpack_frames.encode_camera(camera())) == camera()
-    assert isinstance(desk.take(LIDAR, outgoing.encode_cloud(CLOUD)), LidarFrame)
+    assert isinstance(desk.take(LIDAR, message_encoding.encode_cloud(CLOUD)), LidarFrame)
     assert desk.take(EGO, msgpack_frames.encode_ego(MOTION), "text/plain") == MOTION
     assert desk.decoders[EGO].counts().accepted == 1
 
@@ -149,7 +147,7 @@ def test_else_the_configurations(desk: Desk) -> None:
     [
         (CAMERA, msgpack_frames.encode_camera(camera(frame_id="other")), MSGPACK, "frame_id"),
         (CAMERA, msgpack_frames.encode_camera(camera(width=5)), MSGPACK, "image_size"),
-        (CAMERA, outgoing.encode_cloud(CLOUD), f"{CDR};sensor_msgs/msg/PointCloud2", "wrong_type"),
+        (CAMERA, message_encoding.encode_cloud(CLOUD), f"{CDR};sensor_msgs/msg/PointCloud2", "wrong_type"),
         (LIDAR, bytes(33 * 2**20), CDR, "message_too_large"),
     ],
 )

@@ -7,9 +7,8 @@ import pytest
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import SnippetsConfig
-from coec.runtime.ingest.decoder import Frame
-from coec.runtime.ingest.frame_budget import frame_bytes
-from coec.runtime.ingest.frame_ring import SILENT_S, FrameRing, Snippet
+from coec.service.ingest.decoder import Frame
+from coec.service.ingest.frame_buffers import SILENT_S, FrameRing, Snippet, frame_bytes
 
 S = 1_000_000_000
 BEGIN_NS = 1_700_000_000 * S

@@ -13,18 +13,17 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
-from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import InputSample
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame
 from coec.config import Config, KnownStreamConfig
-from coec.runtime.ingest import pair_stream
-from coec.runtime.ingest.chooser import FrameSelector, SelectionStatistics
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
-from coec.runtime.ingest.intake import Intake
-from coec.runtime.ingest.pair_stream import PairStream
-from coec.runtime.ingest.sensor import FRAMES_WAITING, read_alike
-from pair_bench import HEIGHT, WIDTH, pair_configuration
+from coec.io.logs import LossCounter
+from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.io.zenoh.bus import InputSample
+from coec.service.ingest import pair_stream
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
+from coec.service.ingest.frame_selector import FrameSelector, SelectionStatistics
+from coec.service.ingest.intake import FRAMES_WAITING, Intake, read_alike
+from coec.service.ingest.pair_stream import PairStream
+from support.vehicles import HEIGHT, WIDTH, pair_configuration
 
 HZ10_NS = 100_000_000
 BEGIN_NS = 10**18

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame
-from coec.runtime.ingest.frame_budget import frame_bytes
-from coec.runtime.ingest.pair_buffer import PairBuffer, WaitingFrames
+from coec.service.ingest.frame_buffers import PairBuffer, WaitingFrames, frame_bytes
 
 IMAGE = EncodedImage(ImageFormat.MONO8, 4, 2, bytes(8))
 

@@ -6,7 +6,7 @@ from itertools import count
 
 import pytest
 
-from coec.runtime.ingest.senders import RECENT, REMEMBERED, TRIAL, Senders
+from coec.service.ingest.decoder import RECENT, REMEMBERED, TRIAL, Senders
 
 A, B = b"a" * 16, b"b" * 16
 

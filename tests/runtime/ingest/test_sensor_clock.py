@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coec.runtime.ingest.sensor_clock import MIN_SILENCE_S, NS_PER_S, SILENT_GAPS, SensorClock
+from coec.service.timing import MIN_SILENCE_S, NS_PER_S, SILENT_GAPS, SensorClock
 
 
 @pytest.mark.parametrize("rate", [0.5, 1.0, 20.0, 400.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.runtime.ingest.sequence_numbers import LATE_FRAMES, MAX_GAP, SequenceNumbers
+from coec.service.ingest.decoder import LATE_FRAMES, MAX_GAP, SequenceNumbers
 
 
 def lost(*numbers: int) -> int:

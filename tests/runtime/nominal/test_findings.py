@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.ros.camera_info import CameraInfoContent
-from coec.adapters.ros.static_transforms import StaticTransform, StaticTransforms
 from coec.config import OpenPairConfig
 from coec.geometry import se3
-from coec.runtime.nominal.findings import (
+from coec.io.ros.camera_info import CameraInfoContent
+from coec.io.ros.transforms import StaticTransform, StaticTransforms
+from coec.service.discovery import (
     DiscoveredPair,
     ReceivedImage,
     ReceivedMetadata,

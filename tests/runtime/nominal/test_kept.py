@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.files.state_file import StateFile
 from coec.config import Config, PairConfig
-from coec.runtime.nominal.findings import DiscoveredPair
-from coec.runtime.nominal.kept import NOMINAL_FILE, DiscoveryStore, completed
+from coec.io.storage import StateFile
+from coec.service.discovery import NOMINAL_FILE, DiscoveredPair, DiscoveryStore, completed
 
 INTRINSICS = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0}
 TRANSFORM = [[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, 1 / 3], [1.0, 0.0, 0.0, -0.7], [0.0, 0.0, 0.0, 1.0]]

@@ -9,16 +9,16 @@ import pytest
 from numpy.typing import NDArray
 from rosbags.typesys.stores import ros2_humble as ros
 
-from bags import STORE, camera_info_message, transform_message
-from coec.adapters.ros import messages
-from coec.adapters.zenoh.inputs import CDR, InputSample
 from coec.calibration.types import Reason
 from coec.config import Config
 from coec.geometry import se3
-from coec.runtime.ingest.decoder import CAMERA, LIDAR
-from coec.runtime.nominal.findings import DiscoveredPair
-from coec.runtime.nominal.watch import TRANSFORMS_A_TURN, TRANSFORMS_WAITING, DiscoveryListener
-from ros_messages import compressed_image, packed_cloud
+from coec.io.ros import messages
+from coec.io.zenoh.bus import CDR, InputSample
+from coec.service.discovery import DiscoveredPair
+from coec.service.discovery_listener import TRANSFORMS_A_TURN, TRANSFORMS_WAITING, DiscoveryListener
+from coec.service.ingest.decoder import CAMERA, LIDAR
+from support.recordings import STORE, camera_info_message, transform_message
+from support.ros import compressed_image, packed_cloud
 
 T_BASE_TOP = se3.exp(np.array([0.0, 0.0, 0.3, 1.0, 0.0, 1.9]))
 CLOUD = packed_cloud([("x", "<f4", [1.0, 2.0]), ("y", "<f4", [0.0, 1.0]), ("z", "<f4", [0.0, 1.0])])
@@ -178,8 +178,8 @@ def test_a_decoder_that_fails_costs_its_sample(monkeypatch: pytest.MonkeyPatch) 
 
     watch = heard_all()
     with monkeypatch.context() as patched:
-        patched.setattr("coec.runtime.ingest.decoder.SampleReader.frame", broken)
-        patched.setattr("coec.runtime.nominal.watch.decode_static_transforms", broken)
+        patched.setattr("coec.service.ingest.decoder.SampleReader.frame", broken)
+        patched.setattr("coec.service.discovery_listener.decode_static_transforms", broken)
         watch.update()
     assert codes(watch) == ["no_image", "no_cloud"]
     assert watch.nominal("front").losses == {

@@ -10,17 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
-from coec.runtime.ingest.frame_ring import Snippet
-from coec.runtime.recording.recorder import Recorder, RecordingPlan
-from coec.runtime.recording.snippet_store import SnippetStore
-from coec.runtime.recording.snippets import SnippetRecorder
-from coec.runtime.recording.window_store import WindowStore
-from fakes import wait_until
+from coec.io.logs import LossCounter
+from coec.service.ingest.frame_buffers import Snippet
+from coec.service.recording.recorder import Recorder, RecordingPlan
+from coec.service.recording.snippets import SnippetRecorder, SnippetStore
+from coec.service.recording.window_store import WindowStore
+from support.fake_worker import wait_until
 
 NOMINAL = np.eye(4)
 CAMERA = build("pinhole", width=4, height=3, fx=2.0, fy=2.0, cx=1.5, cy=1.0)

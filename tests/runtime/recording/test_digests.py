@@ -12,9 +12,9 @@ from typing import BinaryIO, cast
 import pytest
 
 from coec.config import StateConfig
-from coec.runtime.recording import digests as digests_module
-from coec.runtime.recording.digests import DigestReader
-from coec.runtime.recording.window_store import WindowStore
+from coec.service.recording import recorder as digests_module
+from coec.service.recording.recorder import DigestReader
+from coec.service.recording.window_store import WindowStore
 
 PIECE = 1000
 DEADLINE_S = 20.0

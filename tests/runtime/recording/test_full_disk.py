@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coec.adapters.mcap.windows import read_window
-from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
-from coec.runtime.recording.recorder import Recorder, RecordingPlan
-from coec.runtime.recording.window_store import WindowStore
-from disks import FullDisk
-from fakes import wait_until
+from coec.io.logs import LossCounter
+from coec.io.mcap.window_reader import read_window
+from coec.service.recording.recorder import Recorder, RecordingPlan
+from coec.service.recording.window_store import WindowStore
+from support.disk import FullDisk
+from support.fake_worker import wait_until
 
 NOMINAL = np.eye(4)
 RIG = Rig(

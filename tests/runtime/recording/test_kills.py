@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.mcap.windows import read_window
-from coec.sources.bag.recording import open_bag
-from coec.sources.spec import parse_spec
+from coec.io.mcap.window_reader import read_window
+from coec.io.recordings.bag import open_bag
+from coec.io.recordings.recording_source import parse_spec
 from conftest import REPOSITORY
-from fakes import wait_until
 from runtime.recording.recording_child import PAIRS, recorder_of, stores
+from support.fake_worker import wait_until
 
 LONGEST_S = 0.4
 """From the first word to the kill: some windows, and the one under way."""

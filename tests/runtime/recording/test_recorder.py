@@ -17,14 +17,15 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from coec.adapters.mcap.windows import WindowWriter, read_window
-from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.window import CarriedOverPairs, SliceClosed
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, StateConfig
 from coec.errors import RecordingError
 from coec.geometry.cameras import build
-from coec.runtime.recording.recorder import (
+from coec.io.logs import LossCounter
+from coec.io.mcap.window_reader import read_window
+from coec.io.mcap.window_writer import WindowWriter
+from coec.service.recording.recorder import (
     BETWEEN_WAITING,
     PAIRS_WAITING,
     STUCK_S,
@@ -32,8 +33,8 @@ from coec.runtime.recording.recorder import (
     Recorder,
     RecordingPlan,
 )
-from coec.runtime.recording.window_store import WindowStore
-from fakes import wait_until
+from coec.service.recording.window_store import WindowStore
+from support.fake_worker import wait_until
 
 DEADLINE_S = 20.0
 MIN_PAIRS = 2

@@ -14,19 +14,18 @@ import cv2
 import numpy as np
 import pytest
 
-from coec.adapters.mcap.snippet_file import SnippetFile
-from coec.adapters.system.logs import LossCounter
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig, SweepTiming
 from coec.errors import NotFoundError, UsageError
 from coec.geometry.cameras import build
-from coec.runtime.ingest.decoder import Frame
-from coec.runtime.ingest.frame_ring import Snippet
-from coec.runtime.recording.snippet_store import SnippetStore
-from coec.runtime.recording.snippets import SnippetRecorder
-from coec.sources.bag.recording import open_bag
-from coec.sources.spec import parse_spec
-from disks import FullDisk
-from readers import read_recording
+from coec.io.logs import LossCounter
+from coec.io.mcap.bag_writer import SnippetFile
+from coec.io.recordings.bag import open_bag
+from coec.io.recordings.recording_source import parse_spec
+from coec.service.ingest.decoder import Frame
+from coec.service.ingest.frame_buffers import Snippet
+from coec.service.recording.snippets import SnippetRecorder, SnippetStore
+from support.disk import FullDisk
+from support.readers import read_recording
 
 S = 1_000_000_000
 BEGIN_NS = 1_700_000_000 * S
@@ -212,8 +211,8 @@ def test_a_full_disk_costs_the_snippet(
 def test_a_stop_keeps_what_can_be_written_in_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_s: float, sweeps: int
 ) -> None:
-    monkeypatch.setattr("coec.runtime.recording.snippets.STOP_S", stop_s)
-    monkeypatch.setattr("coec.runtime.recording.snippets.ROUND_S", 60.0)
+    monkeypatch.setattr("coec.service.recording.snippets.STOP_S", stop_s)
+    monkeypatch.setattr("coec.service.recording.snippets.ROUND_S", 60.0)
     bench = Bench(tmp_path)
     bench.recorder.submit(snippet(count=10, points=200_000))  # a round are two sweeps
     bench.recorder.write()

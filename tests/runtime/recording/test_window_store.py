@@ -13,13 +13,12 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.mcap.windows import RecordedWindow
 from coec.config import StateConfig
 from coec.errors import NotFoundError, RecordingError, UsageError
-from coec.runtime.recording import window_store
-from coec.runtime.recording.window_index import WindowVersion
-from coec.runtime.recording.window_store import EXPIRED_AT_ONCE, WindowStore
-from disks import EVERY_OPERATION, Disk
+from coec.io.mcap.window_writer import RecordedWindow
+from coec.service.recording import window_store
+from coec.service.recording.window_store import EXPIRED_AT_ONCE, WindowStore, WindowVersion
+from support.disk import EVERY_OPERATION, Disk
 
 DEADLINE_S = 20.0
 DAY_NS = 86_400 * 10**9
@@ -322,7 +321,7 @@ def test_a_window_that_was_written_again_has_no_digest_until_it_is_noted(tmp_pat
 
 
 def test_what_is_gone_is_forgotten_and_the_index_stays_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.runtime.recording.window_index.INDEX_LINES", 10)
+    monkeypatch.setattr("coec.service.recording.window_store.INDEX_LINES", 10)
     store = store_of(tmp_path)
     for day in range(60):
         record(store, at(day))

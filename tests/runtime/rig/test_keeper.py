@@ -10,17 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.files.state_file import StateFile
-from coec.runtime.api.rig import RigAnswers, reply_of
-from coec.runtime.api.rig_troubles import INCONSISTENT, rig_problems
-from coec.runtime.rig.keeper import LAG_NS, QUIET_TICKS
-from coec.runtime.rig.rig_file import RIG_FILE, RigStore
-from coec.schemas.base import from_json, to_json
+from coec.io.storage import StateFile
 from coec.schemas.keys import Keys
+from coec.schemas.message import from_json, to_json
 from coec.schemas.rig_state import RigReply
-from rig_said import (
+from coec.service.api.problems import INCONSISTENT, rig_problems
+from coec.service.api.rig_answers import RigAnswers, reply_of
+from coec.service.engine.rig_estimator_thread import LAG_NS, QUIET_TICKS
+from coec.service.records.rig_store import RIG_FILE, RigStore
+from support.rigs import (
     CAMERAS,
+    NS,
+    POSES,
+    SIGMA,
     RigEstimatorBench,
+    moved_poses,
     pair_check,
     pair_config,
     pair_pose,
@@ -28,7 +32,6 @@ from rig_said import (
     pair_window,
     served_extrinsic,
 )
-from rigs import NS, POSES, SIGMA, moved_poses
 
 KNOCKED_S = 45.0
 AFTER = moved_poses("roof")

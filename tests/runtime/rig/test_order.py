@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from coec.runtime.rig.order import MOST_WAITING, SILENT_NS, ReportSchedule
+from coec.service.engine.schedule import MOST_WAITING, SILENT_NS, ReportSchedule
 
 S = 1_000_000_000
 PAIRS = ("front", "left", "rear")

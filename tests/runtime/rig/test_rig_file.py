@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.calibration.rig import vehicle
-from coec.calibration.rig.vehicle import VehicleRig
+from coec.calibration.rig import rig_estimator
+from coec.calibration.rig.rig_estimator import VehicleRig
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from coec.runtime.rig.rig_file import RIG_FILE, RigStore
-from driven_rig import STAR, RigDrive, RigPoses, pose_of
-from rigs import POSES, graph, moved_poses
+from coec.service.records.rig_store import RIG_FILE, RigStore
+from support.rigs import POSES, STAR, RigDrive, RigPoses, graph, moved_poses, pose_of
 
 AFTER: RigPoses = moved_poses("roof")
 BLIND = "rear-roof"
@@ -44,7 +43,7 @@ def restarted(rig: VehicleRig, folder: Path) -> VehicleRig:
     file.flush()
     found = RigStore(folder)
     assert found.damage == ()
-    return found.restored(vehicle.initial_rig(rig.graph, rig.serves, rig.windows))
+    return found.restored(rig_estimator.initial_rig(rig.graph, rig.serves, rig.windows))
 
 
 def put_right(drive: RigDrive) -> Matrix4:
@@ -94,8 +93,8 @@ def test_pairs_that_join_one_after_the_other_find_what_was_known_of_them(tmp_pat
         part = graph(STAR[:count])
         serves = {name: rig.serves[name] for name in part.edge}
         windows = {name: one for name, one in rig.windows.items() if name in part.edge}
-        fresh = found.restored(vehicle.initial_rig(part, serves, windows))
-        grown = fresh if grown is None else vehicle.grown(grown, fresh)
+        fresh = found.restored(rig_estimator.initial_rig(part, serves, windows))
+        grown = fresh if grown is None else rig_estimator.grown(grown, fresh)
     assert grown is not None
     assert grown.before is not None
     assert set(grown.before.edges) == {edge.name for edge in graph(STAR).edges}

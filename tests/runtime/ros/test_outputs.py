@@ -9,17 +9,16 @@ from typing import Any, cast
 
 import pytest
 
-from coec.adapters.ros.diagnostics import ServicePhase
-from coec.adapters.ros.wire.qos import STATIC, Qos
-from coec.adapters.zenoh.ros_publisher import RosPublishers
 from coec.calibration.types import Rig
 from coec.config import Config, RosConfig
 from coec.geometry.cameras import build
-from coec.runtime.ros.outputs import RosOutputs
-from coec.runtime.ros.told import PairOutput, VehicleOutput
-from fakes import wait_until
-from pair_bench import BEGIN_S, DRIVE_END_S, STEP_S, OracleWorker, PairBench
+from coec.io.ros.message_encoding import ServicePhase
+from coec.io.ros.wire_format import STATIC, Qos
+from coec.io.zenoh.ros_node import RosPublishers
+from coec.service.ros_output import PairOutput, RosOutputs, VehicleOutput
 from runtime.ros.topics import KeptTopic, KeptTopics
+from support.fake_worker import wait_until
+from support.vehicles import BEGIN_S, DRIVE_END_S, STEP_S, OracleWorker, PairBench
 
 OK, WARN, ERROR, STALE = range(4)
 INFO, OVERLAY = "/coec/front/camera/camera_info", "/coec/front/overlay/compressed"
@@ -116,7 +115,7 @@ def test_diagnostics_come_unasked(told: Told) -> None:
 def test_what_nobody_renews_is_stale(told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
     told.bench.drive(BEGIN_S, STEP_S)
     assert told.status_that(lambda status: status.level == OK)
-    monkeypatch.setattr("coec.runtime.api.health.OLD_S", -1.0)
+    monkeypatch.setattr("coec.service.api.reply_builders.OLD_S", -1.0)
     assert "service_stuck" in str(told.status_that(lambda status: status.level == STALE).values)
 
 

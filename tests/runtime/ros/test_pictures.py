@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.ros.messages import COMPRESSED_IMAGE
-from coec.adapters.ros.wire.qos import Qos
 from coec.calibration.types import Reason
-from coec.runtime.ros.pictures import PICTURE_PERIOD_S, CheckPictures
-from coec.runtime.worker.jobs import Fate, JobOutcome, Kind, RenderedImage, WorkerJob
-from pair_bench import frame_pair_at, pair_configuration
+from coec.io.ros.messages import COMPRESSED_IMAGE
+from coec.io.ros.wire_format import Qos
+from coec.service.ros_output import PICTURE_PERIOD_S, CheckPictures
+from coec.service.worker.worker_jobs import Fate, JobOutcome, Kind, RenderedImage, WorkerJob
 from runtime.ros.topics import KeptTopic
+from support.vehicles import frame_pair_at, pair_configuration
 
 STAMP_NS = 1_700_000_000_250_000_000
 PAIR = pair_configuration(Path("state")).pairs[0]
@@ -44,7 +44,7 @@ class Scene:
 @pytest.fixture
 def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     scene = Scene()
-    monkeypatch.setattr("coec.runtime.ros.pictures.time.monotonic", lambda: scene.now_s)
+    monkeypatch.setattr("coec.service.ros_output.time.monotonic", lambda: scene.now_s)
     return scene
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.adapters.files.conversions import transform_of
 from coec.config import RosConfig
 from coec.geometry import se3
-from coec.runtime.ros.transforms import CalibratedFrames
+from coec.io.serialise import transform_of
 from coec.schemas.replies import Axes, AxisReply, ExtrinsicReply, Provenance
+from coec.service.ros_output import CalibratedFrames
 
 AXIS = AxisReply(status="not_accepted", sigma=None, correction=0.0, unit="deg")
 POSE = se3.perturb(np.eye(4), np.array([0.3, -0.2, 0.1, 1.0, 2.0, 3.0]))

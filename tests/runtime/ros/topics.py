@@ -9,7 +9,7 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
 
-from coec.adapters.ros.wire.qos import Qos
+from coec.io.ros.wire_format import Qos
 
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 TIMEOUT_S = 20.0

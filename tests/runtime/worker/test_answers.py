@@ -11,15 +11,26 @@ import msgpack
 import numpy as np
 import pytest
 
-from coec.adapters.files.conversions import result_of
-from coec.calibration.commissioning.baseline import BaselineDrift
+from coec.calibration.baseline import BaselineDrift
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import Metric, Reason
-from coec.runtime.worker.answers import MalformedAnswerError, number_of, pack_answer, pack_refusal, read_answer
-from coec.runtime.worker.jobs import Answer, Checked, Commissioned, Kind, RenderedImage, Solved
-from coec.schemas.base import to_msgpack
-from estimates import ESTIMATE_RIG, estimate
+from coec.io.serialise import result_of
+from coec.schemas.message import to_msgpack
+from coec.service.worker.worker_jobs import (
+    Answer,
+    Checked,
+    Commissioned,
+    Kind,
+    MalformedAnswerError,
+    RenderedImage,
+    Solved,
+    number_of,
+    pack_answer,
+    pack_refusal,
+    read_answer,
+)
+from support.estimates import ESTIMATE_RIG, estimate
 
 OBSERVATION = Observation(
     stamp_ns=7,

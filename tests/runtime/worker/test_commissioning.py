@@ -11,20 +11,19 @@ import numpy as np
 import pytest
 
 from calibration.conftest import STREET, window_of
-from coec.adapters.files.baseline_file import BASELINES, baseline_hash, load_baseline
-from coec.adapters.images.codec import GreyImages
-from coec.adapters.mcap.windows import WindowWriter
-from coec.calibration.commissioning import learning, verdict_limits
-from coec.calibration.commissioning.learning import commission
+from coec.calibration import commissioning
+from coec.calibration.commissioning import commission
 from coec.calibration.types import Window
 from coec.cli.convert import configuration_for
 from coec.config import CalibrationConfig, Config, DepthConfig, LimitsConfig, SearchConfig, StateConfig
 from coec.errors import CalibrationError
-from coec.runtime.worker import tasks
-from coec.runtime.worker.jobs import DEADLINE_S, Commissioned, Kind, Underway
-from coec.runtime.worker.messages import pack_pairs, pack_pose
-from coec.runtime.worker.tasks import Solver
-from drives import rendered_source
+from coec.io.baseline_file import BASELINES, baseline_hash, load_baseline
+from coec.io.images import GreyImages
+from coec.io.mcap.window_writer import WindowWriter
+from coec.service.worker import tasks
+from coec.service.worker.tasks import Solver
+from coec.service.worker.worker_jobs import DEADLINE_S, Commissioned, Kind, Underway, pack_pairs, pack_pose
+from support.simulated_drives import rendered_source
 
 CONFIG = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(reach_deg=8.0))
 
@@ -32,10 +31,10 @@ CONFIG = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfi
 @pytest.fixture(autouse=True)
 def small_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few of everything, and a slice for each step."""
-    monkeypatch.setattr(learning, "CHECKS", 4)
-    monkeypatch.setattr(learning, "FAR_CHECKS", 1)
-    monkeypatch.setattr(learning, "HALVES", 3)
-    monkeypatch.setattr(verdict_limits, "SOLVES", 1)
+    monkeypatch.setattr(commissioning, "CHECKS", 4)
+    monkeypatch.setattr(commissioning, "FAR_CHECKS", 1)
+    monkeypatch.setattr(commissioning, "HALVES", 3)
+    monkeypatch.setattr(commissioning, "SOLVES", 1)
     monkeypatch.setattr(tasks, "SLICE_S", 0.0)
 
 

@@ -10,13 +10,12 @@ from typing import Any, cast
 import pytest
 
 from coec.config import Config
-from coec.geometry import compile_news
-from coec.runtime.worker import process
-from coec.runtime.worker.compilation import LINE_S, STALLED_S, Compilation, Compiling
-from coec.runtime.worker.kernels import compiled
-from coec.runtime.worker.link import Link
-from coec.runtime.worker.tasks import Solver
-from rig_said import pair_config
+from coec.geometry import compilation_events
+from coec.service.worker import worker_main
+from coec.service.worker.child_process import Link
+from coec.service.worker.compilation import LINE_S, STALLED_S, Compilation, Compiling, compiled
+from coec.service.worker.tasks import Solver
+from support.rigs import pair_config
 
 
 @dataclass
@@ -107,15 +106,15 @@ def test_the_worker_reports_when_it_begins_a_kernel_at_a_bounded_rate_and_when_i
 ) -> None:
     clock, sent = Clock(), Sent()
     monkeypatch.setattr(time, "monotonic", clock)
-    with process._reported(cast("Link", sent), 1):
+    with worker_main._reported(cast("Link", sent), 1):
         for _ in range(3):
-            compile_news.notify("a pass")
-        clock.now_s += process.REPORT_S
-        compile_news.notify("a pass")
-        compile_news.end("kernel")
-        compile_news.notify("another kernel")
+            compilation_events.notify("a pass")
+        clock.now_s += worker_main.REPORT_S
+        compilation_events.notify("a pass")
+        compilation_events.end("kernel")
+        compilation_events.notify("another kernel")
         sent.gone = True
-        compile_news.end("another kernel")
+        compilation_events.end("another kernel")
     assert [message["kind"] for message in sent.messages] == ["compiling", "compiling", "compiled", "compiling"]
     assert sent.messages[0]["total"] == compiled(1).total
 

@@ -8,9 +8,9 @@ from typing import Any, cast
 import pytest
 
 from coec.errors import CalibrationError
-from coec.runtime.worker import dispatch
-from coec.runtime.worker.jobs import RenderedImage
-from coec.runtime.worker.tasks import Solver
+from coec.service.worker import tasks
+from coec.service.worker.tasks import Solver
+from coec.service.worker.worker_jobs import RenderedImage
 
 
 class FaultySolver:
@@ -39,7 +39,7 @@ SOLVE = {"id": 5, "kind": "solve", "pair": "front", "path": "w"}
 
 
 def answer(fault: Exception, message: dict[str, Any]) -> dict[str, Any]:
-    return dispatch.answer_request(cast("Solver", FaultySolver(fault)), message)
+    return tasks.answer_request(cast("Solver", FaultySolver(fault)), message)
 
 
 class Painter:
@@ -62,16 +62,16 @@ class Painter:
 
 def test_an_answer_goes_under_the_number_of_its_question() -> None:
     painter = cast("Solver", Painter())
-    assert dispatch.answer_request(painter, {**OVERLAY, "title": "a"}) == {"id": 4, "result": {"jpeg": b"a"}}
+    assert tasks.answer_request(painter, {**OVERLAY, "title": "a"}) == {"id": 4, "result": {"jpeg": b"a"}}
     picture = {**CHECK, "kind": "picture", "frames": [[]], "title": "b"}
-    assert dispatch.answer_request(painter, picture) == {"id": 3, "result": {"jpeg": b"front 1 b"}}
-    assert dispatch.answer_request(painter, COMPARISON) == {"id": 7, "result": {"jpeg": b"2 a b"}}
+    assert tasks.answer_request(painter, picture) == {"id": 3, "result": {"jpeg": b"front 1 b"}}
+    assert tasks.answer_request(painter, COMPARISON) == {"id": 7, "result": {"jpeg": b"2 a b"}}
     prefetch = {"id": 6, "kind": "prefetch", "pair": "front", "frame": b""}
-    assert dispatch.answer_request(painter, prefetch) == {"id": 6, "result": None}
+    assert tasks.answer_request(painter, prefetch) == {"id": 6, "result": None}
 
 
 def test_a_question_that_nobody_knows_is_refused() -> None:
-    told = dispatch.answer_request(cast("Solver", Painter()), {"id": 7, "kind": "sing", "pair": "front"})
+    told = tasks.answer_request(cast("Solver", Painter()), {"id": 7, "kind": "sing", "pair": "front"})
     assert told["refused"]["code"] == "internal_error"
     assert "'sing'" in told["refused"]["text"]
 

@@ -5,8 +5,8 @@ import numpy as np
 
 from coec.calibration.frames.pairing import Pairer
 from coec.config import LimitsConfig, PairingConfig
-from coec.runtime.worker.messages import pack_pairs, unpack_pairs
-from drives import rendered_source
+from coec.service.worker.worker_jobs import pack_pairs, unpack_pairs
+from support.simulated_drives import rendered_source
 
 
 def test_pairs_survive() -> None:

@@ -19,8 +19,26 @@ from hypothesis.stateful import (
 )
 
 from coec.calibration.types import Reason
-from coec.runtime.worker.jobs import DEADLINE_S, Fate, JobOutcome, Kind, Prefetch, RenderedImage, Underway, WorkerJob
-from coec.runtime.worker.queue import BUSY, PREFETCHES_WAITING, STOPPING, SUPERSEDED, WAITING, JobQueue, Lane, Ticket
+from coec.service.worker.job_queue import (
+    BUSY,
+    PREFETCHES_WAITING,
+    STOPPING,
+    SUPERSEDED,
+    WAITING,
+    JobQueue,
+    Lane,
+    Ticket,
+)
+from coec.service.worker.worker_jobs import (
+    DEADLINE_S,
+    Fate,
+    JobOutcome,
+    Kind,
+    Prefetch,
+    RenderedImage,
+    Underway,
+    WorkerJob,
+)
 
 ANSWER = RenderedImage(b"")
 """Stands for any: the queue does not look into answers."""

@@ -9,19 +9,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coec.calibration.lidar_to_lidar.types import LidarRig, RangeBias, SweepPair
+from coec.calibration.rig.lidar_sampling import LidarRig, RangeBias, SweepPair
 from coec.calibration.types import EgoMotion, LidarFrame, Reason, SweepTiming
 from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import se3
-from coec.runtime.worker import tasks
-from coec.runtime.worker.answers import MalformedAnswerError, pack_answer, read_answer
-from coec.runtime.worker.dispatch import answer_request
-from coec.runtime.worker.jobs import Fate, JobOutcome, Kind, Registered, register
-from coec.runtime.worker.messages import pack_lidars, unpack_lidars, unpack_sweeps
-from coec.runtime.worker.queue import JobQueue
-from coec.runtime.worker.tasks import Solver
-from pair_bench import pair_configuration
+from coec.service.worker import tasks
+from coec.service.worker.job_queue import JobQueue
+from coec.service.worker.tasks import Solver, answer_request
+from coec.service.worker.worker_jobs import (
+    Fate,
+    JobOutcome,
+    Kind,
+    MalformedAnswerError,
+    Registered,
+    pack_answer,
+    pack_lidars,
+    read_answer,
+    register,
+    unpack_lidars,
+    unpack_sweeps,
+)
+from support.vehicles import pair_configuration
 
 T_A_B = se3.perturbation(np.array([0.02, -0.01, 0.4, 0.3, 0.5, -0.4]))
 RIG = LidarRig("roof", "bumper", T_A_B, np.eye(4), None, SweepTiming(0.1, -1, 0.5))

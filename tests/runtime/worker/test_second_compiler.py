@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from coec.config import Config
-from coec.geometry import compile_news
-from coec.runtime.worker import second_compiler
-from rig_said import pair_config
+from coec.geometry import compilation_events
+from coec.service.worker import second_compiler
+from support.rigs import pair_config
 
 CONFIG = Config(pairs=(pair_config("front"),))
 
@@ -33,14 +33,14 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 def test_there_is_none_where_nothing_is_compiled(started: list[subprocess.Popen[bytes]]) -> None:
     with second_compiler.second_compiler(CONFIG):
         pass
-    compile_news.notify("a kernel of somebody else's")
+    compilation_events.notify("a kernel of somebody else's")
     assert started == []
 
 
 def test_there_is_one_from_the_first_kernel_to_the_end_of_the_warm_up(started: list[subprocess.Popen[bytes]]) -> None:
     with second_compiler.second_compiler(CONFIG):
-        compile_news.notify("one")
-        compile_news.notify("another")
+        compilation_events.notify("one")
+        compilation_events.notify("another")
         (child,) = started
         assert child.poll() is None
     assert child.returncode is not None
@@ -51,11 +51,11 @@ def test_there_is_none_beside_a_single_processor(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     with second_compiler.second_compiler(CONFIG):
-        compile_news.notify("one")
+        compilation_events.notify("one")
     assert started == []
 
 
 def test_it_takes_a_configuration_and_ends_when_all_is_compiled() -> None:
-    command = [sys.executable, "-m", "coec.runtime.worker.second_compiler", str(os.getpid())]
+    command = [sys.executable, "-m", "coec.service.worker.second_compiler", str(os.getpid())]
     done = subprocess.run(command, input=CONFIG.model_dump_json().encode(), capture_output=True)
     assert (done.returncode, done.stderr) == (0, b"")

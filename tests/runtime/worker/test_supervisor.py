@@ -16,20 +16,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coec.adapters.files.conversions import result_of
-from coec.adapters.system.threads import ServiceThread
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Reason
 from coec.config import CalibrationConfig, WorkerConfig
-from coec.runtime.api.status import worker_status_of
-from coec.runtime.worker import compilation, jobs, link
-from coec.runtime.worker.child import Child, ChildError, Fault
-from coec.runtime.worker.costs import Cost
-from coec.runtime.worker.jobs import Checked, Commissioned, Fate, JobOutcome, Kind, RenderedImage, Solved, WorkerJob
-from coec.runtime.worker.queue import BUSY
-from coec.runtime.worker.supervisor import Worker, WorkerState
-from coec.schemas.base import to_msgpack
-from estimates import ESTIMATE_RIG, estimate
-from fakes import RELEASE_FILE, RESULT_FILE, SETTINGS_FILE, fake_worker_command, wait_until
+from coec.io.serialise import result_of
+from coec.io.system import ServiceThread
+from coec.schemas.message import to_msgpack
+from coec.service.api.reply_builders import worker_status_of
+from coec.service.worker import child_process, compilation, worker_jobs
+from coec.service.worker.child_process import Child, ChildError, Fault
+from coec.service.worker.job_queue import BUSY
+from coec.service.worker.supervisor import Worker, WorkerState
+from coec.service.worker.worker_jobs import (
+    Checked,
+    Commissioned,
+    Cost,
+    Fate,
+    JobOutcome,
+    Kind,
+    RenderedImage,
+    Solved,
+    WorkerJob,
+)
+from support.estimates import ESTIMATE_RIG, estimate
+from support.fake_worker import RELEASE_FILE, RESULT_FILE, SETTINGS_FILE, fake_worker_command, wait_until
 
 DEADLINE_S = 30.0
 LIMITS = WorkerConfig(timeout_s=3600.0, max_memory_bytes=2**28, attempts=2)
@@ -53,13 +62,13 @@ class Bench:
         return lambda outcome: self.told.put((name, outcome))
 
     def solve(self, name: str, pair: str = "front", live: bool = True) -> None:
-        self.worker.submit(jobs.solve(pair, Path("/windows") / name, name, self.done(name), live))
+        self.worker.submit(worker_jobs.solve(pair, Path("/windows") / name, name, self.done(name), live))
 
     def check(self, name: str, pairs: Sequence[FramePair] = ()) -> None:
-        self.worker.submit(jobs.check("front", CalibrationConfig(), POSE, pairs, self.done(name)))
+        self.worker.submit(worker_jobs.check("front", CalibrationConfig(), POSE, pairs, self.done(name)))
 
     def overlay(self, name: str, deadline_s: float | None = None) -> None:
-        self.worker.submit(jobs.overlay("front", Path("/windows/w"), POSE, name, self.done(name), deadline_s))
+        self.worker.submit(worker_jobs.overlay("front", Path("/windows/w"), POSE, name, self.done(name), deadline_s))
 
     def outcome(self) -> tuple[str, JobOutcome]:
         """The next one that is told."""
@@ -188,7 +197,9 @@ def test_each_kind_comes_back_with_its_answer(tmp_path: Path) -> None:
         assert checked.baseline_not_used == "0 pairs"
         it.overlay("picture")
         assert it.answer() == ("picture", RenderedImage(b"picture"))
-        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig")))
+        it.worker.submit(
+            worker_jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig"))
+        )
         name, rig = it.answer()
         assert (name, type(rig), rig.windows, rig.pairs, rig.baseline_hash) == ("rig", Commissioned, 2, 7, "b" * 16)
         np.testing.assert_array_equal(rig.pose, POSE)
@@ -204,8 +215,8 @@ def test_other_work_is_done_between_the_slices_of_a_commissioning(tmp_path: Path
         it.check("c")
         wait_until(lambda: it.worker.status().state is WorkerState.BUSY, "the check")
         windows = [Path("a"), Path("b"), Path("c")]
-        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig")))
-        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig again")))
+        it.worker.submit(worker_jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig")))
+        it.worker.submit(worker_jobs.commission("front", CalibrationConfig(), POSE, windows, it.done("rig again")))
         assert it.failure() == ("rig again", BUSY)
         assert it.worker.commissioning("front") == "waiting for the worker"
         assert it.worker.commissioning("rear") is None
@@ -221,7 +232,9 @@ def test_other_work_is_done_between_the_slices_of_a_commissioning(tmp_path: Path
 @pytest.mark.fault("the worker is replaced during a commissioning", "it begins again with the next worker")
 def test_a_commissioning_outlives_a_worker_that_dies_of_something_else(tmp_path: Path) -> None:
     with waiting("crash-once", tmp_path, at="check") as it:
-        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig")))
+        it.worker.submit(
+            worker_jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig"))
+        )
         it.check("c")
         it.worker.start()
         name, reason = it.failure()
@@ -233,7 +246,7 @@ def test_a_commissioning_outlives_a_worker_that_dies_of_something_else(tmp_path:
 @pytest.mark.fault("the worker dies of a commissioning", "it ends with the reason; the worker is replaced")
 def test_a_commissioning_that_kills_the_worker_has_failed(tmp_path: Path) -> None:
     with running("crash-once", tmp_path, at="commission") as it:
-        it.worker.submit(jobs.commission("front", CalibrationConfig(), POSE, [Path("a")], it.done("rig")))
+        it.worker.submit(worker_jobs.commission("front", CalibrationConfig(), POSE, [Path("a")], it.done("rig")))
         name, reason = it.failure()
         assert (name, reason.code) == ("rig", "worker_failed")
         it.check("c")
@@ -291,7 +304,7 @@ IN_A_JOB = {
 def test_after_one_fault_another_worker_solves_the_window(
     tmp_path: Path, fault: str, counted: Fault, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link, "TRANSFER_TIMEOUT_S", 1)
+    monkeypatch.setattr(child_process, "TRANSFER_TIMEOUT_S", 1)
     with running(f"{fault}-once", tmp_path, limits_for(fault)) as it:
         it.solve("a")
         assert it.answer() == ("a", "a")
@@ -386,7 +399,7 @@ def a_pair(stamp_ns: int) -> FramePair:
 def test_a_check_that_a_worker_does_not_take_goes_to_the_next_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link, "TRANSFER_TIMEOUT_S", 1)
+    monkeypatch.setattr(child_process, "TRANSFER_TIMEOUT_S", 1)
     with running("deaf-once", tmp_path) as it:
         it.check("c", [a_pair(number) for number in range(5)])
         name, checked = it.answer()
@@ -449,7 +462,7 @@ def test_what_waits_behind_a_worker_that_hangs_is_answered_in_time(tmp_path: Pat
 
 def test_a_worker_may_have_less_time_for_one_job_than_for_others(tmp_path: Path) -> None:
     with running("hang-once", tmp_path) as it:
-        it.worker.submit(replace(jobs.solve("front", Path("a"), "a", it.done("a")), timeout_s=0.2))
+        it.worker.submit(replace(worker_jobs.solve("front", Path("a"), "a", it.done("a")), timeout_s=0.2))
         assert it.answer() == ("a", "a")
         assert it.faults() == {Fault.TIMED_OUT: 1}
 
@@ -496,7 +509,7 @@ def test_whoever_fails_to_take_an_outcome_harms_nobody_else(tmp_path: Path, capl
 
     with running("none", tmp_path) as it:
         it.jobs.append("a")
-        it.worker.submit(jobs.overlay("front", Path("a"), POSE, "a", fail))
+        it.worker.submit(worker_jobs.overlay("front", Path("a"), POSE, "a", fail))
         it.overlay("b")
         assert it.answer() == ("b", RenderedImage(b"b"))
         assert it.worker.status().losses == {"done_raised": 1}
@@ -516,7 +529,7 @@ def test_an_outcome_is_told_without_a_lock(tmp_path: Path) -> None:
             it.overlay("next")
 
         it.jobs.append("first")
-        it.worker.submit(jobs.overlay("front", Path("a"), POSE, "first", told))
+        it.worker.submit(worker_jobs.overlay("front", Path("a"), POSE, "first", told))
         assert it.answer() == ("next", RenderedImage(b"next"))
     assert statuses.get_nowait() in (WorkerState.BUSY, WorkerState.READY)
 
@@ -639,7 +652,7 @@ def test_a_program_that_is_not_there_is_a_failure_until_it_is(tmp_path: Path) ->
 def test_a_worker_without_a_socket_is_a_failure_until_there_is_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    right, failed = link.Link.pair, list[int]()
+    right, failed = child_process.Link.pair, list[int]()
 
     def fail_once() -> Any:
         if failed:
@@ -647,7 +660,7 @@ def test_a_worker_without_a_socket_is_a_failure_until_there_is_one(
         failed.append(1)
         raise OSError(24, "Too many open files")
 
-    monkeypatch.setattr(link.Link, "pair", fail_once)
+    monkeypatch.setattr(child_process.Link, "pair", fail_once)
     with running("none", tmp_path) as it:
         it.solve("a")
         assert it.answer() == ("a", "a")

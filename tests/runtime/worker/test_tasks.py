@@ -10,21 +10,21 @@ import pytest
 from coec.calibration.types import Window
 from coec.config import Config, LidarConfig
 from coec.errors import CalibrationError
-from coec.runtime.worker import warm_up
-from coec.runtime.worker.tasks import Solver
+from coec.service.worker import warm_up
+from coec.service.worker.tasks import Solver
 from warm import LENSES, pair_configs
 
 SCRIPT = """
 import gc
 from numba.core.dispatcher import Dispatcher
-from coec.runtime.worker.late_kernels import late_kernels
-from coec.runtime.worker.tasks import Solver
-from coec.calibration.calibrator import calibrate
+from coec.service.worker.warm_up import late_kernels
+from coec.service.worker.tasks import Solver
+from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import Silence
-from coec.sources import windows
+from coec.io.recordings.layouts import windows
 from coec.cli.convert import configuration_for
 from coec.config import CalibrationConfig, Config, DepthConfig, ObjectiveConfig, SearchConfig
-from coec.sources import open_source
+from coec.io.recordings.layouts import open_source
 
 source = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"
 window = windows.load(source, None, 25, lambda *_: None).window

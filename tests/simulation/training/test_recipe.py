@@ -8,10 +8,11 @@ import pytest
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 from coec.geometry.projection import unproject
-from coec.simulation.training import files, recipe
-from coec.simulation.training.augment import augment, target
-from coec.simulation.training.places import CROWDED, HallScene, JamScene, StreetScene, training_scenes
-from coec.simulation.training.shown import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, TrainingFrame
+from coec_lab.training import training_frames
+from coec_lab.training import training_scenes as recipe
+from coec_lab.training.train import augment, target
+from coec_lab.training.training_frames import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, TrainingFrame
+from coec_lab.training.training_scenes import CROWDED, HallScene, JamScene, StreetScene, training_scenes
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +67,10 @@ def test_shares_of_the_kinds_sum_to_one() -> None:
 
 
 def test_files_give_back_what_was_written(tmp_path: Path, some: list[TrainingFrame]) -> None:
-    path = files.write(tmp_path, 12, some)
-    files.write(tmp_path, 3, some[:1])
-    assert files.towns(tmp_path) == [files.path_of(tmp_path, 3), path]
-    back = files.read(path)
+    path = training_frames.write(tmp_path, 12, some)
+    training_frames.write(tmp_path, 3, some[:1])
+    assert training_frames.towns(tmp_path) == [training_frames.path_of(tmp_path, 3), path]
+    back = training_frames.read(path)
     assert sorted(shown.code.tobytes() for shown in back) == sorted(shown.code.tobytes() for shown in some)
     assert not list(tmp_path.glob("*.part"))
 

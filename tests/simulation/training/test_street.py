@@ -7,16 +7,16 @@ import pytest
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.adapters.depth.maps import open_depth
-from coec.adapters.depth.model_cards import CARDS, find_card
-from coec.adapters.depth.onnx_network import file_identity
-from coec.adapters.images.codec import encode_jpeg
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import DepthConfig, LimitsConfig
-from coec.evaluation.depth_quality import spearman
-from coec.simulation.drive import DriveConfig, SimulatedDrive
-from coec.simulation.training import recipe
+from coec.io.depth.depth_maps import open_depth
+from coec.io.depth.model_cards import CARDS, find_card
+from coec.io.depth.onnx_network import file_identity
+from coec.io.images import encode_jpeg
+from coec_lab.experiments.depth_quality import spearman
+from coec_lab.simulation.drive import DriveConfig, SimulatedDrive
+from coec_lab.training import training_scenes
 
 STREET = CARDS / "street.onnx"
 MOST_BYTES = 2_000_000
@@ -57,7 +57,7 @@ def test_a_network_of_that_name_in_the_users_folder_comes_first(
 
 def test_it_orders_unseen_rendered_frames_by_range(street: DepthModel) -> None:
     correlations = []
-    for shown in recipe.frames(UNSEEN):
+    for shown in training_scenes.frames(UNSEEN):
         height, width = shown.code.shape
         image = EncodedImage(ImageFormat.JPEG, width, height, encode_jpeg(shown.bgr, 95))
         values = street.infer(CameraFrame(0, "camera", image)).values

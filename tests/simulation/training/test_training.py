@@ -10,12 +10,11 @@ pytest.importorskip("onnx", reason="needs the optional extra `train`")
 
 import torch
 
-from coec.simulation.training import files
-from coec.simulation.training.export import export, same
-from coec.simulation.training.loss import loss
-from coec.simulation.training.network import StreetNet
-from coec.simulation.training.shown import SHAPES, TrainingFrame
-from coec.simulation.training.train import RATE, WARM_STEPS, rate, train
+from coec_lab.training import training_frames
+from coec_lab.training.network import StreetNet
+from coec_lab.training.onnx_export import export, same
+from coec_lab.training.train import RATE, WARM_STEPS, loss, rate, train
+from coec_lab.training.training_frames import SHAPES, TrainingFrame
 
 
 def _ramps() -> list[TrainingFrame]:
@@ -67,7 +66,7 @@ def test_learning_rate_rises_stays_and_falls() -> None:
 
 
 def test_training_learns_goes_on_and_exports_what_it_learned(tmp_path: Path) -> None:
-    files.write(tmp_path, 1, _ramps())
+    training_frames.write(tmp_path, 1, _ramps())
     checkpoint, network = tmp_path / "net.pt", tmp_path / "net.onnx"
     train(tmp_path, checkpoint, 2, 0, 1)
     train(tmp_path, checkpoint, 4, 0, 1)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from rosbags.typesys.stores import ros2_humble as ros
 
-from bags import Bag, drive_messages, imu_message, ros_header, timed_cloud_message, transform_message
 from coec.calibration.types import EgoMotion, LidarFrame
 from coec.errors import SourceError, UsageError
 from coec.geometry import se3
-from coec.sources import open_source
-from coec.sources.recording import RecordingSource
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import RecordingSource
+from support.recordings import Bag, drive_messages, imu_message, ros_header, timed_cloud_message, transform_message
 
 SECOND = 10**9
 TWIST = np.array([0.0, 0.0, 0.3, 5.0, 0.0, 0.0])

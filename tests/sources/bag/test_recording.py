@@ -11,7 +11,15 @@ import pytest
 from mcap.writer import CompressionType
 from rosbags.typesys.stores import ros2_humble as ros
 
-from bags import (
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.config import CalibrationConfig, PairingConfig, SearchConfig
+from coec.errors import SourceError, UsageError
+from coec.geometry import cameras, se3
+from coec.io.mcap.window_reader import read_window
+from coec.io.mcap.window_writer import WindowWriter
+from coec.io.recordings.layouts import open_source
+from support.recordings import (
     HEIGHT,
     T_BASE_LIDAR,
     T_BASE_MOUNT,
@@ -28,13 +36,6 @@ from bags import (
     timed_cloud_message,
     transform_message,
 )
-from coec.adapters.mcap.windows import WindowWriter, read_window
-from coec.calibration.frames.pairing import Pairer
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
-from coec.config import CalibrationConfig, PairingConfig, SearchConfig
-from coec.errors import SourceError, UsageError
-from coec.geometry import cameras, se3
-from coec.sources import open_source
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

@@ -14,11 +14,11 @@ from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from ruamel.yaml import YAML
 
-from bags import STORE, Bag, compressed_image_message, drive_messages
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.errors import SourceError, WindowError
-from coec.sources import open_source
-from coec.sources.recording import SensorMessage
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import SensorMessage
+from support.recordings import STORE, Bag, compressed_image_message, drive_messages
 
 SQLITE, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
 NONE, FILE, MESSAGE = CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE
@@ -219,9 +219,9 @@ def test_a_bag_that_grows_without_end_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
 ) -> None:
     for module in ("folder", "mcap_storage"):
-        monkeypatch.setattr(f"coec.sources.bag.{module}.MAX_RATIO", 2)
-    monkeypatch.setattr("coec.sources.bag.folder.MAX_UNPACKED_MESSAGE_BYTES", 30_000)
-    monkeypatch.setattr("coec.sources.bag.mcap_storage.MAX_CHUNK_BYTES", 30_000)
+        monkeypatch.setattr(f"coec.io.recordings.layouts.bag.{module}.MAX_RATIO", 2)
+    monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_UNPACKED_MESSAGE_BYTES", 30_000)
+    monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_CHUNK_BYTES", 30_000)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     zeros = replace(compressed_image_message(5), data=np.zeros(20_000, np.uint8))
     drive = [*drive_messages(), *[("/front/image", zeros)] * 9]

@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from bags import STORE, Bag, cloud_message, compressed_image_message, converted, drive_messages
-from coec.adapters.mcap.bag_writer import write_bag
-from coec.adapters.ros.incoming import decode
-from coec.adapters.ros.messages import COMPRESSED_IMAGE, ODOMETRY, POINT_CLOUD
-from coec.adapters.ros.topics import TopicMessage
 from coec.config import LimitsConfig
 from coec.errors import SourceError, UsageError
-from coec.sources import open_source
-from coec.sources.bag.topics import open_topics
-from coec.sources.spec import parse_spec
+from coec.io.mcap.bag_writer import write_bag
+from coec.io.recordings.bag import open_topics
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import parse_spec
+from coec.io.ros.message_decoding import decode
+from coec.io.ros.messages import COMPRESSED_IMAGE, ODOMETRY, POINT_CLOUD
+from coec.io.ros.topics import TopicMessage
+from support.recordings import STORE, Bag, cloud_message, compressed_image_message, converted, drive_messages
 
 FRAMES = (COMPRESSED_IMAGE, POINT_CLOUD, ODOMETRY)
 

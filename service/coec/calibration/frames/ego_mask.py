@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.picture import square_sums
+from coec.geometry.images import square_sums
 
 Grid = NDArray[np.float64]
 Cells = NDArray[np.bool_]

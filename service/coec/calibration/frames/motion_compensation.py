@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.sweep_times import azimuth_offsets_s
+from coec.calibration.frames.pairing import azimuth_offsets_s
 from coec.calibration.types import Compensation, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, SweepTiming
-from coec.geometry.deskew import deskew
+from coec.geometry.sweep_kernels import deskew
 
 Choice = NDArray[np.int64] | slice
 """Which points of a sweep: indices, or a slice."""

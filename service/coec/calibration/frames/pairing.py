@@ -1,4 +1,5 @@
-"""Decides by sensor stamps alone which camera frame belongs to which sweep, and how the vehicle moved then.
+"""By sensor stamps alone: which camera frame belongs to which sweep, how the vehicle moved then, and when each point
+of a sweep was measured if its driver does not state it.
 
 Nothing here depends on when or in which interleaving messages arrive, as long as each stream arrives in its own order,
 because a pair is formed only when later messages can no longer change it. So a replay at any rate forms the same pairs.
@@ -11,7 +12,10 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from typing import TypeVar
 
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, SweepTiming
 from coec.config import PairingConfig
 
 NS_PER_S = 1_000_000_000
@@ -200,3 +204,11 @@ def _blended_or_unknown(a: Vector | None, b: Vector | None, weight: float) -> Ve
 def _blend(a: Vector, b: Vector, weight: float) -> Vector:
     x, y, z = ((1.0 - weight) * p + weight * q for p, q in zip(a, b, strict=True))
     return x, y, z
+
+
+def azimuth_offsets_s(xyz_m: NDArray[np.float32], sweep: SweepTiming) -> NDArray[np.float64]:
+    """(N,) seconds after the sweep's stamp at which each point was measured, from its azimuth (see `SweepTiming`)."""
+    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0]).astype(np.float64) - sweep.stamp_azimuth_rad
+    revolutions = azimuth / (2.0 * np.pi)
+    revolutions -= np.rint(revolutions)
+    return sweep.sign * sweep.period_s * revolutions

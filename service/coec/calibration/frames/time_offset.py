@@ -21,18 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate, sensor_twist
-from coec.calibration.objective.differences import FrameScores, across, along
+from coec.calibration.objective.derivatives import FrameScores, across, along
 from coec.calibration.objective.edges import EdgeCue, build_edges
 from coec.calibration.ports import ImageReader
-from coec.calibration.search.bounded import Box, maximum_in
-from coec.calibration.steps import of_both
+from coec.calibration.search.local_search import Box, maximum_in
+from coec.calibration.search.prior import of_both
 from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig, TimeOffsetConfig
 from coec.geometry import se3
-from coec.geometry.deskew import deskew
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
 from coec.geometry.edges.charts import pattern_search
-from coec.geometry.linear import solved
+from coec.geometry.linalg import solved
+from coec.geometry.sweep_kernels import deskew
 
 OFFSET = 6
 """Place of the offset, after the six axes of the perturbation."""

@@ -1,28 +1,209 @@
-"""Chooses the pairs of a window while the stream passes: evenly over the slice, each sharp, in view, taken in motion.
+"""Selects the pairs of a window while the stream passes: evenly over the slice, each sharp, in view, taken in motion;
+the thinned pairs between them, which date a move of the camera; the pairs of each check of the monitor; and urgent
+windows, whose slice is shorter. Sensor time alone decides.
+
+They enter no estimate, so they are not selected for quality, and a part of each sweep is enough. The part consists of
+whole scan lines, so that the jumps in range along them are found as in the whole sweep.
+
+Periods are counted from the zero of sensor time, not from the first pair, so that a restarted service and a replay at
+any rate cut the same checks. Unlike the pairs of a window these are not selected for quality, because the monitor has
+to see a dirty lens, a frozen camera, and a mount that is hit while the vehicle stands.
 
 The slice is divided into as many bins as pairs are wanted. The first good pair of a bin is taken, and the rest of the
 bin is not even decoded. Bins and slices are cut by sensor time, so a replay at any rate chooses the same pairs.
 
 If a window was refused because the camera moved within it, its pairs from after the move are as good as any: they are
 kept and count for the next window.
+
+An open slice that began before the mount moved mixes two extrinsics, so it is ended, whatever it holds. A slice that
+began later is ended as soon as it is enough for a window, or replaced by a short dense one if that comes sooner.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import ceil, cos, pi, radians
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.between import BetweenPairs
-from coec.calibration.frames.sampling import stands
 from coec.calibration.ports import ImageInspector, ImageReducer
-from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
-from coec.config import WindowConfig
+from coec.calibration.types import FramePair, ImageQuality, LidarFrame, Matrix4, Rig
+from coec.config import MonitorConfig, WindowConfig
 from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, in_image, project_point
+from coec.geometry.points import BAND_RAD, distinct_rings
+
+NS_PER_S_BETWEEN = 1_000_000_000
+MIB = 2**20
+
+POINTS = 12_000
+"""About how many points of a sweep are kept. Among them are as many range edges as the search for a change uses of each
+frame in a window of 25 (`search.change_point.POINTS`)."""
+
+BEYOND_RAD = radians(6.0)
+"""Points are kept so far beyond the border of the view, because a knock may bring them into view."""
+
+
+@dataclass(slots=True)
+class _ThinnedSlice:
+    """The open slice. From the stamp `next_ns` on a pair lies far enough from those before it; None before the first
+    pair. From the stamp `afforded_ns` on there are bytes for another pair."""
+
+    start_ns: int
+    length_ns: int
+    spacing_ns: int
+    max_bytes: int
+    afforded_ns: int
+    bytes: int = 0
+    next_ns: int | None = None
+
+
+class BetweenPairs:
+    """Picks and thins the pairs between, slice by slice: at a given distance in seconds, within a given size."""
+
+    def __init__(self, images: ImageReducer, half_view_rad: float) -> None:
+        """`half_view_rad` is the largest angle from the optical axis at which the image has a pixel."""
+        self._images = images
+        self._half_view_rad = half_view_rad
+        self._open: _ThinnedSlice | None = None
+
+    def begin(self, config: WindowConfig, start_ns: int, length_ns: int) -> None:
+        """Begins a slice that is cut by `config`. If its chosen pairs will be so near to each other that they show the
+        time as well, it has no pairs between."""
+        spacing_ns = round(config.between_s * NS_PER_S_BETWEEN)
+        enabled = config.between_mib > 0 and length_ns >= 2 * spacing_ns * config.pairs
+        self._open = (
+            _ThinnedSlice(start_ns, length_ns, spacing_ns, config.between_mib * MIB, start_ns) if enabled else None
+        )
+
+    def on_selected(self, stamp_ns: int) -> None:
+        """The window has chosen a pair of this stamp; the next pair between has to keep its distance from it."""
+        if self._open is not None:
+            self._open.next_ns = stamp_ns + self._open.spacing_ns
+
+    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> FramePair | None:
+        """The pair, thinned, if it is to be recorded; `T_camera_lidar` (4, 4) is the current extrinsic."""
+        current = self._open
+        if current is None or current.next_ns is None or pair.stamp_ns < max(current.next_ns, current.afforded_ns):
+            return None
+        current.next_ns = pair.stamp_ns + current.spacing_ns
+        try:
+            camera = self._images.reduced(pair.camera)
+        except DecodeError:
+            return None
+        lidar = thinned_sweep(pair.lidar, T_camera_lidar, self._half_view_rad)
+        spent = current.bytes + len(camera.image.data) + _bytes(lidar)
+        if spent > current.max_bytes:
+            self._open = None
+            return None
+        current.bytes = spent
+        # At any time no more than that time's share of the bytes is spent, so that they last to the end of the slice.
+        current.afforded_ns = current.start_ns + current.length_ns * spent // current.max_bytes
+        return replace(pair, camera=camera, lidar=lidar)
+
+
+def thinned_sweep(lidar: LidarFrame, T_camera_lidar: Matrix4, half_view_rad: float) -> LidarFrame:
+    """The sweep with about `POINTS` points: every n-th row of those in view, or nearly, at `T_camera_lidar` (4, 4).
+    Without intensities."""
+    seen = np.flatnonzero(_near_the_view(lidar.xyz_m, T_camera_lidar, half_view_rad + BEYOND_RAD))
+    every = ceil(len(seen) / POINTS)
+    if every > 1:
+        seen = seen[_rows(lidar, seen) % every == 0]
+    return replace(
+        lidar,
+        xyz_m=np.ascontiguousarray(lidar.xyz_m[seen]),
+        intensity=None,
+        ring=None if lidar.ring is None else lidar.ring[seen],
+        time_offset_s=None if lidar.time_offset_s is None else lidar.time_offset_s[seen],
+    )
+
+
+def _near_the_view(xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4, angle_rad: float) -> NDArray[np.bool_]:
+    """(N,) whether points lie within an angle of the optical axis. It uses no compiled kernel and no BLAS, see
+    `WindowCutter._points_in_view`."""
+    if angle_rad >= pi:
+        return np.ones(len(xyz_m), np.bool_)
+    x_m, y_m, z_m = xyz_m.T
+    T = T_camera_lidar.astype(np.float32)
+    x, y, z = (T[i, 0] * x_m + T[i, 1] * y_m + T[i, 2] * z_m + T[i, 3] for i in range(3))
+    return np.asarray(z >= np.float32(cos(angle_rad)) * np.sqrt(x * x + y * y + z * z))
+
+
+def _rows(lidar: LidarFrame, of: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The row of each point: its ring, or, without rings, its band of elevation."""
+    ring = distinct_rings(lidar.ring)
+    if ring is not None:
+        return ring[of].astype(np.int64)
+    x_m, y_m, z_m = lidar.xyz_m[of].T
+    elevation = np.arctan2(z_m, np.hypot(x_m, y_m))
+    return np.asarray(np.floor(elevation / np.float32(BAND_RAD)).astype(np.int64))
+
+
+def _bytes(lidar: LidarFrame) -> int:
+    return sum(column.nbytes for column in (lidar.xyz_m, lidar.ring, lidar.time_offset_s) if column is not None)
+
+
+NS_PER_S_SAMPLING = 1_000_000_000
+
+SPAN_PERIODS = 6
+"""Periods that the pairs of one check may span. The slowest useful stream, with a pair per period, fills the four pairs
+of a check in four periods; two more allow for losses. Pairs further apart do not belong to one check. From then on its
+checks share pairs, so that one is completed in every period."""
+
+
+MOVING_MPS = 1.0
+"""Above this speed a vehicle passes the things that it sees."""
+
+
+def drives(pairs: Sequence[FramePair]) -> bool:
+    """Whether the vehicle is known to be on the move in most of the pairs."""
+    return 2 * sum(pair.motion is not None and pair.motion.reaches(MOVING_MPS) for pair in pairs) > len(pairs)
+
+
+def stands(pair: FramePair, window: WindowConfig) -> bool:
+    """Whether the vehicle is known to stand, so that it sees nothing new."""
+    return pair.motion is not None and pair.motion.stays_below(window.min_speed_mps)
+
+
+class CheckSampler:
+    """Keeps the pairs of the next check, at most `MonitorConfig.pairs`."""
+
+    def __init__(self, config: MonitorConfig) -> None:
+        self._config = config
+        self._period_ns = round(config.period_s * NS_PER_S_SAMPLING)
+        self._pairs: list[FramePair] = []
+        self._new = 0
+        self._period = self._cell = -1
+        self._last_ns = -1
+
+    def offer(self, pair: FramePair) -> tuple[FramePair, ...] | None:
+        """Takes the next pair. Returns the pairs of a check, newest last, if a period has ended with enough of them."""
+        stamp_ns = pair.stamp_ns
+        if stamp_ns < self._last_ns:  # sensor time stepped back
+            self._pairs.clear()
+            self._new = 0
+        self._last_ns = stamp_ns
+        oldest_ns = stamp_ns - SPAN_PERIODS * self._period_ns
+        self._pairs = [earlier for earlier in self._pairs if earlier.stamp_ns >= oldest_ns]
+        period, cell = stamp_ns // self._period_ns, stamp_ns * self._config.pairs // self._period_ns
+        check = None
+        if period != self._period and self._new > 0 and len(self._pairs) >= self._config.min_pairs:
+            check = tuple(self._pairs)
+            if check[-1].stamp_ns - check[0].stamp_ns < self._period_ns:
+                self._pairs.clear()
+            self._new = 0
+        self._period = period
+        if cell != self._cell:
+            self._cell = cell
+            self._pairs.append(pair)
+            self._new += 1
+            del self._pairs[: -self._config.pairs]
+        return check
+
 
 NS_PER_S = 1_000_000_000
 
@@ -278,3 +459,100 @@ def _directions_in_view(camera: Camera) -> NDArray[np.bool_]:
 def _half_view_rad(in_view: NDArray[np.bool_]) -> float:
     """The angle at the end of the last ring of cells that has a pixel."""
     return float(np.flatnonzero(in_view.any(axis=1)).max(initial=-1) + 1) * (np.pi / CELLS)
+
+
+TRIES = 3
+"""Urgent windows per suspicion: if these do not help, more of them will not either."""
+
+MARGIN = 1.2
+"""Factor by which a slice is longer than its pairs need at the rate at which they come."""
+
+NS_PER_S_URGENT = 1_000_000_000
+
+
+class UrgentWindow:
+    """Hurries the `WindowCutter` of one pair while a window is wanted. Sensor time alone decides."""
+
+    def __init__(self, monitor: MonitorConfig) -> None:
+        self._monitor = monitor
+        self._since_ns: int | None = None
+        self._tries = 0
+        self._hurried = False
+        self._for_rig = False
+        self._longer_s = 0.0
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a window is wanted and has not come."""
+        return self._since_ns is not None
+
+    def alarm(self, since_ns: int) -> None:
+        """The pair suspects a move and wants a window of frames since `since_ns`. It does not wait for its turn, as
+        pairs do that the rig waits for."""
+        if (self._since_ns is None or self._for_rig) and self._tries < TRIES:
+            self._request(since_ns, for_rig=False, longer_s=0.0)
+            self._tries += 1
+
+    def request(self, since_ns: int, longer_s: float) -> None:
+        """The rig waits for a window of frames since `since_ns`, whatever the pair itself suspects. The slice is
+        `longer_s` longer than an urgent one, because the pairs of a sensor are solved one after the other."""
+        if self._since_ns is None:
+            self._request(since_ns, for_rig=True, longer_s=longer_s)
+
+    def calm(self) -> None:
+        """The suspicion is over. A window for which the rig waits is still wanted."""
+        self._tries = 0
+        if not self._for_rig:
+            self._since_ns = None
+
+    def forget(self) -> None:
+        """Nothing is wanted any more: sensor time has stepped back."""
+        self.calm()
+        self._since_ns = None
+
+    def _request(self, since_ns: int, *, for_rig: bool, longer_s: float) -> None:
+        self._since_ns, self._hurried = since_ns, False
+        self._for_rig, self._longer_s = for_rig, longer_s
+
+    def apply(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceClosed]:
+        """Ends the slice of the cutter if necessary; to be called before a pair is offered to the cutter.
+
+        Args:
+            rate_hz: at which pairs come; None while unknown.
+        """
+        if self._since_ns is None:
+            return []
+        start_ns, enough = cutter.slice_start_ns, cutter.selected >= cutter.config.min_pairs
+        if start_ns is None:
+            return self._hurry(cutter, rate_hz)
+        if start_ns < self._since_ns:
+            return self._hurry(cutter, rate_hz)
+        if self._hurried:
+            return []
+        if enough:
+            self._since_ns = None
+            return cutter.finish()
+        lacking = cutter.config.min_pairs - cutter.selected
+        waits_s = lacking * cutter.config.slice_s / cutter.config.pairs
+        return [] if waits_s <= self._length_s(cutter.config, rate_hz) else self._hurry(cutter, rate_hz)
+
+    def on_slice_closed(self, event: SliceClosed, cutter: WindowCutter, rate_hz: float | None) -> None:
+        """A slice ended by itself. If it has enough pairs it is the window that was wanted; else the next one is
+        hurried."""
+        if self._since_ns is None or not self._hurried:
+            return
+        if event.complete:
+            self._since_ns = None
+        else:
+            cutter.hurry(self._length_s(cutter.config, rate_hz))
+
+    def _hurry(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceClosed]:
+        closed = cutter.finish()
+        cutter.hurry(self._length_s(cutter.config, rate_hz))
+        self._hurried = True
+        return closed
+
+    def _length_s(self, window: WindowConfig, rate_hz: float | None) -> float:
+        """Length of an urgent slice: as configured, or longer if pairs come slowly, but no longer than any other."""
+        needed_s = MARGIN * window.pairs / rate_hz if rate_hz else 0.0
+        return min(max(self._monitor.urgent_slice_s, needed_s) + self._longer_s, window.slice_s)

@@ -14,17 +14,7 @@ from math import fsum, isfinite, log, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.commissioning.baseline import BaselineDrift
-from coec.calibration.commissioning.quantiles import chi2_quantile
-from coec.calibration.monitor.hypotheses import (
-    MOST_STEP,
-    Hypotheses,
-    TestedAxes,
-    after_check,
-    learnt_distance2,
-)
-from coec.calibration.monitor.likelihood import AXES, FARTHER, WEAK_TIMES, CheckMeasurement, Three, plus, three
-from coec.calibration.monitor.mount_scatter import LOOSE_AT, MountScatter
+from coec.calibration.baseline import BaselineDrift, chi2_quantile
 from coec.calibration.monitor.sensor_faults import (
     BENT_MOUNT,
     CAUSES,
@@ -33,6 +23,22 @@ from coec.calibration.monitor.sensor_faults import (
     LENS_DIRTY,
     MOUNT_LOOSE,
     Cause,
+)
+from coec.calibration.monitor.sequential_tests import (
+    AXES,
+    FARTHER,
+    LOOSE_AT,
+    MOST_STEP,
+    WEAK_TIMES,
+    CheckMeasurement,
+    Hypotheses,
+    MountScatter,
+    TestedAxes,
+    Three,
+    after_check,
+    learnt_distance2,
+    plus,
+    three,
 )
 from coec.calibration.types import Metric
 from coec.config import MonitorConfig

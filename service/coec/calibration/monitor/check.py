@@ -1,7 +1,16 @@
-"""A short check of a few pairs: where the edges put the extrinsic near a pose, and how good the pose itself is.
+"""A short check of a few pairs: where the edges put the extrinsic near a pose, how strongly they prefer that place,
+how good the pose itself is, and what the depth cue says where the edges contradict it or cannot decide.
+
+There is always some optimum, and it never scores below the expected pose. Whether its gain is more than chance shows in
+the look itself. If the mount moved, most frames and most sectors of the image show it, and much of the significance is
+gone at the pose that the mount left. If spray, a lamp post or a guard rail drew the optimum aside, a few cells gain
+what others lose, and the expected pose fits nearly as well.
 
 A full calibration searches tens of degrees; a check searches only within `REACH_RAD` of the pose that it checks. It
 always searches all six degrees of freedom, because a shifted mount must be seen even if only rotations are estimated.
+
+The edges are far sharper, and a network costs more than all the rest of a check. So depth is not used if the edges are
+clear and confirm the pose.
 """
 
 from __future__ import annotations
@@ -9,32 +18,76 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from math import fsum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.confidence.landscape import Landscape
-from coec.calibration.confidence.noise import measure_noise
-from coec.calibration.estimators import WindowData, depth_features
-from coec.calibration.monitor.laid_edges import ProjectedEdges, placed, project_edges
-from coec.calibration.monitor.neighbourhood import REACH_RAD, ROTATION_DOF, search_local_optima
-from coec.calibration.monitor.sensor_faults import SceneFacts
-from coec.calibration.monitor.sensors import (
+from coec.calibration.baseline import normal_quantile
+from coec.calibration.monitor.check_edges import (
+    NEAR_SHARE,
     OUTLINE_RAD,
+    REACH_RAD,
+    ROTATION_DOF,
     PreparedImages,
     PreparedSweep,
+    ProjectedEdges,
     outline,
+    placed,
     prepare_images,
     prepare_sweep,
+    project_edges,
+    search_local_optima,
 )
-from coec.calibration.monitor.support import Support, support
-from coec.calibration.objective.mutual_information import Features
+from coec.calibration.monitor.sensor_faults import SceneFacts
+from coec.calibration.objective.derivatives import axis_derivatives
+from coec.calibration.objective.mutual_information import Features, SearchBox, build_mutual_information
+from coec.calibration.ports import Silence
+from coec.calibration.search.local_search import polish
+from coec.calibration.solver import WindowData, depth_features
 from coec.calibration.types import FramePair, Matrix4, Rig
+from coec.calibration.uncertainty.covariance import measure_noise
+from coec.calibration.uncertainty.scatter import Landscape, certainty
+from coec.config import CalibrationConfig
 from coec.geometry import se3
 from coec.geometry.cameras import in_image
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
 from coec.geometry.edges.image_edges import Rectangle
 from coec.geometry.projection import project
+
+CERTAIN = normal_quantile(0.95)
+"""Standard deviations from which a gain is more than chance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """How strongly the edges prefer an optimum to the pose at which it was expected.
+
+    Attributes:
+        kept: significance at the expected pose over that at the optimum, on the sharpest edges.
+        certainty: of the gain, in standard deviations of the scatter of frames and sectors; see `Landscape`.
+    """
+
+    retained: float
+    certainty: float
+
+    @property
+    def gained(self) -> bool:
+        """Whether the gain is more than chance."""
+        return self.certainty > CERTAIN
+
+    @property
+    def insists(self) -> bool:
+        """Whether the gain is also large enough for another place to be believed instead of the one next to a pose."""
+        return self.gained and self.retained < NEAR_SHARE
+
+
+def support(there: NDArray[np.float64], expected: NDArray[np.float64]) -> Support:
+    """The support, from the cells (F, B) at the optimum and at the expected pose."""
+    best, left = (fsum(cells.ravel().tolist()) for cells in (there, expected))
+    # An optimum without edges has gained nothing.
+    return Support(left / best if best > 0.0 else 1.0, certainty(there - expected))
+
 
 DEPTH_POINTS = 60_000
 """Points of the sweeps of a check, in view or not, that the depth witness uses: its hill is degrees wide."""
@@ -189,3 +242,51 @@ def _in_view(edges: EdgeFrames, T_camera_lidar: Matrix4) -> int:
     """How many range edges lie in the images."""
     uv_px, valid = project(edges.camera, placed(edges, T_camera_lidar))
     return int(np.count_nonzero(valid & in_image(edges.camera, uv_px)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthCue:
+    """What mutual information says of a pose (Borer et al. 2023). Derivatives are over rx ry rz tx ty tz; equation (2)
+    uses those of the rotations.
+
+    Attributes:
+        mi: equation (1), nats.
+        first_derivative: (6,) ∂MI/∂ξ, nats per radian or metre.
+        second_derivative: (6,) -∂²MI/∂ξ², nats per radian² or metre²; positive at a maximum.
+        agreement_rad: angle between the local optimum of depth and that of the edges.
+    """
+
+    mi: float
+    first_derivative: NDArray[np.float64]
+    second_derivative: NDArray[np.float64]
+    agreement_rad: float
+
+    @property
+    def f1(self) -> float:
+        """Largest slope of the rotations, nats per radian."""
+        return float(np.max(np.abs(self.first_derivative[:ROTATION_DOF])))
+
+    @property
+    def f2(self) -> float:
+        """Least peakedness of the rotations, nats per radian²."""
+        return float(np.min(self.second_derivative[:ROTATION_DOF]))
+
+
+def depth_cue(evidence: CheckInput, seen: Check, pose: Matrix4, config: CalibrationConfig) -> DepthCue:
+    """What depth says of `pose` (4, 4), at which the edges say `seen`.
+
+    Raises:
+        CalibrationError: a frame has no usable depth, or no point can come into view.
+    """
+    depth = build_mutual_information(
+        evidence.features(), evidence.rig, pose, SearchBox(REACH_RAD, 0.0), config.objective
+    )
+    first_derivative, second_derivative = axis_derivatives(depth, pose)
+    rotation = config.search.model_copy(update={"dof": ROTATION_DOF})
+    there = polish(depth, seen.T_rotation, rotation, Silence()).T_camera_lidar
+    return DepthCue(
+        mi=depth.evaluate(pose).mi,
+        first_derivative=first_derivative,
+        second_derivative=second_derivative,
+        agreement_rad=se3.rotation_angle_rad(seen.T_rotation @ se3.inverse(there)),
+    )

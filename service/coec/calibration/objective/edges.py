@@ -20,7 +20,7 @@ from coec.geometry.edges.alignment import Alignment, EdgeFrames, alignments, fra
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
-from coec.geometry.thinning import thinned
+from coec.geometry.points import thinned
 
 BANDS = 3
 """Bands of about 0.8, 0.4 and 0.2 degrees: the coarsest feels a pose 0.9 degrees away, the finest is sharp enough to

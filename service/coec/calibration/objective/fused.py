@@ -13,9 +13,17 @@ from math import hypot, radians, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.cells import COLUMNS, ROWS, Cells, PointsInView, sectors
 from coec.calibration.objective.edges import EdgeCue, in_reach
-from coec.calibration.objective.mutual_information import Evaluation, MutualInformation, SearchBox
+from coec.calibration.objective.mutual_information import (
+    COLUMNS,
+    ROWS,
+    Cells,
+    Evaluation,
+    MutualInformation,
+    PointsInView,
+    SearchBox,
+    sectors,
+)
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import in_image

@@ -24,13 +24,12 @@ from math import degrees
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.commissioning.quantiles import chi2_quantile
-from coec.calibration.rig.evidence import EdgeObservation
-from coec.calibration.rig.moves import SEEN, Moved, MovePosterior, who_moved
-from coec.calibration.rig.steps import EdgeHistory, steps_at
-from coec.calibration.rig.types import Edge, RigGraph, Sensor, SensorKind
+from coec.calibration.baseline import chi2_quantile
+from coec.calibration.rig.edge_observations import EdgeHistory, EdgeObservation, steps_at
+from coec.calibration.rig.graph import Edge, RigGraph, Sensor, SensorKind
+from coec.calibration.rig.moved_sensors import SEEN, Moved, MovePosterior, who_moved
 from coec.calibration.types import Matrix4, Reason
-from coec.geometry import dense
+from coec.geometry import linalg
 
 NAMED_AT = 0.95
 """A sensor that is at least so probable to have moved may be named; one below the complement is called calibrated.
@@ -285,7 +284,7 @@ def _stepped(history: EdgeHistory, since_ns: int, place_times: float = 1.0) -> b
     """Whether an edge lies elsewhere since a stamp than before, by more than chance, if streets scatter its looks by
     `place_times` their usual standard deviation."""
     step = steps_at(history, [since_ns], place_times)
-    distance2 = float(dense.squared(dense.inverse(step.covariance[0]), step.xi[0]))
+    distance2 = float(linalg.squared(linalg.inverse(step.covariance[0]), step.xi[0]))
     return bool(step.observations[0] >= SEEN and distance2 > STEPPED2)
 
 

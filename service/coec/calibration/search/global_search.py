@@ -16,12 +16,18 @@ from numpy.typing import NDArray
 
 from coec.calibration.objective.edges import EdgeCue, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
-from coec.calibration.steps import of_both
+from coec.calibration.search.prior import of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from coec.geometry.cover import moved_by, unit_ball
-from coec.geometry.edges.charts import EdgeCharts, charted_significances, pattern_search, select_separated
-from coec.geometry.thinning import thinned
+from coec.geometry.edges.charts import (
+    EdgeCharts,
+    charted_significances,
+    moved_by,
+    pattern_search,
+    select_separated,
+    unit_ball,
+)
+from coec.geometry.points import thinned
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""

@@ -1,27 +1,97 @@
-"""Maximises an objective over a box of perturbations: bounded, derivative-free.
+"""Maximises an objective over a box of perturbations with BOBYQA (Powell 2009, NLopt): bounded, derivative-free,
+deterministic. Along translations that a window cannot determine, the camera's centre stays where it was before the
+search.
 
 There are two stages on one objective. The first finds the basin with a trust region of degrees; the second starts again
 there with a fresh quadratic model of the basin's size. Deterministic: the same objective gives the same evaluations and
 the same optimum.
+
+Rotations move every point of an image alike, translations only near ones. If nothing near has an edge, the optimum
+slides along a translation and takes a rotation with it. It is better to leave the camera where it was, and to say so.
+
+What stays is the camera's *centre*, c = -Rᵀ·t in LiDAR coordinates for T_camera_lidar = [R | t], not an entry of t. The
+column t is the place of the LiDAR as seen from the camera. It changes with every rotation that is found: by 35 cm for a
+start that was turned by 20° and a camera 1 m from the LiDAR, although nobody moved the camera.
+
+In the terms of METHOD, section 4: the perturbation T(ξ) = exp(ξ)·T on the left turns the camera about its own centre,
+and its translation shifts that centre along the axes of the turned camera, by -R·(c - c₀). An axis is kept if this
+component, counted from the start, is zero. With three degrees of freedom all three are kept: a search of rotations
+alone leaves the centre of the start where it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from math import degrees, radians
 from typing import Protocol
 
+import nlopt
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.objective.derivatives import Curvature
 from coec.calibration.objective.mutual_information import Objective, SearchBox
 from coec.calibration.ports import Progress
-from coec.calibration.search.bounded import Box, maximum_in
-from coec.calibration.steps import POLISH_METRES_PER_RADIAN, of_both
+from coec.calibration.search.prior import POLISH_METRES_PER_RADIAN, of_both
 from coec.calibration.types import Matrix4, StopReason
-from coec.config import SearchConfig
+from coec.config import SearchConfig, VerdictConfig
 from coec.geometry import se3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Box:
+    """Where to search, in the units of each of n axes.
+
+    Attributes:
+        lower, upper: (n,) bounds.
+        step: (n,) first trust region.
+        tolerance: (n,) last trust region.
+    """
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    step: NDArray[np.float64]
+    tolerance: NDArray[np.float64]
+
+
+Scores = Callable[[NDArray[np.float64]], Sequence[float]]
+"""The scores of K points (K, n), each by itself."""
+
+
+def maximum_in(
+    box: Box, scores: Scores, start: NDArray[np.float64], max_evaluations: int
+) -> tuple[NDArray[np.float64], bool]:
+    """The best coordinates (n,) in the box that a search from `start` (n,) finds, and whether its evaluations ran out
+    before it ended.
+
+    The first points do not depend on their scores, so they are scored together; the others are scored one by one.
+    """
+    # The first quadratic model needs two steps of room between the bounds.
+    step = np.minimum(box.step, (box.upper - box.lower) / 2.0)
+    first = _first_points(start, step)[:max_evaluations]
+    known = dict(zip((point.tobytes() for point in first), scores(first), strict=True))
+
+    def score(point: NDArray[np.float64], _gradient: NDArray[np.float64]) -> float:
+        cached = known.pop(point.tobytes(), None)
+        return scores(point[None])[0] if cached is None else cached
+
+    optimiser = nlopt.opt(nlopt.LN_BOBYQA, len(start))
+    optimiser.set_lower_bounds(box.lower)
+    optimiser.set_upper_bounds(box.upper)
+    optimiser.set_initial_step(step)
+    optimiser.set_xtol_abs(box.tolerance)
+    optimiser.set_maxeval(max_evaluations)
+    optimiser.set_max_objective(score)
+    best = np.asarray(optimiser.optimize(start))
+    return best, optimiser.last_optimize_result() == nlopt.MAXEVAL_REACHED
+
+
+def _first_points(start: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2·n + 1, n) the points of BOBYQA's first model: the start, and a step either way along each axis. Where the box
+    has no room for both steps, BOBYQA begins at other points."""
+    return np.concatenate([start[None], start + np.diag(step), start - np.diag(step)])
+
 
 REFINE_BOX_RAD, REFINE_STEP_RAD = radians(1.5), radians(0.6)
 """Box and first step of the second stage. The box holds the widest ripple of pixels and scan lines around the end of
@@ -166,3 +236,55 @@ def _pose(start: Matrix4, coordinates: NDArray[np.float64]) -> Matrix4:
     perturbation = np.zeros(6)
     perturbation[: len(coordinates)] = coordinates
     return se3.perturb(start, perturbation)
+
+
+TRANSLATIONS = range(3, 6)
+"""Places of the translations in ξ = [rx ry rz tx ty tz]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FixedCentre:
+    """Keeps the camera's centre where it was along some axes of the camera.
+
+    Attributes:
+        axes: the kept axes, out of `TRANSLATIONS`.
+        prior: (4, 4) T_camera_lidar whose centre is kept.
+    """
+
+    axes: tuple[int, ...]
+    prior: Matrix4
+
+    def __call__(self, T_camera_lidar: Matrix4) -> Matrix4:
+        """The pose (4, 4) with its centre put back along the kept axes of that camera; its rotation stays."""
+        shifted = se3.difference(T_camera_lidar, self.prior)
+        pose = T_camera_lidar.copy()
+        for axis in self.axes:
+            pose[axis - TRANSLATIONS.start, 3] -= shifted[axis]
+        return pose
+
+
+def unobservable(curvature: Curvature, sigma: NDArray[np.float64], dof: int, limits: VerdictConfig) -> tuple[int, ...]:
+    """The searched translation axes that have no maximum, or one whose standard deviation in `sigma` (6,) exceeds
+    `max_sigma_m`.
+
+    If there is no covariance at all (too few frames, or no maximum on a rotation) nothing can be said: empty.
+    """
+    if dof <= TRANSLATIONS.start or not np.isfinite(curvature.second_derivative[: TRANSLATIONS.start]).all():
+        return ()
+    flat = [axis for axis in TRANSLATIONS if not curvature.second_derivative[axis] > 0.0]
+    wide = [axis for axis in TRANSLATIONS if sigma[axis] > limits.max_sigma_m]
+    return tuple(sorted({*flat, *wide}))
+
+
+def without(
+    blind: tuple[int, ...],
+    search: SearchResult,
+    objective: Objective,
+    prior: Matrix4,
+    config: SearchConfig,
+    progress: Progress,
+) -> SearchResult:
+    """The search finished again with the camera's centre put back to that of `prior` (4, 4) along the axes `blind`."""
+    constraint = FixedCentre(blind, prior)
+    again = polish(objective, constraint(search.T_camera_lidar), config, progress, search.evaluations, constraint)
+    return replace(again, stop_reason=search.stop_reason)

@@ -4,7 +4,6 @@ A camera is an immutable named tuple, so that compiled code takes it as it is an
 Points of the camera frame: x right, y down, z forward, metres. Pixel centres lie at integer coordinates (OpenCV).
 """
 
-from coec.geometry.cameras.dispatch import image_point, project_point, unproject_point
 from coec.geometry.cameras.double_sphere import DoubleSphere
 from coec.geometry.cameras.eucm import Eucm
 from coec.geometry.cameras.kannala_brandt import KannalaBrandt
@@ -12,8 +11,23 @@ from coec.geometry.cameras.mei import Mei
 from coec.geometry.cameras.pinhole import Pinhole
 from coec.geometry.cameras.radtan import RadTan
 from coec.geometry.cameras.rational import Rational
-from coec.geometry.cameras.registry import MODELS, Camera, Model, build, cropped, intrinsics_of, name_of, scaled
-from coec.geometry.cameras.view import domain_angle_rad, in_image, in_single_precision, pixel_rad
+from coec.geometry.cameras.registry import (
+    MODELS,
+    Camera,
+    Model,
+    build,
+    cropped,
+    domain_angle_rad,
+    image_point,
+    in_image,
+    in_single_precision,
+    intrinsics_of,
+    name_of,
+    pixel_rad,
+    project_point,
+    scaled,
+    unproject_point,
+)
 
 __all__ = [
     "MODELS",

@@ -18,8 +18,7 @@ exact limit is taken.
 import math
 from typing import NamedTuple
 
-from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import common_intrinsics, within
+from coec.geometry.cameras.base import common_intrinsics, guarded_ray, like, within
 
 # At xi = -1 the second sphere's centre lies on the first sphere and the optical axis itself has no image.
 MIN_XI, MAX_XI = -0.999, 1.0

@@ -10,8 +10,7 @@ Camera Model", 3DV 2018, section on the EUCM, where the inverse is given as well
 import math
 from typing import NamedTuple
 
-from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import common_intrinsics, positive, within
+from coec.geometry.cameras.base import common_intrinsics, guarded_ray, like, positive, within
 
 
 class Eucm(NamedTuple):

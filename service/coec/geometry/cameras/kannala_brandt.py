@@ -13,11 +13,14 @@ d stops growing, and below pi. OpenCV has no such bound.
 import math
 from typing import NamedTuple
 
-from coec.geometry.cameras.formulas import guarded_ray, like, polar_angle
-from coec.geometry.cameras.intrinsics import common_intrinsics, finite
-from coec.geometry.cameras.polynomial import (
+from coec.geometry.cameras.base import (
+    common_intrinsics,
+    finite,
+    guarded_ray,
+    like,
     monotonic_limit_squared,
     odd_polynomial,
+    polar_angle,
     solve_odd_polynomial,
 )
 

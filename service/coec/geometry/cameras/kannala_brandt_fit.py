@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import kannala_brandt
-from coec.geometry.cameras.dispatch import project_point, unproject_point
-from coec.geometry.cameras.formulas import polar_angle
+from coec.geometry.cameras.base import polar_angle
 from coec.geometry.cameras.kannala_brandt import KannalaBrandt
-from coec.geometry.cameras.registry import Camera
+from coec.geometry.cameras.registry import Camera, project_point, unproject_point
 
 # theta, theta^3 ... theta^9: as many as the model has coefficients, with the focal length. Two more for the centre.
 _POWERS = (1, 3, 5, 7, 9)

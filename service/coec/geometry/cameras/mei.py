@@ -12,10 +12,16 @@ below the one at which the radial polynomial stops growing.
 import math
 from typing import NamedTuple
 
-from coec.geometry.cameras.brown_conrady import distort, undistort
-from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import common_intrinsics, finite, within
-from coec.geometry.cameras.polynomial import monotonic_limit_squared
+from coec.geometry.cameras.base import (
+    common_intrinsics,
+    distort,
+    finite,
+    guarded_ray,
+    like,
+    monotonic_limit_squared,
+    undistort,
+    within,
+)
 
 # Calibrations of real lenses have xi of 0 to 4; far above, the image no longer depends on it.
 _MAX_XI = 1e3

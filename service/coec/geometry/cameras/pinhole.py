@@ -2,8 +2,7 @@
 
 from typing import NamedTuple
 
-from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import common_intrinsics
+from coec.geometry.cameras.base import common_intrinsics, guarded_ray, like
 
 
 class Pinhole(NamedTuple):

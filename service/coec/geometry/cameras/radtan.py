@@ -6,10 +6,15 @@ radius at which the radial polynomial stops growing; OpenCV itself has no such b
 
 from typing import NamedTuple
 
-from coec.geometry.cameras.brown_conrady import distort, undistort
-from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import common_intrinsics, finite
-from coec.geometry.cameras.polynomial import monotonic_limit_squared
+from coec.geometry.cameras.base import (
+    common_intrinsics,
+    distort,
+    finite,
+    guarded_ray,
+    like,
+    monotonic_limit_squared,
+    undistort,
+)
 
 
 class RadTan(NamedTuple):

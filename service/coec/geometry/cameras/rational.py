@@ -17,9 +17,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from coec.geometry.cameras.formulas import guarded_ray, like
-from coec.geometry.cameras.intrinsics import common_intrinsics, finite
-from coec.geometry.cameras.polynomial import first_positive_root
+from coec.geometry.cameras.base import common_intrinsics, finite, first_positive_root, guarded_ray, like
 
 # Most doublings that find the bracket, and most halvings of it, as in `polynomial`.
 _MAX_BISECTIONS = 100

@@ -1,19 +1,30 @@
-"""The models by name and by type, and functions for cameras of any model."""
+"""The camera models by name and by type, functions for cameras of any model, projection of one point and the other way
+round, and what a camera sees: which pixels exist, how far from the optical axis points still have a pixel, and the
+angle that a pixel covers.
+"""
+
+from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from types import MappingProxyType
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from coec.geometry.cameras import double_sphere, eucm, kannala_brandt, mei, pinhole, radtan, rational
+from coec.geometry.cameras.base import guarded_pixel, positive
 from coec.geometry.cameras.double_sphere import DoubleSphere
 from coec.geometry.cameras.eucm import Eucm
-from coec.geometry.cameras.intrinsics import positive
 from coec.geometry.cameras.kannala_brandt import KannalaBrandt
 from coec.geometry.cameras.mei import Mei
 from coec.geometry.cameras.pinhole import Pinhole
 from coec.geometry.cameras.radtan import RadTan
 from coec.geometry.cameras.rational import Rational
+from coec.geometry.points import rows_of
 
 Camera = Pinhole | RadTan | Rational | KannalaBrandt | Mei | Eucm | DoubleSphere
 
@@ -114,3 +125,68 @@ def scaled(camera: Camera, scale_x: float, scale_y: float) -> Camera:
             "cy": (camera.cy + 0.5) * scale_y - 0.5,
         },
     )
+
+
+def project_point(camera: Camera, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """(u, v, valid): pixel of a point (m) of the camera frame. An invalid point gets a finite pixel and False.
+
+    NaN and infinity are invalid. A valid point need not lie in the image.
+    """
+    u, v, in_domain = image_point(camera, x, y, z)
+    return guarded_pixel(camera, x, y, z, u, v, in_domain)
+
+
+def image_point(camera: Camera, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """(u, v, in_domain): the model's formula alone. Outside its domain, and for what is no point (NaN, infinity, the
+    origin), u and v are anything.
+
+    Compiled for the precision of the point, which must be that of the camera's fields: see `formulas.like`.
+    """
+    return model_of(type(camera)).image_point(camera, x, y, z)
+
+
+def unproject_point(camera: Camera, u: float, v: float) -> tuple[float, float, float, bool]:
+    """(x, y, z, valid): unit ray of a pixel in the camera frame. An invalid pixel gets the optical axis and False."""
+    return model_of(type(camera)).unproject_point(camera, u, v)
+
+
+_STEP = 1e-3
+"""Step in radians that is small enough for every camera model to be linear."""
+
+
+def in_image(camera: Camera, uv_px: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """(N,): true where the nearest pixel exists: -0.5 <= u < width - 0.5, and v likewise. uv_px: (N, 2)."""
+    u, v = rows_of("uv_px", uv_px, 2).T
+    inside: NDArray[np.bool_] = (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
+    return inside
+
+
+@lru_cache(maxsize=64, typed=True)
+def in_single_precision(camera: Camera) -> Camera:
+    """The same camera with intrinsics as float32: in single precision a vector register holds twice as many points."""
+    return type(camera)(*(field if isinstance(field, int) else np.float32(field) for field in camera))  # type: ignore[arg-type]
+
+
+def domain_angle_rad(camera: Camera) -> float:
+    """The angle from the optical axis, in (0, π], up to which a point has a pixel. In every model the domain is a cone
+    about the axis."""
+    low, high = 0.0, math.pi
+    for angle in np.linspace(0.0, math.pi, 257)[1:].tolist():
+        if not project_point(camera, math.sin(angle), 0.0, math.cos(angle))[2]:
+            high = angle
+            break
+        low = angle
+    while low < (middle := 0.5 * (low + high)) < high:  # bisection down to the last bit
+        if project_point(camera, math.sin(middle), 0.0, math.cos(middle))[2]:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def pixel_rad(camera: Camera) -> float:
+    """The angle that a pixel on the optical axis covers, radians; the larger one if rows and columns differ. It is
+    measured by projection, because the focal length of a fisheye is not in pixels per radian."""
+    u, v, _ = project_point(camera, 0.0, 0.0, 1.0)
+    neighbours = project_point(camera, _STEP, 0.0, 1.0), project_point(camera, 0.0, _STEP, 1.0)
+    return _STEP / min(math.hypot(right - u, down - v) for right, down, _ in neighbours)

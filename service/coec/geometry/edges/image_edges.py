@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.compiler import PRANGE, njit, prange
-from coec.geometry.thinning import thinned
+from coec.geometry.points import thinned
 
 CLIP_SHARE = 0.95
 """Gradients are clipped at this quantile, as reflections and lamps would outweigh the rest."""

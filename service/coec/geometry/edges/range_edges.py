@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.bearings import Bearings, bearings
 from coec.geometry.compiler import PRANGE, njit, prange
-from coec.geometry.edges.scan_lines import BAND_RAD, distinct_rings
+from coec.geometry.points import BAND_RAD, distinct_rings
+from coec.geometry.sweep_kernels import Bearings, bearings
 
 BANDS = math.ceil(0.5 * math.pi / BAND_RAD)
 """Bands of elevation in a quarter of a turn, from the horizon up or down."""

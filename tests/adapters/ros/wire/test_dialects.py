@@ -5,11 +5,8 @@ from __future__ import annotations
 
 import pytest
 
-from coec.adapters.ros import messages
-from coec.adapters.ros.wire.dialect import Dialect
-from coec.adapters.ros.wire.qos import SENSOR_DATA, STATIC, Qos
-from coec.adapters.ros.wire.rmw_zenoh import Node, RmwZenoh, gid_of
-from coec.adapters.ros.wire.ros2dds import Ros2dds, qos_text
+from coec.io.ros import messages
+from coec.io.ros.wire_format import SENSOR_DATA, STATIC, Dialect, Node, Qos, RmwZenoh, Ros2dds, gid_of, qos_text
 
 SESSION = "b0a1c2d3e4f5061728394a5b6c7d8e9f"
 RMW = RmwZenoh(Node(0, SESSION, 0, "/vehicle", "coec"), messages.type_hash)

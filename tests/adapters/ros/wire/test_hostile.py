@@ -8,10 +8,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from coec.adapters.ros.wire import rmw_zenoh, ros2dds
-from coec.adapters.ros.wire.publisher import Publisher
-from coec.adapters.ros.wire.rmw_zenoh import MessageAttachment, TopicKey
 from coec.errors import UsageError
+from coec.io.ros import wire_format
+from coec.io.ros.wire_format import MessageAttachment, Publisher, TopicKey
 
 SESSION = "aa0ba1fb1b3a2e2c9d8f5e6c3b4a5d6e"
 TOKEN = (
@@ -21,8 +20,8 @@ BRIDGED = f"@/{SESSION}/@ros2_lv/MP/front§image/sensor_msgs§msg§Image/:0:0:0,
 KEY = "0/front/image/sensor_msgs::msg::dds_::Image_/RIHS01_00"
 
 READERS: dict[str, tuple[str, Callable[[str], Publisher | None]]] = {
-    "rmw_zenoh": (TOKEN, rmw_zenoh.rmw_publisher),
-    "ros2dds": (BRIDGED, lambda token: ros2dds.bridge_publisher(token, "")),
+    "rmw_zenoh": (TOKEN, wire_format.rmw_publisher),
+    "ros2dds": (BRIDGED, lambda token: wire_format.bridge_publisher(token, "")),
 }
 
 hostile = st.text(max_size=60) | st.sampled_from(["", "%", "§", "/", "::", "@", "*", "**", "\0", "\x1b[2J", "a" * 5000])
@@ -46,7 +45,7 @@ def test_a_token_is_a_publishers_with_names_that_ros_takes_or_none(middleware: s
     if found is not None:
         names = found.topic + found.type_name + (found.node or "")
         assert all(char.isascii() and (char.isalnum() or char in "_/") for char in names)
-        assert len(found.topic) < rmw_zenoh.MAX_RMW_TOKEN
+        assert len(found.topic) < wire_format.MAX_RMW_TOKEN
 
 
 @given(mutated(KEY))

@@ -1,1 +1,0 @@
-"""One folder per outside thing. Only here are wire models and foreign formats translated to and from values."""

@@ -1,1 +1,0 @@
-"""Depth maps: from networks with model cards, or received with the frames."""

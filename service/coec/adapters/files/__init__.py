@@ -1,1 +1,0 @@
-"""Files that are kept, and values as JSON documents."""

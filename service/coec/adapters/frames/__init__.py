@@ -1,1 +1,0 @@
-"""Frames as msgpack, and what every frame is asked before it is believed."""

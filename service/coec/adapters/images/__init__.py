@@ -1,1 +1,0 @@
-"""Images: decoding, quality, and refusal of bad ones."""

@@ -1,1 +1,0 @@
-"""MCAP files: windows, bags, and what both have in common."""

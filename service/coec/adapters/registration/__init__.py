@@ -1,1 +1,0 @@
-"""Libraries that search in point clouds."""

@@ -1,1 +1,0 @@
-"""The operating system: logs, threads, memory, service manager."""

@@ -1,1 +1,0 @@
-"""A rig's own baseline and limits, and how they are learned."""

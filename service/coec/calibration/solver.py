@@ -1,0 +1,415 @@
+"""The estimators of the extrinsic of a window, by the name of their objective, and the data of a window that they
+read. One line in `ESTIMATORS` adds another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import nan, radians
+from types import MappingProxyType
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
+from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
+from coec.calibration.objective.edges import EdgeCue, build_edges
+from coec.calibration.objective.fused import Fusion
+from coec.calibration.objective.mutual_information import (
+    Divisible,
+    Features,
+    MutualInformation,
+    SearchBox,
+    build_mutual_information,
+    distance_and_depth,
+    distances,
+)
+from coec.calibration.ports import DepthModel, ImageReader, Progress
+from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins
+from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
+from coec.calibration.search.prior import log_prior
+from coec.calibration.types import CameraFrame, DepthMap, Matrix4, Metric, StopReason, Window
+from coec.calibration.uncertainty.modes import Rivals
+from coec.calibration.uncertainty.scatter import independent_samples_at
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError, DecodeError
+from coec.geometry import se3
+from coec.geometry.edges.image_edges import halved
+from coec.geometry.points import thinned
+
+MAX_CACHED_BYTES = 64_000_000
+"""Most bytes of decoded images that are kept: twenty-five of 2.5 megapixels. Their edge maps take as much, and each
+image is dropped when its maps are made. Images beyond this are decoded again."""
+
+
+class CachedImages:
+    """An image reader that keeps images from their first use to their second."""
+
+    def __init__(self, images: ImageReader) -> None:
+        self._images = images
+        self._cache: dict[int, NDArray[np.uint8]] = {}
+        self._bytes = 0
+
+    def first(self, frame: CameraFrame) -> NDArray[np.uint8]:
+        """(height, width) grey values of a frame; `grey` will be called for it later.
+
+        Raises:
+            DecodeError: the image cannot be decoded within the limits.
+        """
+        grey = self._images.grey(frame)
+        if id(frame) not in self._cache and self._bytes + grey.nbytes <= MAX_CACHED_BYTES:
+            self._cache[id(frame)] = grey
+            self._bytes += grey.nbytes
+        return grey
+
+    def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
+        """(height, width) grey values; the reader then drops the image.
+
+        Raises:
+            DecodeError: the image cannot be decoded within the limits.
+        """
+        cached = self._cache.pop(id(frame), None)
+        if cached is None:
+            return self._images.grey(frame)
+        self._bytes -= cached.nbytes
+        return cached
+
+
+Seen = TypeVar("Seen")
+
+POLISHED_BASINS = 5
+"""How many basins are polished on the fused objective beside that of the start. The true basin never ranked below the
+second place."""
+
+POLISHED_ALIKE = 3
+"""At most this many polishes, that of the start included, may end in one basin: further ones come to the same end. On
+eight windows of nine, half of them simulated, the score of the settled pose differs by 0.1 % at most; with two, another
+basin won on the ninth."""
+
+PLAUSIBLE = 0.5
+"""A basin, or the neighbourhood of the start, is polished if it has at least this share of the best rank. A polish adds
+a tenth to a rank, a quarter at most; a rank half as high as the best would have to double."""
+
+NEIGHBOURHOOD_RAD = radians(5.0)
+"""Radius of the neighbourhood of the start."""
+
+SETTLED_POSES = 2
+"""How many poses of the best basin are settled. One is not enough: with six degrees of freedom, blurred edges can lead
+it astray (to 0.5° and 8 cm in one window of 24 of a simulated fisheye of 700 px)."""
+
+LEADING_DEPTH_POINTS = 150_000
+"""Points of the window's clouds, in view or not, that the depth witness of a fusion uses until its basin is known. Few
+are enough because its hill is degrees wide."""
+
+SEEN_DEPTH_POINTS = 100_000
+"""Points in view that the depth witness uses at the end, unless at least half as many are in view already. The counts
+of a histogram scatter by their square root; that scatter in a thousand cells puts ripples on the hill, and where little
+is near the edges alone do not hold its top. Measured on eight windows of four simulated drives with six degrees of
+freedom and starts 20° and 0.3 m away: root mean square 0.08° and 1.0 cm on the worst axes instead of 0.10° and 1.6
+cm."""
+
+TELLING = 2.0
+"""More points are spent on the depth witness only if it stands out by at least this many standard deviations. Below
+that its peak may be chance, and more points would not change that."""
+
+SETTLING = SearchBox(radians(8.0), 0.5)
+"""How far from a settled pose these points are used at most: for its summits, and to measure how wide its hill is."""
+
+DISPLACED = SearchBox(SETTLING.rotation_rad + radians(2.0), SETTLING.translation_m + 3.0)
+"""The same for points before motion compensation: in half a sweep, 40 m/s and 40°/s displace them by the difference."""
+
+SAME_BASIN_RAD = radians(1.5)
+"""Poses nearer than this are one basin, not rivals."""
+
+BETWEEN = (0.5, 0.75, 0.25)
+"""Shares of the way from the pose to another summit at which a valley between them is looked for."""
+
+MAX_GREY_WIDTH_PX = 800
+"""Images are halved to at most this width before grey values are compared: pixels are then about as far apart as the
+points of a sweep."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowData:
+    """A window as an estimator sees it.
+
+    Sweeps are motion-compensated, depth is inferred and images are decoded only when an estimator asks for them,
+    because most windows need only a part of each.
+    """
+
+    window: Window
+    compensated: bool
+    depth: DepthModel
+    images: ImageReader
+    progress: Progress
+
+    def points(self, index: int, selection: Choice = EVERY) -> NDArray[np.float32]:
+        """P_i: (N, 3) the chosen points of the sweep of pair `index`, at the instant of the exposure."""
+        return compensate(self.window.pairs[index], self.window.rig, enabled=self.compensated, selection=selection)
+
+    def depths(self) -> list[DepthMap]:
+        """D_i of every pair.
+
+        Raises:
+            CalibrationError: a frame has no usable depth.
+        """
+        return list(self._each("depth", lambda index: self.depth.infer(self.window.pairs[index].camera)))
+
+    def greys(self) -> Iterator[NDArray[np.uint8]]:
+        """The images of every pair, (height, width) grey values, each decoded when it is asked for.
+
+        Raises:
+            CalibrationError: an image cannot be decoded.
+        """
+        return self._each("images", lambda index: self.images.grey(self.window.pairs[index].camera))
+
+    def _each(self, stage: str, load: Callable[[int], Seen]) -> Iterator[Seen]:
+        for index, pair in enumerate(self.window.pairs):
+            try:
+                seen = load(index)
+            except DecodeError as error:
+                raise CalibrationError(f"no {stage} for the camera frame at {pair.stamp_ns} ns: {error}") from error
+            self.progress.step(stage, index + 1, len(self.window.pairs))
+            yield seen
+
+
+def prepare_window_data(
+    window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, progress: Progress
+) -> WindowData:
+    """The window as `config` wants it seen. If the rig has no mask, one is found from the window's own frames."""
+    data = WindowData(window, config.motion_compensation, depth, images, progress)
+    return data if window.rig.mask is not None or len(window.pairs) < MIN_FRAMES else _masked(data)
+
+
+def _masked(data: WindowData) -> WindowData:
+    images = CachedImages(data.images)
+    data = replace(data, images=images)
+    first_images = data._each("images", lambda index: images.first(data.window.pairs[index].camera))
+    moving = (
+        grey
+        for grey, pair in zip(first_images, data.window.pairs, strict=True)
+        if pair.motion is None or not pair.motion.stays_below(MIN_SPEED_MPS)
+    )
+    rig = data.window.rig
+    try:
+        mask = lit_pixels(moving)
+    except CalibrationError:
+        return data  # an estimator that needs the images will say so
+    if mask is None or mask.shape != (rig.camera.height, rig.camera.width):
+        return data
+    return replace(data, window=replace(data.window, rig=replace(rig, mask=mask)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimatorResult:
+    """What an estimator found.
+
+    Attributes:
+        objective: what it maximised.
+        search: the end of the search on it.
+        metrics: those that only this objective has.
+        rivals: other summits to which the search came within the same basin.
+        edges: the edges of the window; None if it used none.
+    """
+
+    objective: Divisible
+    search: SearchResult
+    metrics: tuple[Metric, ...]
+    rivals: tuple[Rivals, ...] = ()
+    edges: EdgeCue | None = None
+
+
+Estimator = Callable[[WindowData, CalibrationConfig], EstimatorResult]
+
+
+def by_depth(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
+    """The paper's estimator: BOBYQA on the mutual information of depth and range."""
+    return _by_mutual_information(depth_features(data, data.window.T_camera_lidar_start), data, config)
+
+
+def by_intensity(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
+    """Pandey, McBride, Savarese, Eustice 2012: BOBYQA on the mutual information of reflectance and grey value.
+
+    Raises:
+        CalibrationError: the sweeps carry no intensity.
+    """
+    frames = []
+    for index, (pair, grey) in enumerate(zip(data.window.pairs, data.greys(), strict=True)):
+        if pair.lidar.intensity is None:
+            raise CalibrationError(f"the sweep at {pair.lidar.stamp_ns} ns carries no intensity: use another objective")
+        pixels = grey.astype(np.float32)
+        while pixels.shape[1] > MAX_GREY_WIDTH_PX:
+            pixels = halved(pixels)
+        frames.append(Features(data.points(index), pair.lidar.intensity, pixels))
+    return _by_mutual_information(frames, data, config)
+
+
+def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
+    """Edges and depth: finds every basin of the edge witness within reach, ranks them by both witnesses, and polishes
+    the best on both."""
+    window, progress = data.window, data.progress
+    start = window.T_camera_lidar_start
+    reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
+    # Edges first: depth may be inferred meanwhile.
+    edges = build_edges(window.pairs, data.points, data.greys(), window.rig)
+    features = depth_features(data, start, LEADING_DEPTH_POINTS)
+    depth = build_mutual_information(features, window.rig, start, reach, config.objective)
+    basins = find_basins(edges, start, reach)
+    progress.step("basins", 1, 1)
+    fusion = Fusion(edges, depth, start, reach)
+    ranked = sorted(_with_ranks(fusion, [basin.T_camera_lidar for basin in basins]), key=lambda item: -item[0])
+    to_rank = near(config.search, fusion.ranking[-1])
+    of_start = basin_next_to(edges, start, SearchBox(NEIGHBOURHOOD_RAD, reach.translation_m))
+    least = PLAUSIBLE * max((rank for rank, _ in ranked), default=0.0)
+    plausible = [basin for rank, basin in ranked[:POLISHED_BASINS] if rank >= least]
+    ends, others = [], [basin for _, basin in ranked[len(plausible) :]]
+    if fusion.rank(of_start) >= least:
+        # The neighbourhood of the start is polished wherever the charts rank it.
+        ends.append(polish_in_turn(fusion.ranking, start, to_rank, progress))
+    else:
+        others.append(of_start)
+    for basin in plausible:
+        there = sum(not _differ(end.T_camera_lidar, basin) for end in ends)
+        if there < POLISHED_ALIKE:
+            # The coarser bands led the first polish of a basin. They would lead the others to the same end.
+            bands = fusion.ranking[-1:] if there else fusion.ranking
+            ends.append(polish_in_turn(bands, basin, to_rank, progress))
+    polished = _with_ranks(fusion, [end.T_camera_lidar for end in ends])
+
+    _, highest = max(polished, key=lambda end: end[0])
+    independent = independent_samples_at(edges.sharp, highest).count / len(window.pairs)
+
+    def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:
+        rank, pose = end
+        # Half the square of a rank is, in nats, what the window says against chance, if its frames are independent:
+        # ten frames of one view fit a wrong pose ten times. A maximum outside of the reach is a rival, but the answer
+        # has to lie inside.
+        log_posterior = 0.5 * independent * rank**2 + log_prior(pose, start, window.start_known_to_rad)
+        return not at_rim(pose, start, reach), log_posterior
+
+    _, pose = max(polished, key=preferred)
+    contrast = fusion.edge_contrast(pose)
+    others += [end for _, end in polished]
+    rival = _best_rival(fusion, [other for other in others if _differ(other, pose)], pose)
+    limits = config.verdict
+    metrics = (
+        Metric("range_edges", len(edges.sharp.weight), least_range_edges(config), at_least=True),
+        Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
+        Metric("runner_up", runner_up(contrast, rival), limits.max_runner_up, at_least=False),
+    )
+    alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
+    finest = fusion.settling[-1]
+    if fusion.depth_contrast(alike[0][1]) >= TELLING:
+        finest = finest.with_depth(_denser(data, depth, alike[0][1], config))
+    last = (fusion.settling[0], finest)
+    settled = [polish_in_turn(last, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
+    best = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
+    final = replace(best, evaluations=sum(end.evaluations for end in (*ends, *settled)))
+    if at_rim(final.T_camera_lidar, start, reach):
+        final = replace(final, stop_reason=StopReason.AT_BOUND)
+    others = [end.T_camera_lidar for end in settled if end is not best]
+    if not _differ(start, best.T_camera_lidar):
+        # A window that cannot tell the start from the pose found says nothing.
+        others.append(start)
+    summits = (
+        Rivals(finest, best.T_camera_lidar, tuple(others)),
+        Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
+    )
+    return EstimatorResult(finest, final, metrics, summits, edges)
+
+
+def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[tuple[float, Matrix4]]:
+    return list(zip(fusion.ranks(poses), poses, strict=True))
+
+
+def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> list[float]:
+    """The largest edge contrast among those of `others` (4, 4) that are summits beside `pose` (4, 4), in a list; an
+    empty list if none is a summit.
+
+    A climb may also end on the shoulder of the hill whose top is `pose`, because turns and shifts make up for each
+    other. From a shoulder the way to the top never leads down, so it is no rival.
+    """
+    contrasts = fusion.edge_contrasts(np.array(others).reshape(-1, 4, 4))
+    for contrast, other in sorted(zip(contrasts, others, strict=True), key=lambda item: -item[0]):
+        difference = se3.difference(other, pose)
+        if any(fusion.edge_contrast(se3.perturb(pose, share * difference)) < contrast for share in BETWEEN):
+            return [contrast]
+    return []
+
+
+def least_range_edges(config: CalibrationConfig) -> float:
+    """How many range jumps a window must have: in proportion to the degrees of freedom.
+
+    The more poses there are to try, the better one of them fits by chance: the largest of N normal deviates grows as
+    √(2·ln N), a significance as the root of the jumps. With the translations within 20 cm, N is ten thousand times as
+    large as for the rotations within 10° alone.
+    """
+    return config.verdict.min_range_edges * config.search.dof / 3.0
+
+
+def runner_up(contrast: float, rivals: Sequence[float]) -> float:
+    """The largest edge contrast of the rivals over that of the pose; 0 if no rival stands out at all.
+
+    NaN if the pose itself does not stand out, so that the metric passes no limit.
+    """
+    return max((0.0, *rivals)) / contrast if contrast > 0.0 else nan
+
+
+ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
+
+
+def depth_features(data: WindowData, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:
+    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4). Every sweep gives the
+    same share of its points, so that about `at_most` are used in all.
+
+    Raises:
+        CalibrationError: a frame has no usable depth.
+    """
+    counts = [len(pair.lidar.xyz_m) for pair in data.window.pairs]
+    share = 1.0 if at_most is None else min(1.0, at_most / max(sum(counts), 1))
+    return [
+        distance_and_depth(data.points(index, _share_of(counts[index], share)), depth, T_camera_lidar)
+        for index, depth in enumerate(data.depths())
+    ]
+
+
+def _share_of(count: int, share: float) -> Choice:
+    return EVERY if share >= 1.0 else thinned(count, _number(count, share))
+
+
+def _number(count: int, share: float) -> int:
+    return count if share >= 1.0 else round(share * count)
+
+
+def _denser(data: WindowData, depth: MutualInformation, pose: Matrix4, config: CalibrationConfig) -> MutualInformation:
+    """The depth witness with about `SEEN_DEPTH_POINTS` in view at `pose` (4, 4); unchanged if at least half as many are
+    in view there already. At least one point must be in view there."""
+    seen = depth.evaluate(pose).points_in_view
+    if 2 * seen >= SEEN_DEPTH_POINTS:
+        return depth
+    counts = [len(pair.lidar.xyz_m) for pair in data.window.pairs]
+    leading = [_number(count, LEADING_DEPTH_POINTS / sum(counts)) for count in counts]
+    share, points, times = SEEN_DEPTH_POINTS / seen * sum(leading) / sum(counts), [], []
+    for index, (count, led) in enumerate(zip(counts, leading, strict=True)):
+        indices = thinned(count, _number(count, share))
+        times.append(len(indices) / max(led, 1))
+        indices = indices[depth.may_see(data.window.pairs[index].lidar.xyz_m[indices], pose, DISPLACED)]
+        points.append(distances(data.points(index, indices), pose))
+    return depth.with_points(points, np.array(times), pose, SETTLING, config.objective)
+
+
+def _by_mutual_information(frames: list[Features], data: WindowData, config: CalibrationConfig) -> EstimatorResult:
+    start, progress = data.window.T_camera_lidar_start, data.progress
+    objective: MutualInformation = build_mutual_information(
+        frames, data.window.rig, start, box_of(config.search), config.objective
+    )
+    search = maximise(objective, start, config.search, progress)
+    mi, unrelated = objective.evaluate(search.T_camera_lidar).mi, objective.mi_of_unrelated(search.T_camera_lidar)
+    ratio = Metric("mi_over_unrelated", mi / max(unrelated, 1e-12), config.verdict.min_mi_over_unrelated, at_least=True)
+    return EstimatorResult(objective, search, (ratio,))
+
+
+def _differ(a: Matrix4, b: Matrix4) -> bool:
+    return se3.rotation_angle_rad(a @ se3.inverse(b)) > SAME_BASIN_RAD

@@ -1,1 +1,0 @@
-"""Experiments on the estimator: starts, statistics, split halves, detection, profiles, and the paper's own."""

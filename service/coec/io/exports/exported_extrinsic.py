@@ -1,0 +1,430 @@
+"""What every export writes: a transform between two named frames, its uncertainty and its origin, made from a window's
+result or from a reply to `extrinsic`; conversions of rotations that formats need; and an editor that changes one
+entry of a YAML file and leaves every other byte as it is.
+
+Each format writes the direction and the order that its readers expect, and states both in the file.
+
+A YAML library would rewrite the whole document, including the comments, quotes and number formats that people chose.
+Here the library only finds the place of an entry, and the lines of that entry are replaced.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
+from ruamel.yaml.error import YAMLError
+
+import coec
+from coec.config import CameraIntrinsics
+from coec.errors import OutputError
+from coec.geometry import cameras, se3
+from coec.io.rig_files import intrinsics_config
+from coec.io.serialise import estimate_of, matrix_of, number_or_null
+from coec.schemas.replies import CalibrationResult, ExtrinsicReply, Intrinsics
+
+Matrix = NDArray[np.float64]
+
+AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class ExtrinsicOrigin:
+    """Where an extrinsic comes from.
+
+    Attributes:
+        version: of coec.
+        provenance: `nominal`, `commissioned`, `estimated` or `restored`.
+        window_id, data_stamp_ns, config_hash: of the window that it rests on; None if there is none.
+        objections: why it is not accepted, one sentence each; empty if it is accepted.
+    """
+
+    vehicle: str
+    pair: str
+    version: str
+    provenance: str
+    window_id: str | None
+    data_stamp_ns: int | None
+    config_hash: str | None
+    rejection_reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExportedExtrinsic:
+    """A camera's pose, ready to be written.
+
+    Attributes:
+        T_camera_lidar: (4, 4) maps LiDAR (x forward, y left, z up) to optical camera coordinates (x right, y down, z
+            forward), metres.
+        covariance: (6, 6) of its error about and along the camera axes, radians and metres: the true transform is
+            exp(error)·T_camera_lidar. NaN for entries that are not known.
+        parent, child: names of the frames; the child is the camera.
+        T_parent_lidar: (4, 4) pose of the LiDAR in the parent; identity if the parent is the LiDAR.
+        camera: intrinsics; None if they are not known.
+        origin: see `Origin`.
+    """
+
+    T_camera_lidar: Matrix
+    covariance: Matrix
+    parent: str
+    child: str
+    T_parent_lidar: Matrix
+    camera: CameraIntrinsics | None
+    origin: ExtrinsicOrigin
+
+    @property
+    def T_child_parent(self) -> Matrix:
+        """(4, 4) maps coordinates in the parent to optical camera coordinates."""
+        return self.T_camera_lidar @ se3.inverse(self.T_parent_lidar)
+
+    @property
+    def T_parent_child(self) -> Matrix:
+        """(4, 4) pose of the optical camera frame in the parent: what tf, URDF and most formats hold."""
+        return self.T_parent_lidar @ se3.inverse(self.T_camera_lidar)
+
+    @property
+    def T_parent_body(self) -> Matrix:
+        """(4, 4) pose in the parent of the camera's body frame (x forward, y left, z up; REP 103)."""
+        return self.T_parent_child @ T_OPTICAL_BODY
+
+    def remarks(self, direction: str) -> list[str]:
+        """Comment lines for a file: the direction of its numbers in words, their uncertainty and their origin."""
+        origin = self.origin
+        lines = [
+            f"{origin.pair} of {origin.vehicle}: {origin.provenance}, by coec {origin.version}",
+            direction,
+            self._sigma_line(),
+            f"covariance of the error (rad, m; about the camera axes, row by row): {_numbers(self.covariance.ravel())}",
+        ]
+        if origin.window_id is not None:
+            lines.append(
+                f"window {origin.window_id}, data until {utc(origin.data_stamp_ns)}, configuration {origin.config_hash}"
+            )
+        if origin.rejection_reasons:
+            lines.append(f"NOT ACCEPTED, exported by force: {' '.join(origin.rejection_reasons)}")
+        return [_one_line(line) for line in lines]
+
+    def document(self, direction: str) -> dict[str, object]:
+        """The same facts as JSON values, for formats without comments."""
+        origin = self.origin
+        return {
+            "direction": direction,
+            "accepted": not origin.rejection_reasons,
+            "objections": list(origin.rejection_reasons),
+            "covariance_rad_m": [[number_or_null(value) for value in row] for row in self.covariance.tolist()],
+            "vehicle": origin.vehicle,
+            "pair": origin.pair,
+            "provenance": origin.provenance,
+            "window_id": origin.window_id,
+            "data_stamp_ns": origin.data_stamp_ns,
+            "config_hash": origin.config_hash,
+            "version": origin.version,
+        }
+
+    def _sigma_line(self) -> str:
+        sigma = np.sqrt(self.covariance.diagonal())
+        axis_texts = [
+            f"{name} {np.degrees(value):.4f} deg" if axis < 3 else f"{name} {value:.4f} m"
+            for axis, (name, value) in enumerate(zip(AXES, sigma.tolist(), strict=True))
+            if math.isfinite(value)
+        ]
+        return f"sigma about the camera axes: {', '.join(axis_texts)}" if axis_texts else "sigma: not known"
+
+
+T_OPTICAL_BODY: Matrix = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""Maps body coordinates (x forward, y left, z up) to optical ones (x right, y down, z forward): REP 103."""
+
+
+def quaternion_wxyz(T: Matrix) -> list[float]:
+    """Unit quaternion of a transform (4, 4), w first, w ≥ 0."""
+    x, y, z, w = se3.quaternion_xyzw_from_rotation(T[:3, :3]).tolist()
+    return [w, x, y, z]
+
+
+def quaternion_xyzw(T: Matrix) -> list[float]:
+    """Unit quaternion of a transform (4, 4), w last, w ≥ 0."""
+    return [float(value) for value in se3.quaternion_xyzw_from_rotation(T[:3, :3])]
+
+
+def roll_pitch_yaw(T: Matrix) -> list[float]:
+    """[roll, pitch, yaw] in radians, R = Rz(yaw)·Ry(pitch)·Rx(roll), as in URDF and ROS.
+
+    Yaw is taken first, then pitch and roll from the rest of the rotation. This is exact even for a pitch of a right
+    angle, where yaw and roll turn about the same axis and only their sum is determined.
+    """
+    R = T[:3, :3]
+    yaw = math.atan2(R[1, 0], R[0, 0])
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    forward = cosine * R[0] + sine * R[1]
+    left = cosine * R[1] - sine * R[0]
+    return [math.atan2(-left[2], left[1]), math.atan2(-R[2, 0], forward[0]), yaw]
+
+
+def translation_m(T: Matrix) -> list[float]:
+    """Last column of a transform (4, 4), metres."""
+    return [float(value) for value in T[:3, 3]]
+
+
+def utc(stamp_ns: int | None) -> str:
+    """A stamp for people."""
+    if stamp_ns is None:
+        return "an unknown time"
+    return datetime.fromtimestamp(stamp_ns // NS_PER_S, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def _one_line(text: str) -> str:
+    """The text in one line and in ASCII, so that a comment with it cannot end early and every reader accepts it."""
+    return " ".join(text.split()).encode("ascii", "replace").decode()
+
+
+def _numbers(values: Matrix) -> str:
+    return " ".join("?" if math.isnan(value) else f"{value:.6g}" for value in values.tolist())
+
+
+FRAME = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]{0,127}")
+"""Frame names that are safe in XML, YAML, JSON and a shell."""
+
+NOMINAL = "It is the nominal calibration: nothing has been accepted yet."
+
+PITCH_HEIGHT, YAW_SIDE = (0, 4), (1, 3)
+"""Axes of the two correlations in a reply."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExportFrames:
+    """The frames between which a transform is written; None: the pair's own frames.
+
+    Attributes:
+        T_parent_lidar: (4, 4) pose of the LiDAR in the parent; None: the parent is the LiDAR.
+    """
+
+    parent: str | None = None
+    child: str | None = None
+    T_parent_lidar: NDArray[np.float64] | None = None
+
+
+def extrinsic_of_result(
+    result: CalibrationResult, camera: CameraIntrinsics | None, frames: ExportFrames
+) -> ExportedExtrinsic:
+    """A window's result, with its whole covariance; the reasons of a negative verdict become the objections. `camera`
+    None: the intrinsics that the result holds."""
+    reasons = tuple(reason.text for reason in result.verdict.reasons)
+    origin = ExtrinsicOrigin(
+        vehicle=result.vehicle,
+        pair=result.pair,
+        version=coec.__version__,
+        provenance="estimated",
+        window_id=result.window_id,
+        data_stamp_ns=result.data_stamp_ns,
+        config_hash=result.config_hash,
+        rejection_reasons=() if result.verdict.decision == "accepted" else reasons or ("Its verdict is negative.",),
+    )
+    return between_frames(
+        matrix_of(result.camera_from_lidar),
+        estimate_of(result).uncertainty.covariance,
+        (result.lidar_frame, result.camera_frame),
+        frames,
+        intrinsics_config_of(result.intrinsics) if camera is None else camera,
+        origin,
+    )
+
+
+def extrinsic_of_reply(
+    reply: ExtrinsicReply, camera: CameraIntrinsics | None, frames: ExportFrames
+) -> ExportedExtrinsic:
+    """The extrinsic that a service serves, with the part of its covariance that a reply holds: σ of each axis and two
+    correlations. The only possible objection is that it is still the nominal calibration. `camera` None: the intrinsics
+    that the reply holds."""
+    served = reply.provenance != "nominal"
+    origin = ExtrinsicOrigin(
+        vehicle=reply.vehicle,
+        pair=reply.pair,
+        version=coec.__version__,
+        provenance=reply.provenance,
+        window_id=reply.window_id,
+        data_stamp_ns=reply.data_stamp_ns,
+        config_hash=reply.config_hash,
+        rejection_reasons=() if served else (NOMINAL,),
+    )
+    return between_frames(
+        matrix_of(reply.camera_from_lidar),
+        _reply_covariance(reply),
+        (reply.lidar_frame, reply.camera_frame),
+        frames,
+        intrinsics_config_of(reply.intrinsics) if camera is None else camera,
+        origin,
+    )
+
+
+def intrinsics_config_of(intrinsics: Intrinsics | None) -> CameraIntrinsics | None:
+    """The intrinsics of a result or a reply; None if it holds none, or no camera that this version has."""
+    if intrinsics is None:
+        return None
+    parameters = {**intrinsics.parameters, "width": intrinsics.width, "height": intrinsics.height}
+    try:
+        return intrinsics_config(cameras.build(intrinsics.model, **parameters))
+    except ValueError:
+        return None
+
+
+def between_frames(
+    T_camera_lidar: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    own: tuple[str, str],
+    frames: ExportFrames,
+    camera: CameraIntrinsics | None,
+    origin: ExtrinsicOrigin,
+) -> ExportedExtrinsic:
+    """An extrinsic between the requested frames, by default its own (LiDAR, camera).
+
+    Raises:
+        OutputError: a frame has a name that some format cannot hold.
+    """
+    for name in (frames.parent or own[0], frames.child or own[1]):
+        if not FRAME.fullmatch(name):
+            raise OutputError(f"{name[:64]!a} names no frame: letters, digits and _ . / - are known to all formats")
+    return ExportedExtrinsic(
+        T_camera_lidar=T_camera_lidar,
+        covariance=covariance,
+        parent=frames.parent or own[0],
+        child=frames.child or own[1],
+        T_parent_lidar=np.eye(4) if frames.T_parent_lidar is None else frames.T_parent_lidar,
+        camera=camera,
+        origin=origin,
+    )
+
+
+def _reply_covariance(reply: ExtrinsicReply) -> NDArray[np.float64]:
+    axes = [getattr(reply.axes, name) for name in AXES]
+    sigma = np.array(
+        [math.nan if axis.sigma is None else axis.sigma * (math.pi / 180 if axis.unit == "deg" else 1) for axis in axes]
+    )
+    covariance = np.full((6, 6), np.nan)
+    covariance[np.diag_indices(6)] = sigma**2
+    correlations = {PITCH_HEIGHT: reply.correlation_pitch_height, YAW_SIDE: reply.correlation_yaw_side}
+    for (one, other), correlation in correlations.items():
+        if correlation is not None:
+            covariance[one, other] = covariance[other, one] = correlation * sigma[one] * sigma[other]
+    return covariance
+
+
+def parse_pose(text: str) -> NDArray[np.float64]:
+    """(4, 4) from ``x,y,z,qx,qy,qz,qw``: metres, and a quaternion of any length.
+
+    Raises:
+        ValueError: not seven finite numbers, or a quaternion of length zero.
+    """
+    values = [float(item) for item in text.split(",")]
+    if len(values) != 7 or not all(math.isfinite(value) for value in values):
+        raise ValueError("seven finite numbers are expected: x,y,z,qx,qy,qz,qw")
+    return se3.transform_from(se3.rotation_from_quaternion_xyzw(np.array(values[3:])), np.array(values[:3]))
+
+
+INDENT = "  "
+
+
+def set_yaml_entry(text: str, path: Sequence[str], lines: Sequence[str]) -> str:
+    """The text with one entry set: replaced if it exists, else added at the end of the map that should hold it.
+
+    Args:
+        text: a YAML document whose root is a map in block style.
+        path: keys from the root to the entry.
+        lines: lines of the value below the key, without indentation.
+
+    Raises:
+        OutputError: not such a document, or the entry cannot be changed without touching others.
+    """
+    before = _parsed_yaml(text)
+    parent, depth = _deepest(before, path)
+    rows = text.splitlines()
+    if depth == len(path):
+        line, column = parent.lc.key(path[-1])
+        if rows[line][:column].strip():
+            raise OutputError(f"`{path[-1]}` stands among others on line {line + 1}: it cannot be changed alone")
+        end = _end_of(rows, line, column)
+        fresh = [" " * column + f"{path[-1]}:", *(" " * column + INDENT + row for row in lines)]
+        rows[line:end] = fresh
+    else:
+        column, end = _room_in(parent, rows, path[:depth])
+        fresh = []
+        for level, key in enumerate(path[depth:]):
+            fresh.append(" " * column + INDENT * level + f"{key}:")
+        fresh += [" " * column + INDENT * len(path[depth:]) + row for row in lines]
+        rows[end:end] = fresh
+    after = "\n".join(rows) + "\n"
+    if _without(_parsed_yaml(after), path) != _without(before, path):
+        raise OutputError(f"`{path[-1]}` cannot be set without changing something else of the file")
+    return after
+
+
+def _parsed_yaml(text: str) -> CommentedMap:
+    try:
+        document = YAML().load(text)
+    except (YAMLError, ValueError, RecursionError) as error:
+        raise OutputError(f"the file is no YAML that can be changed: {str(error).splitlines()[0]}") from error
+    if not isinstance(document, CommentedMap):
+        raise OutputError("the file holds no map of names")
+    return document
+
+
+def _deepest(document: CommentedMap, path: Sequence[str]) -> tuple[CommentedMap, int]:
+    """The map that holds the longest existing part of the path, and how many keys that part has."""
+    deepest = document
+    for depth, key in enumerate(path):
+        if key not in deepest:
+            return deepest, depth
+        if depth + 1 == len(path):
+            break
+        inner = deepest[key]
+        if not isinstance(inner, CommentedMap):
+            raise OutputError(f"`{key}` is no map of names")
+        deepest = inner
+    return deepest, len(path)
+
+
+def _end_of(rows: Sequence[str], line: int, column: int) -> int:
+    """The line behind the entry that begins at a line and column."""
+    end = line + 1
+    for number in range(line + 1, len(rows)):
+        row = rows[number]
+        inside = len(row) - len(row.lstrip())
+        if row.strip() and inside <= column and not (inside == column and row.lstrip().startswith("- ")):
+            break
+        if row.strip():
+            end = number + 1
+    return end
+
+
+def _room_in(parent: CommentedMap, rows: Sequence[str], path: Sequence[str]) -> tuple[int, int]:
+    """Column of the keys of a map in block style, and the line behind its last entry."""
+    if not len(parent):
+        raise OutputError(f"`{'.'.join(path)}` is an empty map: write into another file")
+    last = list(parent)[-1]
+    line, column = parent.lc.key(last)
+    if rows[line][:column].strip():
+        raise OutputError(f"the entries beside `{last}` stand on one line: another cannot be put among them")
+    return column, _end_of(rows, line, column)
+
+
+def _without(document: Any, path: Sequence[str]) -> Any:
+    """Plain values of a document without the entry, and without maps that hold only the entry."""
+    if not isinstance(document, CommentedMap) or not path:
+        return document
+    rest = {key: value for key, value in document.items() if key != path[0]}
+    if len(path) > 1 and path[0] in document:
+        inner = _without(document[path[0]], path[1:])
+        if inner:
+            rest[path[0]] = inner
+    return rest

@@ -1,0 +1,435 @@
+"""One interface to the messages of a ROS 2 bag: MCAP files, SQLite files, and the folders of rosbag2 that hold them.
+Sizes are bounded before they are used; `rosbags` reads bags that it trusts.
+
+Files are not trusted: their schema is not, nothing in them may be longer than a message, and the tables must be real
+tables.
+
+Files that are packed as a whole (`compression_mode: FILE`) are unpacked into the system's temporary folder, and removed
+when the recording is no longer used.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import quote
+
+import zstandard
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coec.config import describe, load_yaml
+from coec.errors import ConfigError, SourceError
+from coec.io.mcap.reader import (
+    MAX_CHUNK_BYTES,
+    MAX_RATIO,
+    MAX_ZSTD_WINDOW,
+    Channel,
+    McapDamagedError,
+    McapMessage,
+    MessageReader,
+    Schema,
+    read_records,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """A message, and the place at which it can be read again.
+
+    Attributes:
+        type_name: ROS type, for example `sensor_msgs/msg/Image`.
+        data: the message in CDR.
+        logged_ns: when the recorder got the message, by its own clock.
+        place: where the message lies; only the storage that gave it can use it.
+    """
+
+    topic: str
+    type_name: str
+    data: bytes
+    logged_ns: int
+    place: tuple[int, ...]
+
+
+class BagReader(Protocol):
+    """Reads messages again while the files are open."""
+
+    def read(self, place: tuple[int, ...]) -> bytes:
+        """The data of the message at a place.
+
+        Raises:
+            SourceError: the file is no longer what it was.
+        """
+        ...
+
+
+class BagStorage(Protocol):
+    """The messages of a bag.
+
+    Attributes:
+        path: path of the bag, as a person gives it.
+    """
+
+    @property
+    def path(self) -> Path:
+        """See above."""
+        ...
+
+    def entries(self) -> Iterator[BagMessage]:
+        """All CDR messages, in the order in which they lie in the bag.
+
+        Raises:
+            SourceError: a file is absent, cut off or damaged; names it.
+        """
+        ...
+
+    def open(self) -> AbstractContextManager[BagReader]:
+        """A context manager that gives a reader; the files are closed at its end."""
+        ...
+
+
+def open_storage(path: Path) -> BagStorage:
+    """The storage of an `.mcap` or `.db3` file, or of a folder with rosbag2's `metadata.yaml`.
+
+    Raises:
+        SourceError: the path is none of them; the message lists what would be.
+    """
+    if path.is_dir():
+        return open_folder(path)
+    match path.suffix:
+        case ".mcap":
+            return McapStorage(path)
+        case ".db3":
+            return SqliteStorage(path)
+        case _:
+            raise SourceError(f"{path} is no bag: .mcap, .db3, or a folder with metadata.yaml")
+
+
+_NO_CHUNK = -1
+
+
+@dataclass(frozen=True, slots=True)
+class McapStorage:
+    """The `Storage` of an MCAP file. A place is: file offset of the chunk (-1 outside chunks), offset in the chunk,
+    length."""
+
+    path: Path
+
+    def entries(self) -> Iterator[BagMessage]:
+        """See `Storage`."""
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        try:
+            with self.path.open("rb") as stream:
+                limit = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
+                for record in read_records(stream, max_unpacked_bytes=limit):
+                    match record:
+                        case Schema():
+                            schemas[record.schema_id] = record
+                        case Channel():
+                            channels[record.channel_id] = record
+                        case McapMessage():
+                            channel = channels.get(record.channel_id)
+                            schema = None if channel is None else schemas.get(channel.schema_id)
+                            if channel is not None and schema is not None and channel.message_encoding == "cdr":
+                                yield _entry(channel.topic, schema.name, record)
+        except OSError as error:
+            raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
+        except McapDamagedError as error:
+            raise SourceError(error.of(self.path)) from error
+
+    @contextmanager
+    def open(self) -> Iterator[BagReader]:
+        """See `Storage`."""
+        with self.path.open("rb") as stream:
+            yield _McapReader(self.path, MessageReader(stream))
+
+
+@dataclass(frozen=True, slots=True)
+class _McapReader:
+    path: Path
+    reader: MessageReader
+
+    def read(self, place: tuple[int, ...]) -> bytes:
+        """See `Reader`."""
+        chunk_at, at, length = place
+        try:
+            return self.reader.read(None if chunk_at == _NO_CHUNK else chunk_at, at, length)
+        except McapDamagedError as error:
+            raise SourceError(f"{self.path}: {error}") from error
+
+
+def _entry(topic: str, type_name: str, message: McapMessage) -> BagMessage:
+    chunk_at = _NO_CHUNK if message.chunk_at is None else message.chunk_at
+    place = (chunk_at, message.at, len(message.data))
+    return BagMessage(topic, type_name, message.data, message.log_time_ns, place)
+
+
+MAX_MESSAGE_BYTES = 256 * 2**20
+"""Largest message, bytes; the same as for MCAP's chunks."""
+
+MAX_TOPICS = 10_000
+"""Most topics of a bag; a large vehicle has some 2,000."""
+
+MAX_NAME = 1024
+"""Most characters of the name of a topic or a type."""
+
+MIN_ROW_BYTES = 4
+"""Least bytes that a message takes in the file beside its data. Size of the cell, row, header and time take more."""
+
+_TABLES = {"topics", "messages"}
+
+
+@dataclass(frozen=True, slots=True)
+class SqliteStorage:
+    """The `Storage` of a SQLite file. A place is the row of a message."""
+
+    path: Path
+
+    def entries(self) -> Iterator[BagMessage]:
+        """See `Storage`."""
+        with self._connected() as connection:
+            topics = self._topics(connection)
+            left = self.path.stat().st_size
+            # In the order of the file, without join or ORDER BY, so that nothing is sorted, whatever the schema says.
+            for row, topic_id, logged_ns, data in connection.execute(
+                "SELECT rowid, topic_id, timestamp, data FROM messages"
+            ):
+                if not (isinstance(row, int) and isinstance(logged_ns, int)) or topic_id not in topics:
+                    raise SourceError(f"{self.path} is damaged: a message has no number, no time or no topic")
+                message = self._bytes(row, data)
+                # A file whose pages are used twice, or whose columns are computed, would give more bytes than it has.
+                left -= len(message) + MIN_ROW_BYTES
+                if left < 0:
+                    raise SourceError(f"{self.path} is damaged: its messages are longer than the file")
+                topic, type_name, serialization = topics[topic_id]
+                if serialization == "cdr":
+                    yield BagMessage(topic, type_name, message, logged_ns, (row,))
+
+    @contextmanager
+    def open(self) -> Iterator[BagReader]:
+        """See `Storage`."""
+        with self._connected() as connection:
+            yield _SqliteReader(self, connection)
+
+    def _topics(self, connection: sqlite3.Connection) -> dict[int, tuple[str, str, str]]:
+        """Name, type and serialization of each topic, by id."""
+        topics = {}
+        rows = connection.execute("SELECT id, name, type, serialization_format FROM topics LIMIT ?", (MAX_TOPICS + 1,))
+        for number, *texts in rows:
+            if not isinstance(number, int) or not all(isinstance(t, str) and len(t) <= MAX_NAME for t in texts):
+                raise SourceError(f"{self.path} is damaged: a topic has no name, type or serialization")
+            topics[number] = (texts[0], texts[1], texts[2])
+        if len(topics) > MAX_TOPICS:
+            raise SourceError(f"{self.path} has more than {MAX_TOPICS} topics")
+        return topics
+
+    def read_from(self, connection: sqlite3.Connection, row: int) -> bytes:
+        """The data of the message in a row."""
+        row_data = connection.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
+        if row_data is None:
+            raise SourceError(f"{self.path}: there is no message {row} any more: the file has changed")
+        return self._bytes(row, row_data[0])
+
+    def _bytes(self, row: int, data: object) -> bytes:
+        if not isinstance(data, bytes):
+            raise SourceError(f"{self.path} is damaged: message {row} holds no bytes")
+        return data
+
+    @contextmanager
+    def _connected(self) -> Iterator[sqlite3.Connection]:
+        """Connects to the file. If nobody is writing it, it is opened as immutable, so that SQLite needs no second file
+        beside it."""
+        if not self.path.is_file():
+            raise SourceError(f"{self.path} does not exist")
+        write_ahead_log = self.path.with_name(f"{self.path.name}-wal")
+        mode = "mode=ro" if write_ahead_log.exists() and write_ahead_log.stat().st_size else "mode=ro&immutable=1"
+        try:
+            with closing(sqlite3.connect(f"file:{quote(str(self.path))}?{mode}", uri=True)) as connection:
+                connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
+                connection.execute("PRAGMA trusted_schema = OFF")
+                connection.execute("PRAGMA cell_size_check = ON")
+                named = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")
+                if not {name for (name,) in named} >= _TABLES:
+                    raise SourceError(f"{self.path} is no bag: it has no tables {' and '.join(sorted(_TABLES))}")
+                yield connection
+        except sqlite3.Error as error:
+            raise SourceError(f"{self.path} is damaged: {error}. `ros2 bag reindex` may save it") from error
+
+
+@dataclass(frozen=True, slots=True)
+class _SqliteReader:
+    storage: SqliteStorage
+    connection: sqlite3.Connection
+
+    def read(self, place: tuple[int, ...]) -> bytes:
+        """See `Reader`."""
+        return self.storage.read_from(self.connection, place[0])
+
+
+METADATA = "metadata.yaml"
+
+MAX_FILES = 10_000
+"""Most files of one bag: a day in files of ten seconds."""
+
+MAX_UNPACKED_MESSAGE_BYTES = 256 * 2**20
+"""Largest unpacked size of one packed message, bytes; the same as for MCAP's chunks."""
+
+MIN_FREE_BYTES = 2**30
+"""Bytes that stay free on the disk of temporary files. A packed file that would leave less is refused."""
+
+_COPY_BYTES = 2**20
+
+
+class BagInformation(BaseModel):
+    """The used fields of `rosbag2_bagfile_information`, versions 1 to 9; others are ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    storage_identifier: str = Field(max_length=64)
+    relative_file_paths: tuple[str, ...] = Field(min_length=1, max_length=MAX_FILES)
+    compression_format: str = ""
+    compression_mode: str = ""
+
+
+@dataclass(frozen=True, slots=True, weakref_slot=True)
+class FolderStorage:
+    """The `Storage` of a folder. A place is: number of the file, place in that file.
+
+    Attributes:
+        packed_messages: whether each message is a zstd frame (`compression_mode: MESSAGE`).
+    """
+
+    path: Path
+    files: tuple[BagStorage, ...]
+    packed_messages: bool
+
+    def entries(self) -> Iterator[BagMessage]:
+        """See `Storage`."""
+        for number, file in enumerate(self.files):
+            left = MAX_UNPACKED_MESSAGE_BYTES
+            for entry in file.entries():
+                data = self.plain(entry.data)
+                left += MAX_RATIO * len(entry.data) - len(data)
+                if left < 0:
+                    raise SourceError(f"{file.path} unpacks to more than {MAX_RATIO} times its size")
+                yield replace(entry, data=data, place=(number, *entry.place))
+
+    @contextmanager
+    def open(self) -> Iterator[BagReader]:
+        """See `Storage`."""
+        with ExitStack() as opened:
+            yield _FolderReader(self, opened, {})
+
+    def plain(self, data: bytes) -> bytes:
+        """A message as it was before it was packed."""
+        if not self.packed_messages:
+            return data
+        try:
+            if zstandard.get_frame_parameters(data).content_size > MAX_UNPACKED_MESSAGE_BYTES:
+                raise SourceError(
+                    f"{self.path}: a message does not state that it unpacks to at most {MAX_UNPACKED_MESSAGE_BYTES} bytes"
+                )
+            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
+            return unpacker.decompress(data, max_output_size=MAX_UNPACKED_MESSAGE_BYTES)
+        except zstandard.ZstdError as error:
+            raise SourceError(f"{self.path} is damaged: a message is no zstd frame: {error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class _FolderReader:
+    """Keeps only the file open that was read last, because a bag may have more files than a process may open."""
+
+    folder: FolderStorage
+    opened: ExitStack
+    current: dict[int, BagReader]
+
+    def read(self, place: tuple[int, ...]) -> bytes:
+        """See `Reader`."""
+        number, *rest = place
+        if number not in self.current:
+            self.opened.close()
+            self.current.clear()
+            self.current[number] = self.opened.enter_context(self.folder.files[number].open())
+        return self.folder.plain(self.current[number].read(tuple(rest)))
+
+
+def open_folder(path: Path) -> FolderStorage:
+    """Opens the bag in a folder.
+
+    Raises:
+        SourceError: `metadata.yaml` is absent or cannot be used, the storage is unknown, or a file is absent; names it.
+    """
+    information = _information(path)
+    if information.storage_identifier not in ("mcap", "sqlite3"):
+        raise SourceError(f"{path / METADATA}: storage {information.storage_identifier!a} is neither mcap nor sqlite3")
+    mode = information.compression_mode.upper() if information.compression_format else ""
+    if mode and information.compression_format != "zstd":
+        raise SourceError(f"{path / METADATA}: compression {information.compression_format!a} is not zstd")
+    # Only the file's name counts: a bag must not reach outside its folder, and old versions wrote the folder in front.
+    names = [path / Path(name).name for name in information.relative_file_paths]
+    if len(set(names)) < len(names):
+        raise SourceError(f"{path / METADATA} names a file twice")
+    if mode != "FILE":
+        return FolderStorage(path, _files(path, information, names), mode == "MESSAGE")
+    unpacked = Path(tempfile.mkdtemp(prefix="coec-bag-"))
+    try:
+        plain = [_unpacked(file, unpacked) for file in names]
+        storage = FolderStorage(path, _files(path, information, plain), packed_messages=False)
+    except BaseException:
+        shutil.rmtree(unpacked, ignore_errors=True)
+        raise
+    weakref.finalize(storage, shutil.rmtree, unpacked, ignore_errors=True)
+    return storage
+
+
+def _files(path: Path, information: BagInformation, names: Sequence[Path]) -> tuple[BagStorage, ...]:
+    for name in names:
+        if not name.is_file():
+            raise SourceError(f"{path} lacks {name.name}, which its {METADATA} names")
+    kind = SqliteStorage if information.storage_identifier == "sqlite3" else McapStorage
+    return tuple(kind(name) for name in names)
+
+
+def _information(path: Path) -> BagInformation:
+    file = path / METADATA
+    if not file.is_file():
+        raise SourceError(f"{path} has no {METADATA}; `ros2 bag reindex {path}` writes one")
+    try:
+        document: Any = load_yaml(file)
+        return BagInformation.model_validate(document["rosbag2_bagfile_information"])
+    except ConfigError as error:
+        raise SourceError(str(error)) from error
+    except ValidationError as error:
+        raise SourceError(f"{file}: {describe(error)}") from error
+    except (KeyError, TypeError) as error:
+        raise SourceError(f"{file} is no metadata of rosbag2") from error
+
+
+def _unpacked(file: Path, folder: Path) -> Path:
+    """A packed file (`name.mcap.zstd`), unpacked (`name.mcap`)."""
+    target = folder / file.name.removesuffix(".zstd")
+    unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
+    try:
+        with file.open("rb") as packed, target.open("wb") as plain:
+            left = MAX_UNPACKED_MESSAGE_BYTES + MAX_RATIO * file.stat().st_size
+            for block in unpacker.read_to_iter(packed, write_size=_COPY_BYTES):
+                left -= len(block)
+                if left < 0:
+                    raise SourceError(f"{file} unpacks to more than {MAX_RATIO} times its size")
+                if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
+                    raise SourceError(f"{file} unpacks to more than {folder.parent} has room for")
+                plain.write(block)
+    except FileNotFoundError as error:
+        raise SourceError(f"{file} does not exist") from error
+    except OSError as error:
+        raise SourceError(f"cannot unpack {file}: {error.strerror}") from error
+    except zstandard.ZstdError as error:
+        raise SourceError(f"{file} is damaged: {error}") from error
+    return target

@@ -1,0 +1,262 @@
+"""`dataset.yaml`: images and clouds listed one by one (CONTRACT, "Command line").
+
+The coordinate frames are called `camera` and `lidar`. A `twist` is the velocity of the LiDAR in its own frame at the
+stamp of the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
+from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Name, describe, load_yaml
+from coec.errors import ConfigError, DecodeError, SourceError
+from coec.io.images import encode_depth_png, probe, raw_image
+from coec.io.recordings.bag_index import with_ros_camera_info
+from coec.io.recordings.cloud_files import load_cloud, measured_from
+from coec.io.recordings.kitti import load_image
+from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
+from coec.io.rig_files import camera_of, load_mask, rigid_matrix
+from coec.io.ros.camera_info import info_of_yaml
+from coec.io.user_files import read_bytes, read_npy
+
+FILE_NAME = "dataset.yaml"
+CAMERA_FRAME = "camera"
+LIDAR_FRAME = "lidar"
+
+_MAX_STAMP_NS = 2**31 * 1_000_000_000
+"""Bound for stamps: ROS 2 time, in which frames are recorded, has signed 32-bit seconds."""
+
+_DEPTH_CODES = 65_534
+"""Span of the codes 1 ... 65535 that mean a value in a 16-bit PNG; 0 means "no value"."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class TwistDocument(_Strict):
+    """Velocity of the LiDAR in its own frame, m/s and rad/s."""
+
+    linear_mps: tuple[float, float, float]
+    angular_radps: tuple[float, float, float]
+
+
+class FrameDocument(_Strict):
+    """One image and its cloud; paths are relative to the manifest."""
+
+    image: FilePath
+    cloud: FilePath
+    stamp_ns: int = Field(ge=0, lt=_MAX_STAMP_NS)
+    cloud_stamp_ns: int | None = Field(default=None, ge=0, lt=_MAX_STAMP_NS)
+    depth: FilePath | None = None
+    twist: TwistDocument | None = None
+
+
+class ManifestDocument(_Strict):
+    """The whole of `dataset.yaml`."""
+
+    pair: Name
+    camera: CameraIntrinsics
+    mask: FilePath | None = None
+    T_camera_lidar: Matrix4x4
+    T_cloud_lidar: Matrix4x4 = Field(
+        default=IDENTITY, description="pose of the LiDAR in the frame in which the points are given"
+    )
+    frames: tuple[FrameDocument, ...] = Field(min_length=1)
+
+
+def open_manifest(spec: SourceSpec) -> FramewiseRecording:
+    """Opens a folder with a `dataset.yaml`, or such a file.
+
+    Raises:
+        UsageError: a query was given.
+        SourceError: the manifest is absent or not YAML, has an unknown or missing key, or names an absent file; names
+            each place.
+    """
+    spec.only()
+    path = spec.path / FILE_NAME if spec.path.is_dir() else spec.path
+    if not path.is_file():
+        raise SourceError(f"{spec.path} has no {FILE_NAME}; for a KITTI folder write kitti360:... or kitti-raw:...")
+    try:
+        text = load_yaml(path)
+    except ConfigError as error:
+        raise SourceError(str(error)) from error
+    if info_of_yaml(text) is not None:
+        raise SourceError(
+            f"{path} is the calibration of a camera in ROS's form, no list of frames: name it as `camera: {path.name}` "
+            f"in a {FILE_NAME}, or behind a bag as BAG?intrinsics={path.name}"
+        )
+    try:
+        document = ManifestDocument.model_validate(with_ros_camera_info(text, path, rectified=False))
+        camera = camera_of(document.camera)
+        T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
+        T_cloud_lidar = rigid_matrix(document.T_cloud_lidar, "T_cloud_lidar")
+        mask = None if document.mask is None else load_mask(path.parent / document.mask, camera)
+    except ValidationError as error:
+        raise SourceError(f"{path}: {describe(error)}") from error
+    except ConfigError as error:
+        raise SourceError(f"{path}: {error}") from error
+    rig = Rig(
+        pair=document.pair,
+        camera=camera,
+        camera_frame=CAMERA_FRAME,
+        lidar_frame=LIDAR_FRAME,
+        T_camera_lidar_nominal=T_camera_lidar,
+        T_lidar_ego=np.eye(4),
+        mask=mask,
+    )
+    frames = sorted(document.frames, key=lambda frame: frame.stamp_ns)
+    _check_frames(path, frames)
+    depths = [path.parent / frame.depth for frame in frames if frame.depth is not None]
+    scale = _DepthScale([depth for depth in depths if depth.suffix == ".npy"])
+    motions = [
+        EgoMotion(frame.stamp_ns, LIDAR_FRAME, frame.twist.linear_mps, frame.twist.angular_radps)
+        for frame in frames
+        if frame.twist is not None
+    ]
+    return FramewiseRecording(
+        f"{path.parent.name}/{document.pair}",
+        rig,
+        T_camera_lidar,
+        tuple(_recorded(path.parent, frame, scale, T_cloud_lidar) for frame in frames),
+        tuple(motions),
+    )
+
+
+def _check_frames(path: Path, frames: Sequence[FrameDocument]) -> None:
+    stamps_ns = [frame.stamp_ns for frame in frames]
+    if len(frames) > 1 and len(set(stamps_ns)) == 1:
+        raise SourceError(
+            f"{path}: all {len(frames)} frames have the stamp_ns {stamps_ns[0]}: write when each was taken, in "
+            "nanoseconds; if only the rate is known, number them: 0, 100000000, 200000000, ... at 10 Hz"
+        )
+    unit = _unit_of(stamps_ns)
+    if unit is not None:
+        name, factor = unit
+        raise SourceError(
+            f"{path}: stamp_ns counts nanoseconds, and {stamps_ns[0]} with the next after "
+            f"{stamps_ns[1] - stamps_ns[0]} looks like {name}: multiply every stamp by {factor}"
+        )
+    for stream in (stamps_ns, [_cloud_stamp_ns(f) for f in frames]):
+        if any(later <= earlier for earlier, later in pairwise(stream)):
+            raise SourceError(
+                f"{path}: two frames have the same stamp, or clouds are not in the order of their images: correct "
+                "stamp_ns and cloud_stamp_ns, or leave out the frame that stands there twice"
+            )
+    for frame in frames:
+        for file in (frame.image, frame.cloud, frame.depth):
+            if file is not None and not (path.parent / file).is_file():
+                raise SourceError(f"{path}: there is no file {file}")
+        if frame.depth is not None and frame.depth.suffix not in (".png", ".npy"):
+            raise SourceError(f"{path}: depth {frame.depth} is neither .png nor .npy")
+
+
+def _unit_of(stamps_ns: Sequence[int]) -> tuple[str, int] | None:
+    """The unit in which stamps were written by mistake, and its factor; None if they can be nanoseconds. No camera
+    takes a thousand pictures a second, and stamps of an epoch tell their unit by their size."""
+    if len(stamps_ns) < 2 or float(np.median(np.diff(stamps_ns))) >= 1e6:
+        return None
+    units = ((10**9, 10**11, "seconds", 10**9), (10**12, 10**14, "milliseconds", 10**6), (10**15, 10**17, "µs", 10**3))
+    return next(((name, factor) for least, most, name, factor in units if least <= stamps_ns[0] < most), None)
+
+
+def _cloud_stamp_ns(frame: FrameDocument) -> int:
+    return frame.stamp_ns if frame.cloud_stamp_ns is None else frame.cloud_stamp_ns
+
+
+def _recorded(folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: Matrix4) -> RecordedFrame:
+    cloud_stamp_ns = _cloud_stamp_ns(frame)
+    return RecordedFrame(
+        frame.stamp_ns,
+        partial(_load_camera, folder, frame, scale),
+        cloud_stamp_ns,
+        partial(_load_lidar, folder / frame.cloud, cloud_stamp_ns, T_cloud_lidar),
+    )
+
+
+_ADVICE = {
+    ApparentOrigin.cause: "State the LiDAR's pose there as `T_cloud_lidar`.",
+    SeveralOrigins.cause: "Give the cloud of one LiDAR only.",
+}
+
+
+def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: Matrix4) -> LidarFrame:
+    return measured_from(load_cloud(stamp_ns, LIDAR_FRAME, path), T_cloud_lidar, LIDAR_FRAME, path, _ADVICE)
+
+
+def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> CameraFrame:
+    depth = None
+    if frame.depth is not None:
+        file = folder / frame.depth
+        depth = scale.encode(file) if file.suffix == ".npy" else load_image(file)
+    return CameraFrame(frame.stamp_ns, CAMERA_FRAME, _load_any_image(folder / frame.image), depth=depth)
+
+
+def _load_any_image(path: Path) -> EncodedImage:
+    """JPEG and PNG files as they are; any other image that OpenCV can read as raw 8-bit pixels."""
+    data = read_bytes(path)
+    try:
+        return probe(data, LimitsConfig())
+    except DecodeError as error:
+        if error.reason != "image_unknown_format":
+            raise SourceError(f"{path}: {error}") from error
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:  # an empty file, or a size that it refuses
+        pixels = None
+    if pixels is None:
+        raise SourceError(f"{path} is not an image that OpenCV reads")
+    height, width = pixels.shape[:2]
+    return raw_image(ImageFormat.BGR8, width, height, pixels.tobytes(), LimitsConfig())
+
+
+class _DepthScale:
+    """One linear scale from the float maps of a recording to 16-bit codes 1 ... 65535, so that a code means the same in
+    every frame. Values that are not finite or not above zero get 0, which means "no value". The scale keeps the order
+    of the values up to 1/65534 of their span, and mutual information depends only on their order."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._least, self._span = 0.0, 0.0
+        extremes = []
+        for path in paths:
+            values = _load_float_map(path)
+            valid = values[_has_value(values)]
+            if valid.size:
+                extremes.append((float(valid.min()), float(valid.max())))
+        if extremes:
+            self._least = min(least for least, _ in extremes)
+            self._span = max(greatest for _, greatest in extremes) - self._least
+
+    def encode(self, path: Path) -> EncodedImage:
+        """The map as a 16-bit grey PNG.
+
+        Raises:
+            SourceError: the file is unreadable or not a (h, w) array of floats.
+        """
+        values = _load_float_map(path)
+        share = (np.where(_has_value(values), values, self._least) - self._least) / (self._span or 1.0)
+        codes = np.where(_has_value(values), 1 + np.rint(np.clip(share, 0.0, 1.0) * _DEPTH_CODES), 0)
+        return probe(encode_depth_png(codes.astype(np.uint16)), LimitsConfig())
+
+
+def _has_value(values: NDArray[np.floating]) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(values) & (values > 0))
+
+
+def _load_float_map(path: Path) -> NDArray[np.floating]:
+    values = read_npy(path)
+    if values.ndim != 2 or values.dtype.kind != "f" or not values.size:
+        raise SourceError(f"{path}: a depth map must be a float array of shape (height, width)")
+    if values.size > LimitsConfig().max_image_pixels:
+        raise SourceError(f"{path}: {values.shape} is larger than any depth map")
+    return np.asarray(values, dtype=np.float64)

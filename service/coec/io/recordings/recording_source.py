@@ -1,0 +1,242 @@
+"""The interface of a recording, whatever its layout on disk: its rig, and its frames in the order of sensor time; and
+the grammar of a SOURCE argument, `[layout:]path[?key=value&…]`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+from urllib.parse import parse_qsl
+
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+from coec.config import CalibrationConfig
+from coec.errors import UsageError
+from coec.io.user_files import expand_home
+
+SensorMessage = CameraFrame | LidarFrame | EgoMotion
+
+MOTION_REACH_NS = 1_000_000_000
+"""Ego-motion within this time of a chosen camera frame is handed out with it, ns: five times the default motion
+tolerance."""
+
+_EGO, _LIDAR, _CAMERA = 0, 1, 2
+"""Order of messages with equal stamps, so that the partners of a camera frame come before it."""
+
+
+class RecordingSource(Protocol):
+    """A recorded drive of one camera-LiDAR pair."""
+
+    @property
+    def name(self) -> str:
+        """Layout, drive and camera, for people to read."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """Rig of the pair, with the calibration that came with the recording as nominal."""
+        ...
+
+    @property
+    def T_camera_lidar_start(self) -> Matrix4:
+        """(4, 4) extrinsic that was current when the recording was made; the nominal one if that was not recorded."""
+        ...
+
+    @property
+    def configuration(self) -> CalibrationConfig | None:
+        """Configuration that a recorded window carries; None for every other recording."""
+        ...
+
+    @property
+    def camera_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the camera frames, ascending, nanoseconds."""
+        ...
+
+    @property
+    def sweep_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the sweeps, ascending, nanoseconds."""
+        ...
+
+    @property
+    def motion_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the ego-motion, ascending, nanoseconds; empty if there is none."""
+        ...
+
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
+        """Messages in ascending order of their stamps, each loaded when it is its turn.
+
+        Args:
+            cameras: indices into `camera_stamps_ns`: only these camera frames, and the sweeps and ego-motion that are
+                needed to pair them. None: everything.
+
+        Raises:
+            UsageError: an index is out of range.
+            SourceError: a file cannot be read; names it.
+        """
+        ...
+
+
+@runtime_checkable
+class HasGroundTruth(Protocol):
+    """A recording whose true extrinsic is known, because it was simulated."""
+
+    def truth(self, stamp_ns: int) -> Matrix4:
+        """True T_camera_lidar (4, 4) at a time."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedFrame:
+    """A camera frame and the sweep that was taken with it, not loaded yet."""
+
+    camera_stamp_ns: int
+    load_camera: Callable[[], CameraFrame]
+    lidar_stamp_ns: int
+    load_lidar: Callable[[], LidarFrame]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramewiseRecording:
+    """A `Recording` of layouts that number camera frames and sweeps together (KITTI, manifests, windows).
+
+    Attributes:
+        frames: the frames, ascending by `camera_stamp_ns`.
+        motions: the ego-motion, ascending by `stamp_ns`.
+    """
+
+    name: str
+    rig: Rig
+    T_camera_lidar_start: Matrix4
+    frames: tuple[RecordedFrame, ...]
+    motions: tuple[EgoMotion, ...] = ()
+    configuration: CalibrationConfig | None = None
+
+    @property
+    def camera_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the camera frames, ascending, nanoseconds."""
+        return tuple(frame.camera_stamp_ns for frame in self.frames)
+
+    @property
+    def sweep_stamps_ns(self) -> tuple[int, ...]:
+        """See `Recording`."""
+        return tuple(sorted({frame.lidar_stamp_ns for frame in self.frames}))
+
+    @property
+    def motion_stamps_ns(self) -> tuple[int, ...]:
+        """See `Recording`."""
+        return tuple(motion.stamp_ns for motion in self.motions)
+
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
+        """See `Recording.messages`."""
+        frames = [self.frames[index] for index in selected_indices(cameras, len(self.frames))]
+        stamps_ns = [frame.camera_stamp_ns for frame in frames]
+        motions = self.motions if cameras is None else motions_near(self.motions, stamps_ns)
+        queue: list[tuple[int, int, int, Callable[[], SensorMessage]]] = []
+        for place, frame in enumerate(frames):
+            queue.append((frame.lidar_stamp_ns, _LIDAR, place, frame.load_lidar))
+            queue.append((frame.camera_stamp_ns, _CAMERA, place, frame.load_camera))
+        for place, motion in enumerate(motions):
+            queue.append((motion.stamp_ns, _EGO, place, lambda motion=motion: motion))  # type: ignore[misc]
+        for _, _, _, load in sorted(queue, key=lambda entry: entry[:3]):
+            yield load()
+
+
+def selected_indices(cameras: Collection[int] | None, count: int) -> list[int]:
+    """The indices asked for, ascending and once each; None asks for all.
+
+    Raises:
+        UsageError: an index is outside 0 ... count - 1.
+    """
+    if cameras is None:
+        return list(range(count))
+    for index in cameras:
+        if not 0 <= index < count:
+            raise UsageError(f"there is no camera frame {index}: the recording has {count}, counted from 0")
+    return sorted(set(cameras))
+
+
+def motions_near(motions: Collection[EgoMotion], stamps_ns: Collection[int]) -> list[EgoMotion]:
+    """The ego-motion samples within `MOTION_REACH_NS` of any of the stamps, in their order."""
+    return [m for m in motions if any(abs(m.stamp_ns - stamp) <= MOTION_REACH_NS for stamp in stamps_ns)]
+
+
+FORMS = """accepted forms of a source:
+  FILE.mcap                                     a recorded window
+  BAG?camera=/TOPIC&points=/TOPIC&...           any ROS 2 bag: FILE.mcap, FILE.db3 or rosbag2's folder (topics are found
+                                                by type where they are unique; lidar_frame=NAME for clouds in another,
+                                                moving=PARENT,CHILD for motion on /tf, time=FIELD,UNIT[,BASE],
+                                                lidar_source=N for one LiDAR of a cloud of several)
+  kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
+  kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
+  FOLDER or dataset.yaml                        images and clouds listed in a manifest
+  sim:seed=1&seconds=60&camera=fisheye700&...   a seeded drive through a town that does not exist (extra `sim`)
+  sim:rig=four-fisheyes&pair=front-roof&...     one pair of a simulated rig"""
+
+LAYOUTS = ("kitti360", "kitti-raw", "sim")
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSpec:
+    """A parsed SOURCE: its layout (None for a plain path), its path and its query."""
+
+    text: str
+    layout: str | None
+    path: Path
+    query: dict[str, str] = field(default_factory=dict)
+
+    def only(self, *keys: str) -> dict[str, str]:
+        """The query, checked to hold no other keys than these.
+
+        Raises:
+            UsageError: names the unknown keys and the known ones.
+        """
+        unknown = sorted(set(self.query) - set(keys))
+        if unknown:
+            known = f"known here: {', '.join(keys)}" if keys else "this kind of source takes none"
+            raise UsageError(f"unknown query key {', '.join(unknown)} in {self.text}; {known}", FORMS)
+        return self.query
+
+
+def parse_spec(text: str) -> SourceSpec:
+    """Splits a SOURCE argument.
+
+    Raises:
+        UsageError: an unknown layout, a malformed query or a missing path; lists the accepted forms.
+    """
+    prefix, colon, rest = text.partition(":")
+    layout = prefix if colon and prefix in LAYOUTS else None
+    if layout is None and colon and "/" not in prefix and "." not in prefix:
+        raise UsageError(f"unknown source layout {prefix!r} in {text}", FORMS)
+    # A simulated drive has no path, so the question mark may be left out.
+    place = f"?{rest.removeprefix('?')}" if layout == "sim" else rest if layout else text
+    location, _, query = place.partition("?")
+    if not location and layout != "sim":
+        raise UsageError(f"no path in source {text!r}", FORMS)
+    return SourceSpec(text, layout, expand_home(location), _parse_query(query, text))
+
+
+def is_bag(spec: SourceSpec) -> bool:
+    """Whether the source is a ROS 2 bag or a recorded window, by the name of the file or the content of the folder."""
+    by_name = spec.path.suffix in (".mcap", ".db3") or (spec.path / "metadata.yaml").is_file()
+    return spec.layout is None and by_name
+
+
+def is_rig(spec: SourceSpec) -> bool:
+    """Whether the source is a whole simulated rig, not one pair of it."""
+    return spec.layout == "sim" and "rig" in spec.query and "pair" not in spec.query
+
+
+def _parse_query(query: str, text: str) -> dict[str, str]:
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
+    except ValueError as error:
+        raise UsageError(f"malformed query in source {text}: {error}", FORMS) from error
+    result: dict[str, str] = {}
+    for key, value in pairs:
+        if key in result:
+            raise UsageError(f"query key {key} given twice in source {text}")
+        if not value:
+            raise UsageError(f"query key {key} has no value in source {text}")
+        result[key] = value
+    return result

@@ -1,0 +1,239 @@
+"""Makes a window of a SOURCE, as the service would have cut it, and adds the thinned pairs between its own from a
+recording that holds more than the window.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.frames.window import NS_PER_S_BETWEEN, BetweenPairs
+from coec.calibration.search.prior import MOUNT_RAD
+from coec.calibration.types import FramePair, Matrix4, Window
+from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
+from coec.errors import SourceError, UsageError
+from coec.geometry import se3
+from coec.geometry.culling import half_field_of_view_rad
+from coec.io.images import CompressingReducer
+from coec.io.mcap.window_reader import is_window, read_result, read_window
+from coec.io.recordings.layouts import RecordingSource, open_source
+from coec.io.recordings.recording_source import parse_spec
+
+WHOLE = (0.0, math.inf)
+"""Begin and end of the whole recording, in seconds after the first camera frame."""
+
+HALF_TURN_DEG = 180.0
+FARTHEST_M = 50.0
+"""Largest distance of two sensors on a road or rail vehicle. A larger number was given in other units."""
+
+RECORDED_GAP_S = 1e9
+"""Largest gap between frames that are chosen from a recording, s: practically any, because their order is certain."""
+
+
+class NoPairsError(SourceError):
+    """No pair can be made of the chosen camera frames, or there are none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedWindow:
+    """A window and what came with it.
+
+    Attributes:
+        configuration: configuration of a recorded window; None for other recordings.
+        vehicle: vehicle of a recorded window that holds its result; else the default name.
+        unpaired: number of frames that found no partner, by cause.
+    """
+
+    window: Window
+    configuration: CalibrationConfig | None
+    vehicle: str
+    unpaired: dict[str, int]
+
+
+def load_window(
+    source: str,
+    frames: int | None,
+    default_frames: int,
+    on_progress: Callable[[int, int], None],
+    between_s: tuple[float, float] = WHOLE,
+) -> LoadedWindow:
+    """The window of a SOURCE. A recorded window's file gives its own window. From any other recording, at most `frames`
+    (`default_frames` if None) camera frames are chosen evenly and paired. `heard(done, total)` counts camera frames.
+    Only camera frames from `between_s` (begin, end) seconds after the first one are used.
+
+    Raises:
+        UsageError, SourceError, WindowError: see `open_source`. SourceError also if no camera frame has a sweep.
+    """
+    spec = parse_spec(source)
+    if (
+        spec.layout is None
+        and not spec.query
+        and spec.path.suffix == ".mcap"
+        and spec.path.is_file()
+        and is_window(spec.path)
+    ):
+        return _recorded(spec.path, frames, between_s)
+    return window_of_recording(open_source(source), frames or default_frames, on_progress, between_s)
+
+
+def window_of_recording(
+    recording: RecordingSource,
+    frames: int,
+    on_progress: Callable[[int, int], None],
+    between_s: tuple[float, float] = WHOLE,
+) -> LoadedWindow:
+    """The window of an open recording: at most `frames` of its camera frames, evenly chosen and paired. `heard` and
+    `between_s` as in `load`. The recording's own extrinsic counts as one in use, not as a guess.
+
+    Raises:
+        SourceError: a file cannot be read, or no camera frame has a sweep.
+    """
+    within = _within(recording.camera_stamps_ns, between_s)
+    selected = [within[index] for index in evenly_spread(len(within), frames)]
+    pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
+    pairs: list[FramePair] = []
+    for message in recording.messages(selected):
+        pairs += pairer.push(message)
+        on_progress(len(pairs), len(selected))
+    pairs += pairer.flush()
+    on_progress(len(pairs), len(selected))
+    if not pairs:
+        raise NoPairsError(
+            f"{recording.name}: none of {len(selected)} camera frames has a sweep within "
+            f"{PairingConfig().tolerance_s} s: {clocks_text(recording.camera_stamps_ns, recording.sweep_stamps_ns)}"
+        )
+    window_id = f"{recording.rig.pair}-{pairs[0].stamp_ns}"
+    window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
+    losses = {cause: count for cause, count in pairer.losses.items() if count}
+    return LoadedWindow(window, recording.configuration, _default_vehicle(), losses)
+
+
+def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:
+    """How far the stamps of two streams are apart if no frame of one has a partner in the other, and what to do."""
+    if not camera_stamps_ns or not sweep_stamps_ns:
+        return "one of the two streams is empty"
+    cameras, sweeps = (np.array(stamps, dtype=np.float64) * 1e-9 for stamps in (camera_stamps_ns, sweep_stamps_ns))
+    offset_s = float(np.median([sweeps[np.abs(sweeps - stamp_s).argmin()] - stamp_s for stamp_s in cameras]))
+    overlap = sweeps[0] <= cameras[-1] and cameras[0] <= sweeps[-1]
+    if not overlap:
+        offset_s = float(sweeps[0] - cameras[0])
+    return (
+        f"the clouds are {abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} the images. The stamps must "
+        "be of one clock: let both drivers take the computer's time, or synchronise the sensors (PTP), and record "
+        "again; where the difference is known, correct the stamps of one stream"
+    )
+
+
+def evenly_spread(count: int, limit: int) -> list[int]:
+    """At most `wanted` of `count` indices, evenly spread. They include the first and the last; a single one is the
+    first."""
+    if limit >= count:
+        return list(range(count))
+    return sorted({round(index) for index in np.linspace(0, count - 1, limit)})
+
+
+def parse_perturbation(option: str, text: str) -> NDArray[np.float64]:
+    """ξ (6,) in radians and metres from the value of an option, `rx,ry,rz[,tx,ty,tz]` in degrees and metres.
+
+    Raises:
+        UsageError: these are not three or six finite numbers, or larger than any mount has; names the option.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise UsageError(f"{option} {text}: give numbers with commas between, as 1,0,-0.5") from error
+    return perturbation_vector(f"{option} {text}", values)
+
+
+def perturbation_vector(what: str, values: Sequence[float]) -> NDArray[np.float64]:
+    """ξ (6,) in radians and metres from `rx, ry, rz[, tx, ty, tz]` in degrees and metres.
+
+    Raises:
+        UsageError: these are not three or six finite numbers, or larger than any mount has; begins with `what`.
+    """
+    if len(values) not in (3, 6) or not np.isfinite(values).all():
+        raise UsageError(f"{what}: give three numbers (degrees), or six (degrees, then metres)")
+    xi = np.zeros(6)
+    xi[: len(values)] = values
+    if np.abs(xi[:3]).max() > HALF_TURN_DEG or np.abs(xi[3:]).max() > FARTHEST_M:
+        raise UsageError(
+            f"{what}: at most {HALF_TURN_DEG:g} degrees, then at most {FARTHEST_M:g} metres (not millimetres)"
+        )
+    xi[:3] = np.radians(xi[:3])
+    return xi
+
+
+def with_perturbed_start(window: Window, xi: NDArray[np.float64]) -> Window:
+    """The window with its start moved by ξ (6,), applied on the left. The start then counts as a mere guess."""
+    start = se3.perturb(window.T_camera_lidar_start, xi)
+    return replace(window, T_camera_lidar_start=start, start_known_to_rad=math.pi)
+
+
+def rotation_error_deg(T_a: Matrix4, T_b: Matrix4) -> float:
+    """Geodesic angle between the rotations of two transforms (4, 4)."""
+    return float(np.degrees(se3.rotation_angle_rad(T_a @ se3.inverse(T_b))))
+
+
+def _within(stamps_ns: Sequence[int], between_s: tuple[float, float]) -> list[int]:
+    """Indices of the stamps (ascending, nanoseconds) that lie `between_s` (begin, end) seconds after the first one."""
+    first_s, last_s = between_s
+    return [index for index, stamp in enumerate(stamps_ns) if first_s <= (stamp - stamps_ns[0]) * 1e-9 <= last_s]
+
+
+def _recorded(path: Path, frames: int | None, between_s: tuple[float, float]) -> LoadedWindow:
+    window, configuration = read_window(path)
+    within = _within([pair.stamp_ns for pair in window.pairs], between_s)
+    if not within:
+        raise NoPairsError(f"{path}: no pair was recorded {between_s[0]:g} to {between_s[1]:g} s after the first")
+    window = replace(window, pairs=tuple(window.pairs[index] for index in within))
+    if frames is not None:
+        window = replace(window, pairs=tuple(window.pairs[index] for index in evenly_spread(len(window.pairs), frames)))
+    result = read_result(path)
+    return LoadedWindow(window, configuration, result.vehicle if result else _default_vehicle(), {})
+
+
+def _default_vehicle() -> str:
+    return str(Config.model_fields["vehicle"].default)
+
+
+def with_thinned_pairs(window: Window, recording: RecordingSource, config: WindowConfig) -> Window:
+    """The window with the pairs between its own that the daemon would have recorded, taken from a recording that holds
+    them. The window's slice runs from its first to its last pair.
+
+    Raises:
+        SourceError: a file cannot be read.
+    """
+    stamps_ns = [pair.stamp_ns for pair in window.pairs]
+    rig = window.rig
+    lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
+    picked = BetweenPairs(CompressingReducer(LimitsConfig()), half_field_of_view_rad(rig.camera, lit))
+    # From the first of n pairs to the last there are n - 1 intervals; a slice of n pairs has n.
+    of_window = config.model_copy(update={"pairs": max(1, len(stamps_ns) - 1)})
+    picked.begin(of_window, stamps_ns[0], stamps_ns[-1] - stamps_ns[0])
+    own, between = set(stamps_ns), []
+    for pair in _pairs(recording, window, config):
+        if pair.stamp_ns in own:
+            picked.on_selected(pair.stamp_ns)
+        elif (thinned := picked.offer(pair, window.T_camera_lidar_start)) is not None:
+            between.append(thinned)
+    return replace(window, between=tuple(between))
+
+
+def _pairs(recording: RecordingSource, window: Window, config: WindowConfig) -> list[FramePair]:
+    """The pairs of the window, and those between them at the configured distance (`between_s`)."""
+    own, selected, last_ns = {pair.stamp_ns for pair in window.pairs}, [], window.pairs[0].stamp_ns
+    for index, stamp_ns in enumerate(recording.camera_stamps_ns):
+        if not window.pairs[0].stamp_ns <= stamp_ns <= window.stamp_ns:
+            continue
+        if stamp_ns in own or stamp_ns - last_ns >= round(config.between_s * NS_PER_S_BETWEEN):
+            selected.append(index)
+            last_ns = stamp_ns
+    pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
+    pairs = [pair for message in recording.messages(selected) for pair in pairer.push(message)]
+    return [*pairs, *pairer.flush()]

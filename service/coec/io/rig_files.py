@@ -1,0 +1,304 @@
+"""The rig in its three forms: configuration, value, and JSON with a mask image (`rig.json`, `mask.png` of a window)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coec.calibration.types import CloudFrame, Matrix4, Rig, SweepTiming
+from coec.config import (
+    IDENTITY,
+    CameraIntrinsics,
+    LidarConfig,
+    LimitsConfig,
+    Matrix4x4,
+    OpenPairConfig,
+    PairConfig,
+    SweepConfig,
+    describe,
+)
+from coec.errors import ConfigError, DecodeError, WindowError, cannot_read, require_readable
+from coec.geometry import cameras, se3
+from coec.io.images import decode_bgr, encode_png, probe
+
+NOT_ALWAYS_THERE = ("sweep", "cloud")
+"""Entries of `rig_identity` that a rig has only if they are configured."""
+
+ROUNDING = 1e-9
+"""Relative and absolute difference up to which two numbers of an identity count as equal: far below what any mount is
+known to, far above the rounding of a double."""
+
+
+class SweepDocument(BaseModel):
+    """`SweepTiming`, kept in radians so that it reads back to the same bits."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    period_s: float = Field(gt=0)
+    sign: Literal[-1, 1]
+    stamp_azimuth_rad: float
+
+
+class CloudDocument(BaseModel):
+    """`CloudFrame`."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    frame_id: str
+    T_cloud_lidar: Matrix4x4
+
+
+class RigDocument(BaseModel):
+    """`rig.json`: a `Rig` without its mask. Floats are written so that they read back to the same bits."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    pair: str
+    camera: CameraIntrinsics
+    camera_frame: str
+    lidar_frame: str
+    T_camera_lidar_nominal: Matrix4x4
+    T_lidar_ego: Matrix4x4
+    sweep: SweepDocument | None = None
+    cloud: CloudDocument | None = None
+
+
+def rig_of(pair: PairConfig) -> Rig:
+    """The rig that a configuration describes; reads its mask.
+
+    Raises:
+        ConfigError: the model refuses the intrinsics, a matrix is not rigid, or the mask is absent, not an image, or
+            not of the camera's size. Names the pair and the key.
+    """
+    camera = _camera(pair.camera.intrinsics, f"pair {pair.name}, camera.intrinsics")
+    ego = pair.ego
+    return Rig(
+        pair=pair.name,
+        camera=camera,
+        camera_frame=pair.camera.frame_id,
+        lidar_frame=pair.lidar.frame_id,
+        T_camera_lidar_nominal=rigid_matrix(pair.T_camera_lidar, f"pair {pair.name}, T_camera_lidar"),
+        T_lidar_ego=np.eye(4) if ego is None else rigid_matrix(ego.T_lidar_ego, f"pair {pair.name}, ego.T_lidar_ego"),
+        mask=None if pair.camera.mask is None else load_mask(pair.camera.mask, camera),
+        sweep=None if pair.lidar.sweep is None else _sweep(pair.lidar.sweep),
+        cloud=_cloud(pair.lidar, f"pair {pair.name}, lidar.T_cloud_lidar"),
+    )
+
+
+def check_given(pair: OpenPairConfig) -> None:
+    """Checks the parts of an awaited pair's rig that the configuration gives, as far as possible without the rest.
+
+    Raises:
+        ConfigError: the model refuses the intrinsics, a matrix is not rigid, or the mask does not exist.
+    """
+    where = f"pair {pair.name}"
+    if pair.camera.intrinsics is not None:
+        _camera(pair.camera.intrinsics, f"{where}, camera.intrinsics")
+    if pair.camera.mask is not None:
+        require_readable(pair.camera.mask, f"{where}, camera.mask")
+    matrices = {
+        "T_camera_lidar": pair.T_camera_lidar,
+        "lidar.T_cloud_lidar": pair.lidar.T_cloud_lidar,
+        "ego.T_lidar_ego": None if pair.ego is None else pair.ego.T_lidar_ego,
+    }
+    for name, rows in matrices.items():
+        if rows is not None:
+            rigid_matrix(rows, f"{where}, {name}")
+
+
+def camera_of(intrinsics: CameraIntrinsics) -> cameras.Camera:
+    """The camera that intrinsics describe.
+
+    Raises:
+        ConfigError: a parameter is missing, not of this model, or out of range; names it.
+    """
+    return _camera(intrinsics, "camera")
+
+
+def rigid_matrix(rows: Matrix4x4, where: str) -> Matrix4:
+    """(4, 4) float64, checked to be a rotation and a translation.
+
+    Raises:
+        ConfigError: it is not; the message names `where`.
+    """
+    T = np.array(rows, dtype=np.float64)
+    if not se3.is_rigid(T):
+        raise ConfigError(f"{where} is not a rigid transform: rows of a rotation, a translation, then 0 0 0 1")
+    return T
+
+
+def load_mask(path: Path, camera: cameras.Camera) -> NDArray[np.bool_]:
+    """(height, width) bool from a PNG or JPEG: False at pixels that are black in every channel.
+
+    Raises:
+        ConfigError: unreadable, not an image, or not of the camera's size.
+    """
+    try:
+        return mask_from_image(path.read_bytes(), camera)
+    except OSError as error:
+        raise ConfigError(cannot_read(path, error, "mask")) from error
+    except DecodeError as error:
+        raise ConfigError(f"mask {path}: {error}") from error
+
+
+def mask_from_image(data: bytes, camera: cameras.Camera) -> NDArray[np.bool_]:
+    """(height, width) bool from an encoded image, likewise.
+
+    Raises:
+        DecodeError: not an image, or not of the camera's size.
+    """
+    limits = LimitsConfig()
+    image = probe(data, limits)
+    if (image.width, image.height) != (camera.width, camera.height):
+        raise DecodeError(
+            "image_size_mismatch",
+            f"the mask is {image.width} x {image.height} px, the camera {camera.width} x {camera.height} px",
+        )
+    return np.asarray(decode_bgr(image, limits).any(axis=2))
+
+
+def mask_to_png(mask: NDArray[np.bool_]) -> bytes:
+    """A grey PNG, 255 at pixels where the mask is True, else 0."""
+    return encode_png(np.where(mask, np.uint8(255), np.uint8(0)))
+
+
+def intrinsics_config(camera: cameras.Camera) -> CameraIntrinsics:
+    """The intrinsics as a configuration holds them."""
+    return CameraIntrinsics.model_validate({"model": cameras.name_of(camera), **cameras.intrinsics_of(camera)})
+
+
+def rig_to_json(rig: Rig) -> dict[str, Any]:
+    """The rig without its mask, as JSON values."""
+    document = RigDocument(
+        pair=rig.pair,
+        camera=intrinsics_config(rig.camera),
+        camera_frame=rig.camera_frame,
+        lidar_frame=rig.lidar_frame,
+        T_camera_lidar_nominal=matrix_rows(rig.T_camera_lidar_nominal),
+        T_lidar_ego=matrix_rows(rig.T_lidar_ego),
+        sweep=None
+        if rig.sweep is None
+        else SweepDocument(
+            period_s=rig.sweep.period_s,
+            sign=1 if rig.sweep.sign > 0 else -1,
+            stamp_azimuth_rad=rig.sweep.stamp_azimuth_rad,
+        ),
+        cloud=None
+        if rig.cloud is None
+        else CloudDocument(frame_id=rig.cloud.frame_id, T_cloud_lidar=matrix_rows(rig.cloud.T_cloud_lidar)),
+    )
+    return document.model_dump(mode="json", exclude_none=True)
+
+
+def rig_identity(rig: Rig) -> dict[str, Any]:
+    """What makes a calibration belong to this rig, as JSON values: names, frames, intrinsics, nominal pose, and how
+    points are placed. What is not configured has no entry.
+
+    The form is fixed, whatever `rig_to_json` becomes, because `identity_sha256` of it is in the state directories of
+    all versions. A later version may add an entry for something that it newly knows, if it leaves that entry out where
+    the rig is as earlier versions took it to be.
+    """
+    identity: dict[str, Any] = {
+        "pair": rig.pair,
+        "camera": {"model": cameras.name_of(rig.camera), **intrinsics_config(rig.camera).parameters()},
+        "camera_frame": rig.camera_frame,
+        "lidar_frame": rig.lidar_frame,
+        "T_camera_lidar_nominal": rig.T_camera_lidar_nominal.tolist(),
+        "T_lidar_ego": rig.T_lidar_ego.tolist(),
+    }
+    if rig.sweep is not None:
+        identity["sweep"] = {
+            "period_s": float(rig.sweep.period_s),
+            "sign": 1 if rig.sweep.sign > 0 else -1,
+            "stamp_azimuth_rad": float(rig.sweep.stamp_azimuth_rad),
+        }
+    if rig.cloud is not None:
+        identity["cloud"] = {"frame_id": rig.cloud.frame_id, "T_cloud_lidar": rig.cloud.T_cloud_lidar.tolist()}
+    return identity
+
+
+def identity_sha256(identity: dict[str, Any]) -> str:
+    """The sha256 (hexadecimal) by which versions without `rig_identity` in their state know the rig."""
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+
+
+def is_same_rig(rig: Rig, stored: Mapping[str, Any]) -> bool:
+    """Whether a stored `rig_identity`, of this version or another one, is that of a rig. Entries that only the other
+    version knows are ignored, and numbers may differ by rounding."""
+    identity = rig_identity(rig)
+    return all(_is_equal(identity.get(name), stored.get(name)) for name in identity.keys() | NOT_ALWAYS_THERE)
+
+
+def _is_equal(value: Any, stored: Any) -> bool:
+    match value:
+        case dict():
+            return isinstance(stored, dict) and all(_is_equal(value[name], stored.get(name)) for name in value)
+        case list():
+            same_length = isinstance(stored, list) and len(value) == len(stored)
+            return same_length and all(_is_equal(one, other) for one, other in zip(value, stored, strict=True))
+        case float():
+            return isinstance(stored, float) and math.isclose(value, stored, rel_tol=ROUNDING, abs_tol=ROUNDING)
+        case _:
+            return bool(value == stored)
+
+
+def rig_from_json(document: object, mask_png: bytes | None) -> Rig:
+    """The exact inverse of `rig_to_json` and `mask_to_png`.
+
+    Raises:
+        WindowError: not a valid document; says where.
+    """
+    try:
+        parsed = RigDocument.model_validate(document)
+        camera = camera_of(parsed.camera)
+        mask = None if mask_png is None else mask_from_image(mask_png, camera)
+        return Rig(
+            pair=parsed.pair,
+            camera=camera,
+            camera_frame=parsed.camera_frame,
+            lidar_frame=parsed.lidar_frame,
+            T_camera_lidar_nominal=rigid_matrix(parsed.T_camera_lidar_nominal, "T_camera_lidar_nominal"),
+            T_lidar_ego=rigid_matrix(parsed.T_lidar_ego, "T_lidar_ego"),
+            mask=mask,
+            sweep=None
+            if parsed.sweep is None
+            else SweepTiming(parsed.sweep.period_s, parsed.sweep.sign, parsed.sweep.stamp_azimuth_rad),
+            cloud=None
+            if parsed.cloud is None
+            else CloudFrame(parsed.cloud.frame_id, rigid_matrix(parsed.cloud.T_cloud_lidar, "T_cloud_lidar")),
+        )
+    except ValidationError as error:
+        raise WindowError(f"the rig is damaged: {describe(error)}") from error
+    except (ConfigError, DecodeError) as error:
+        raise WindowError(f"the rig is damaged: {error}") from error
+
+
+def matrix_rows(T: Matrix4) -> Matrix4x4:
+    """(4, 4) as nested tuples of Python floats."""
+    a, b, c, d = ((float(w), float(x), float(y), float(z)) for w, x, y, z in T)
+    return a, b, c, d
+
+
+def _camera(intrinsics: CameraIntrinsics, where: str) -> cameras.Camera:
+    try:
+        return cameras.build(intrinsics.model, **intrinsics.parameters())
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def _cloud(lidar: LidarConfig, where: str) -> CloudFrame | None:
+    if lidar.cloud_frame_id is None and lidar.T_cloud_lidar == IDENTITY:
+        return None
+    return CloudFrame(lidar.cloud_frame_id or lidar.frame_id, rigid_matrix(lidar.T_cloud_lidar, where))
+
+
+def _sweep(sweep: SweepConfig) -> SweepTiming:
+    return SweepTiming(sweep.period_s, sweep.sign, math.radians(sweep.stamp_azimuth_deg))

@@ -1,0 +1,520 @@
+"""Converts `sensor_msgs/PointCloud2` to sweeps and back, with any order of fields, padding and organisation, and one
+copy per column; when each point was measured (field, unit and base of its time); and the points of one LiDAR in a
+concatenated cloud.
+
+`PointCloud2` has no rule for this. Ouster counts nanoseconds from the stamp; Velodyne counts seconds from the stamp or
+up to it; Hesai and RoboSense write seconds since 1970, Livox nanoseconds since 1970. So the reading is recognised from
+the values: a sweep takes `SHORTEST_S` to `LONGEST_S` and lies within `NEAR_S` of its stamp. Units are a factor of 1000
+apart, so that at most one of them makes a usual sweep of a column. If more than one reading is left, the cloud is
+refused, and `lidar.time` in the configuration has to say which is right.
+
+Some drivers that write times of day leave the stamp out; then the first point gives it.
+
+Every cloud is judged by itself, so that it reads the same alone and in a stream, live and in a bag.
+
+Most programs that join clouds write no such field. Autoware's `concatenate_data` puts the sources into another message
+(`ConcatenatedPointCloudInfo`), and no field of its points (x, y, z, intensity, return_type, channel, azimuth,
+elevation, distance, time_stamp) holds them. A `laser_id` or `channel` is the number of a beam, not of a LiDAR.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys.stores.ros2_humble import builtin_interfaces__msg__Time as Time
+from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointCloud2 as PointCloud2
+from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointField as PointField
+from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
+
+from coec.calibration.types import LidarFrame
+from coec.config import LimitsConfig, PointTimeConfig, TimeBase, TimeUnit
+from coec.errors import DecodeError
+from coec.io.frame_validation import Refusal, finite_rows, lidar_frame
+
+FIELDS: Final = (
+    "t",
+    "time",
+    "time_offset",
+    "offset_time",
+    "timestamp",
+    "time_stamp",
+    "time_offset_ns",
+    "time_offset_sec",
+)
+"""Names that drivers use for the time field; the first that a cloud has counts. Ouster `t`, Velodyne `time`, Livox
+`offset_time` and `timestamp`, Hesai and RoboSense `timestamp`, Autoware `time_stamp`, Aeva `time_offset_ns`, SICK
+`time_offset_sec`."""
+
+ON_A_CLOCK: Final = ("timestamp", "time_stamp")
+"""Names that drivers use both for the time of day and for the time since the stamp."""
+
+SHORTEST_S: Final = 1e-3
+"""Shortest sweep. A shorter one needs no motion compensation: a millisecond at 30 m/s is 3 cm."""
+
+LONGEST_S: Final = 10.0
+"""Longest sweep, as the longest period of `config.SweepConfig`."""
+
+NEAR_S: Final = 1.0
+"""Most time between a sweep and its stamp: drivers stamp its begin, middle or end, or the instant of sending it."""
+
+SINCE_S: Final = 946_684_800
+"""Begin of 2000, seconds since 1970; no time of day is earlier."""
+
+UNTIL_S: Final = 2**31
+"""2038, the end of ROS time. As units are a factor of 1000 apart, a value lies between `SINCE_S` and this in at most
+one of them."""
+
+FINEST_S: Final = 1e-3
+"""Largest step between neighbouring values of a time of day that can date a sweep; float32 is coarser."""
+
+NS_PER_S: Final = 1_000_000_000
+
+_TICKS: Final[dict[TimeUnit, int]] = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": NS_PER_S}
+"""Ticks of each unit in a second."""
+
+_UNIT_TEXT: Final[dict[TimeUnit, str]] = {"s": "s", "ms": "ms", "us": "µs", "ns": "ns"}
+_BASES: Final[dict[TimeBase, str]] = {"stamp": "since the stamp", "clock": "on the stamp's clock"}
+
+
+@dataclass(frozen=True, slots=True)
+class TimeReading:
+    """One way to read a column; with it the first and last point are `begin_s` and `end_s` after the stamp."""
+
+    unit: TimeUnit
+    base: TimeBase
+    begin_s: float
+    end_s: float
+
+    @property
+    def lasts_s(self) -> float:
+        """The duration of the sweep."""
+        return self.end_s - self.begin_s
+
+    @property
+    def sentence(self) -> str:
+        """The reading in words, without the name of the field."""
+        begin, end = (f"{1e3 * value:.1f}".replace("-0.0", "0.0") for value in (self.begin_s, self.end_s))
+        since = " from the stamp" if self.base == "clock" else ""
+        return f"{_UNIT_TEXT[self.unit]} {_BASES[self.base]}; {begin} to {end} ms{since}"
+
+    @property
+    def stamped(self) -> str:
+        """Where in the sweep the stamp lies, to a tenth of the sweep; empty if at none of the usual places."""
+        tenth = 0.1 * self.lasts_s
+        if self.lasts_s < SHORTEST_S:
+            return ""
+        if abs(self.begin_s) <= tenth:
+            return ", stamped at its begin"
+        if abs(self.end_s) <= tenth:
+            return ", stamped at its end"
+        return ", stamped in its middle" if abs(self.begin_s + self.end_s) <= 2 * tenth else ""
+
+
+def offsets_s(
+    name: str,
+    column: NDArray[Any],
+    keep: NDArray[np.bool_] | None,
+    stamp_ns: int,
+    configured: PointTimeConfig | None,
+) -> tuple[NDArray[np.float32], str]:
+    """(N,) float32 seconds after the stamp at which each point was measured, and a line that says how they were read.
+
+    Args:
+        name: of the field.
+        column: (N,) its values.
+        keep: (N,) the points whose values count, None: all; other values may be anything.
+        said: how to read it, if the configuration says so.
+
+    Raises:
+        DecodeError: `cloud_time` if no reading brings the points near the stamp, `cloud_time_ambiguous` if several do.
+    """
+    values = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
+    begin, end = _range(values if keep is None else values[keep])
+    if configured is not None:
+        reading = _read(begin, end, configured.unit, configured.base, stamp_ns)
+    else:
+        reading = recognised(name, values.dtype, begin, end, stamp_ns)
+    line = f"{name}: {values.dtype.name}, {reading.sentence}{reading.stamped}"
+    return _after_stamp_s(values, reading, stamp_ns), line
+
+
+def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, configured: PointTimeConfig | None) -> int | None:
+    """The time of the first point, ns, for a cloud without a stamp; None if its points have no time of day, or not the
+    one in the configuration. Arguments as for `offsets_s`."""
+    values = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
+    begin, end = _range(values if keep is None else values[keep])
+    clocked = [unit for unit in _TICKS if configured is None or (configured.unit, configured.base) == (unit, "clock")]
+    since_s = SINCE_S if configured is None else 0
+    for unit in clocked:
+        ticks = _TICKS[unit]
+        finest = 1.0 if values.dtype.kind != "f" else float(np.spacing(values.dtype.type(begin)))
+        if since_s < begin / ticks and end / ticks < UNTIL_S and finest / ticks <= FINEST_S:
+            seconds, rest = divmod(begin, ticks)
+            return int(seconds) * NS_PER_S + round(rest * (NS_PER_S / ticks))
+    return None
+
+
+def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_ns: int) -> TimeReading:
+    """How to read a column whose values reach from `begin` to `end`.
+
+    Raises:
+        DecodeError: `cloud_time`, `cloud_time_ambiguous`.
+    """
+    counts = dtype.kind != "f"
+    units: tuple[TimeUnit, ...] = ("ns", "us", "ms", "s") if counts else ("s", "ms", "us", "ns")
+    bases: tuple[TimeBase, ...] = ("stamp", "clock")
+    every = [_read(begin, end, unit, base, stamp_ns) for base in bases for unit in units]
+    near = [reading for reading in every if reading.begin_s <= NEAR_S and reading.end_s >= -NEAR_S]
+    sweeps = _as_named(name, [reading for reading in near if SHORTEST_S <= reading.lasts_s <= LONGEST_S])
+    instants = _as_named(name, [reading for reading in near if reading.lasts_s < SHORTEST_S])
+    # Few drivers write whole milliseconds, so that such values may also be nanoseconds of a flash LiDAR.
+    flashes = [reading for reading in instants if counts and reading.unit == "ns" and reading.base == "stamp"]
+    coarse = any(reading.unit in ("ms", "s") for reading in sweeps)
+    candidates = [*sweeps, *(flashes if coarse else ())] if sweeps else instants
+    if not candidates:
+        raise DecodeError(
+            Refusal.CLOUD_TIME,
+            f"the times in the field {name} of the points are not near the stamp of their sweep in any unit: do both "
+            "come from one clock?",
+        )
+    first = candidates[0]
+    if all(_agree(first, other) for other in candidates):
+        return first
+    readings_text = "; or ".join(reading.sentence for reading in candidates)
+    raise DecodeError(
+        Refusal.CLOUD_TIME_AMBIGUOUS,
+        f"the field {name} of the points may be {readings_text}: say which with "
+        f"`lidar.time: {{field: {name}, unit: {first.unit}, base: {first.base}}}`, of a bag with "
+        f"`?time={name},{first.unit},{first.base}`",
+    )
+
+
+def _as_named(name: str, readings: Sequence[TimeReading]) -> list[TimeReading]:
+    """The readings without those on a clock, if the name means the time since the stamp and such a reading is left."""
+    since_stamp = [reading for reading in readings if reading.base == "stamp"]
+    return since_stamp if since_stamp and name not in ON_A_CLOCK else list(readings)
+
+
+def _agree(a: TimeReading, b: TimeReading) -> bool:
+    return max(abs(a.begin_s - b.begin_s), abs(a.end_s - b.end_s)) < SHORTEST_S
+
+
+def _read(begin: float, end: float, unit: TimeUnit, base: TimeBase, stamp_ns: int) -> TimeReading:
+    whole, rest_s = _stamp(unit, base, stamp_ns)
+    ticks = _TICKS[unit]
+    return TimeReading(unit, base, (begin - whole) / ticks - rest_s, (end - whole) / ticks - rest_s)
+
+
+def _stamp(unit: TimeUnit, base: TimeBase, stamp_ns: int) -> tuple[int, float]:
+    """What a column counts from: whole seconds, in its unit, and the fraction in seconds. They are separate so that no
+    digit of a time of day is lost."""
+    if base == "stamp":
+        return 0, 0.0
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
+    return seconds * _TICKS[unit], nanoseconds * 1e-9
+
+
+def _range(values: NDArray[Any]) -> tuple[float, float]:
+    """Least and largest finite value; (0, 0) if there is none."""
+    if values.size == 0:
+        return 0.0, 0.0
+    least, most = values.min().item(), values.max().item()
+    if np.isfinite(least) and np.isfinite(most):
+        return least, most
+    return _range(values[np.isfinite(values)])
+
+
+def _after_stamp_s(values: NDArray[Any], reading: TimeReading, stamp_ns: int) -> NDArray[np.float32]:
+    if reading.base == "stamp" and reading.unit == "s":
+        return values.astype(np.float32, copy=False)
+    whole, rest_s = _stamp(reading.unit, reading.base, stamp_ns)
+    if not whole and not rest_s:
+        return (values * (1.0 / _TICKS[reading.unit])).astype(np.float32)
+    offset_s = values.astype(np.float64)
+    offset_s -= whole
+    offset_s *= 1.0 / _TICKS[reading.unit]
+    offset_s -= rest_s
+    return offset_s.astype(np.float32)
+
+
+SOURCE_FIELDS: Final = ("lidar_id", "sensor_id", "source_id", "device_id", "source")
+"""Names of integer fields in which joined clouds identify the LiDAR: `lidar_id`, `sensor_id` and `source` in published
+projects, `device_id` in Kitware's SLAM (beside its `laser_id`, the beam)."""
+
+_WIDTHS: Final = {
+    PointField.INT8: "i1",
+    PointField.UINT8: "u1",
+    PointField.INT16: "i2",
+    PointField.UINT16: "u2",
+    PointField.INT32: "i4",
+    PointField.UINT32: "u4",
+}
+
+MAX_LISTED: Final = 16
+"""Most sources that a refusal lists. A vehicle has fewer LiDARs, but the field may hold other numbers, however many."""
+
+
+def points_of_source(message: PointCloud2, source: int | None) -> PointCloud2:
+    """The points of one LiDAR, in their order, as a cloud of one row; the message unchanged if it holds no others.
+
+    Args:
+        message: its data must be as long as its layout says.
+        source: number of the requested LiDAR; None: the cloud must hold only one.
+
+    Raises:
+        DecodeError: `cloud_concatenated`: several sources but none requested, or no point of the requested one; lists
+            the sources.
+    """
+    field = next((field for name in SOURCE_FIELDS for field in message.fields if field.name == name), None)
+    values = None if field is None else _values(message, field)
+    if field is None or values is None:
+        if source is None:
+            return message
+        raise DecodeError(
+            Refusal.CLOUD_CONCATENATED,
+            f"source {source} is asked for, but no field of the points names one: {', '.join(SOURCE_FIELDS)} would",
+        )
+    selected = int(values[0, 0]) if source is None else source
+    mine = values == selected
+    if mine.all():
+        return message
+    if source is None or not mine.any():
+        known = np.unique(values)
+        listed = ", ".join(map(str, known[:MAX_LISTED].tolist())) + (", ..." if len(known) > MAX_LISTED else "")
+        advice = "choose one" if source is None else f"none has {source}"
+        raise DecodeError(
+            Refusal.CLOUD_CONCATENATED, f"the cloud is concatenated: its {field.name} has {listed}; {advice}"
+        )
+    rows = _rows(message)[mine]
+    return replace(
+        message,
+        height=1,
+        width=len(rows),
+        row_step=len(rows) * message.point_step,
+        data=np.ascontiguousarray(rows).reshape(-1),
+    )
+
+
+def _values(message: PointCloud2, field: PointField) -> NDArray[np.integer] | None:
+    """(height, width) numbers of a field; None if it holds no integers or lies outside of its point."""
+    width = _WIDTHS.get(field.datatype)
+    if width is None or field.offset + int(width[1]) > message.point_step:
+        return None
+    return np.ndarray(
+        shape=(message.height, message.width),
+        dtype=np.dtype(width).newbyteorder(">" if message.is_bigendian else "<"),
+        buffer=message.data,
+        offset=field.offset,
+        strides=(message.row_step, message.point_step),
+    )
+
+
+def _rows(message: PointCloud2) -> NDArray[np.uint8]:
+    """(height, width, point_step) bytes of the points."""
+    return np.ndarray(
+        shape=(message.height, message.width, message.point_step),
+        dtype=np.uint8,
+        buffer=message.data,
+        strides=(message.row_step, message.point_step, 1),
+    )
+
+
+_DTYPES: dict[int, np.dtype[Any]] = {
+    PointField.INT8: np.dtype("i1"),
+    PointField.UINT8: np.dtype("u1"),
+    PointField.INT16: np.dtype("<i2"),
+    PointField.UINT16: np.dtype("<u2"),
+    PointField.INT32: np.dtype("<i4"),
+    PointField.UINT32: np.dtype("<u4"),
+    PointField.FLOAT32: np.dtype("<f4"),
+    PointField.FLOAT64: np.dtype("<f8"),
+}
+
+_XYZ_BYTES = np.dtype("V12")
+"""x y z as float32."""
+
+
+def frame_of(
+    message: PointCloud2,
+    stamp_ns: int,
+    limits: LimitsConfig,
+    *,
+    point_time: PointTimeConfig | None = None,
+    source: int | None = None,
+) -> LidarFrame:
+    """The sweep of a message whose header is already checked.
+
+    `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned integer. The
+    time is one of `TIME_FIELDS`, any number, read as recognised in `point_time` or as the argument `point_time` says.
+    Optional fields of other types are left out, and so are fields with several values per point. A `stamp_ns` of 0
+    means no stamp; then the first point gives it, if it has a time of day. `source`: see `of_source`.
+
+    Raises:
+        DecodeError: `cloud_shape`, `cloud_fields`, `cloud_too_large`, `cloud_empty`, `cloud_time`,
+        `cloud_time_ambiguous`, `cloud_concatenated`.
+    """
+    _check_layout(message, limits)
+    message = points_of_source(message, source)
+    by_name = {field.name: field for field in reversed(message.fields)}  # the first field of a name counts
+    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinite and are dropped
+        xyz_m = _positions(message, by_name)
+        intensity = _column(message, by_name.get("intensity"), "fiu")
+        ring = _column(message, next((by_name[n] for n in ("ring", "channel", "line") if n in by_name), None), "u")
+        if ring is not None and ring.itemsize > 2 and int(ring.max()) > 0xFFFF:
+            raise DecodeError(Refusal.CLOUD_FIELDS, "a ring number exceeds 65535")
+        times = _times(message, by_name, finite_rows(xyz_m), stamp_ns, point_time)
+        return lidar_frame(
+            times.stamp_ns,
+            message.header.frame_id,
+            xyz_m,
+            None if intensity is None else intensity.astype(np.float32),
+            None if ring is None else ring.astype(np.uint16),
+            times.offset_s,
+            timed_by=times.description,
+        )
+
+
+WRITTEN_TIME: Final = PointTimeConfig(field="time", unit="s", base="stamp")
+"""How `message_of` writes the times of points, as Velodyne does."""
+
+
+def message_of(frame: LidarFrame) -> PointCloud2:
+    """The message that `frame_of` reads back to an equal sweep; without padding, with points timed as
+    `WRITTEN_TIME`."""
+    given = [
+        ("x", frame.xyz_m[:, 0], PointField.FLOAT32),
+        ("y", frame.xyz_m[:, 1], PointField.FLOAT32),
+        ("z", frame.xyz_m[:, 2], PointField.FLOAT32),
+        ("intensity", frame.intensity, PointField.FLOAT32),
+        ("ring", frame.ring, PointField.UINT16),
+        (WRITTEN_TIME.field, frame.time_offset_s, PointField.FLOAT32),
+    ]
+    columns = [(name, values, datatype) for name, values, datatype in given if values is not None]
+    rows = np.empty(len(frame.xyz_m), np.dtype([(name, _DTYPES[datatype]) for name, _, datatype in columns]))
+    fields = []
+    offset = 0
+    for name, values, datatype in columns:
+        rows[name] = values
+        fields.append(PointField(name, offset, datatype, 1))
+        offset += _DTYPES[datatype].itemsize
+    seconds, nanoseconds = divmod(frame.stamp_ns, 10**9)
+    return PointCloud2(
+        header=Header(Time(seconds, nanoseconds), frame.frame_id),
+        height=1,
+        width=len(rows),
+        fields=fields,
+        is_bigendian=False,
+        point_step=offset,
+        row_step=offset * len(rows),
+        data=rows.view(np.uint8),
+        is_dense=True,
+    )
+
+
+def _check_layout(message: PointCloud2, limits: LimitsConfig) -> None:
+    """Checks the sizes, in Python integers, which do not overflow."""
+    count = message.width * message.height
+    if count > limits.max_points:
+        raise DecodeError(Refusal.CLOUD_TOO_LARGE, f"{count} points; limits.max_points is {limits.max_points}")
+    if count == 0:
+        raise DecodeError(Refusal.CLOUD_EMPTY, "the cloud has no point")
+    if (
+        message.point_step == 0
+        or message.row_step < message.width * message.point_step
+        or message.data.size < (message.height - 1) * message.row_step + message.width * message.point_step
+    ):
+        raise DecodeError(
+            Refusal.CLOUD_SHAPE,
+            f"{message.height}×{message.width} points of {message.point_step} bytes, rows {message.row_step} apart, "
+            f"do not fit into {message.data.size} bytes",
+        )
+
+
+def _positions(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[np.float32]:
+    """(N, 3) x y z."""
+    together = _contiguous_positions(message, by_name)
+    if together is not None:
+        return together
+    xyz_m = np.empty((message.width * message.height, 3), np.float32)
+    for i, axis in enumerate("xyz"):
+        column = _column(message, by_name.get(axis), "f")
+        if column is None:
+            raise DecodeError(Refusal.CLOUD_FIELDS, "the cloud needs the fields x, y, z as float32 or float64")
+        xyz_m[:, i] = column
+    return xyz_m
+
+
+def _contiguous_positions(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[np.float32] | None:
+    """x y z in the layout of most drivers, float32 one after the other. Copying the three together takes a third of the
+    time of single columns. None for any other layout."""
+    x = by_name.get("x")
+    if x is None or x.offset + _XYZ_BYTES.itemsize > message.point_step:
+        return None
+    for i, axis in enumerate("xyz"):
+        field = by_name.get(axis)
+        if field is None or (field.datatype, field.offset) != (PointField.FLOAT32, x.offset + 4 * i) or field.count > 1:
+            return None
+    places = np.ascontiguousarray(_view(message, _XYZ_BYTES, x.offset))
+    return places.view(">f4" if message.is_bigendian else "<f4").reshape(-1, 3).astype(np.float32, copy=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Times:
+    """The stamp of a sweep, the times of its points, and how they were read.
+
+    Attributes:
+        stamp_ns: that of the header; if it has none, that of the first point, if points have a time of day.
+        offset_s: (N,) seconds after the stamp; None if no field holds a time.
+        told: see `LidarFrame.timed_by`.
+    """
+
+    stamp_ns: int
+    offset_s: NDArray[np.float32] | None
+    description: str
+
+
+def _times(
+    message: PointCloud2,
+    by_name: Mapping[str, PointField],
+    keep: NDArray[np.bool_] | None,
+    stamp_ns: int,
+    configured: PointTimeConfig | None,
+) -> _Times:
+    """`keep` as in `offsets_s`."""
+    names = FIELDS if configured is None else (configured.field,)
+    name = next((name for name in names if name in by_name), None)
+    column = None if name is None else _column(message, by_name[name], "fiu")
+    if name is None or column is None:
+        return _Times(stamp_ns, None, "")
+    first_ns = None if stamp_ns else stamp_in(column, keep, configured)
+    offset_s, description = offsets_s(name, column, keep, first_ns or stamp_ns, configured)
+    if first_ns is None:
+        return _Times(stamp_ns, offset_s, description)
+    return _Times(first_ns, offset_s, f"{description}; without a stamp, that of the first point is taken")
+
+
+def _column(message: PointCloud2, field: PointField | None, kinds: str) -> NDArray[Any] | None:
+    """(N,) values of a field; None if it is absent or not of these NumPy kinds."""
+    if field is None or field.datatype not in _DTYPES or _DTYPES[field.datatype].kind not in kinds:
+        return None
+    if field.count > 1:  # some drivers write 0 for 1
+        return None
+    dtype = _DTYPES[field.datatype].newbyteorder(">" if message.is_bigendian else "<")
+    if field.offset + dtype.itemsize > message.point_step:
+        raise DecodeError(Refusal.CLOUD_SHAPE, "a field lies outside its point")
+    return _view(message, dtype, field.offset).reshape(-1)
+
+
+def _view(message: PointCloud2, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
+    """(height, width) values at an offset in each point; the caller has checked that they fit."""
+    return np.ndarray(
+        shape=(message.height, message.width),
+        dtype=dtype,
+        buffer=message.data,
+        offset=offset,
+        strides=(message.row_step, message.point_step),
+    )

@@ -1,0 +1,273 @@
+"""Transforms of ROS 2 (`tf2_msgs/TFMessage`), read with bounds: the tree of static transforms, and ego-motion from two
+poses of a moving frame.
+
+In tf each frame has one parent, and the latest transform of a joint holds. Names, positions and the number of joints
+are bounded before anything is kept. Trees that violate tf's rule, and joints that change, are reported, so that the
+code that reads a calibration from them can judge.
+
+A transform tells where a frame is, not how fast it moves. For two poses T₁ and T₂ of the vehicle in `odom`, dt apart,
+the twist between them is log(T₁⁻¹·T₂)/dt, in the vehicle's frame. It is exact if the twist is constant. Otherwise its
+error is of second order in dt at the middle between the two poses, and that middle is its stamp.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from rosbags.typesys.stores import ros2_humble as ros
+
+from coec.calibration.types import EgoMotion, Matrix4
+from coec.errors import DecodeError
+from coec.geometry import se3
+from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
+from coec.io.frame_validation import MAX_FRAME_ID, Refusal
+from coec.io.ros.message_decoding import checked
+from coec.io.ros.messages import MessageCursor, deserialized, frame_id, stamp_ns
+
+MAX_TRANSFORMS: Final = 2048
+"""Most transforms of a message; robots with many joints send some hundred at once."""
+
+MAX_MESSAGE_BYTES: Final = 2**20
+"""Largest message; `MAX_TRANSFORMS` transforms with names of usual length have 300 kB."""
+
+MAX_PLACE_M: Final = 1e9
+"""Largest translation per axis, metres; map frames may lie at the centre of the earth, 6.4e6 m away."""
+
+
+def transforms_in(payload: bytes) -> list[Any]:
+    """The `TransformStamped` in a `TFMessage` in CDR, unchanged.
+
+    Raises:
+        DecodeError: `message_too_large`, `transforms_too_many` or `message_malformed`.
+    """
+    if len(payload) > MAX_MESSAGE_BYTES:
+        what = f"a message of transforms has at most {MAX_MESSAGE_BYTES} bytes"
+        raise DecodeError(Refusal.MESSAGE_TOO_LARGE, what)
+    if MessageCursor(payload).number() > MAX_TRANSFORMS:
+        raise DecodeError(Refusal.TRANSFORMS_TOO_MANY, f"a message of transforms has at most {MAX_TRANSFORMS}")
+    transforms: list[Any] = deserialized(ros.tf2_msgs__msg__TFMessage, payload).transforms
+    return transforms
+
+
+def pose_of(stamped: Any) -> Matrix4:
+    """T_parent_child (4, 4), the pose of the child in its parent.
+
+    Raises:
+        DecodeError: `transform_invalid`.
+    """
+    rotation, place = stamped.transform.rotation, stamped.transform.translation
+    place_m = np.array([place.x, place.y, place.z])
+    if not (np.abs(place_m) <= MAX_PLACE_M).all():
+        raise DecodeError(
+            Refusal.TRANSFORM_INVALID, "not a rigid transform: its translation is not finite, or far away"
+        )
+    try:
+        turn = rotation_from_quaternion_xyzw(np.array([rotation.x, rotation.y, rotation.z, rotation.w]))
+    except ValueError as error:
+        raise DecodeError(Refusal.TRANSFORM_INVALID, f"not a rigid transform: {error}") from error
+    return transform_from(turn, place_m)
+
+
+def bare(frame_id: str) -> str:
+    """A frame id without the leading slash of ROS 1."""
+    return frame_id.lstrip("/")
+
+
+MAX_STATIC_TRANSFORMS: Final = 2048
+"""Most joints that are kept; vehicles have some hundred."""
+
+
+@dataclass(frozen=True, slots=True)
+class StaticTransform:
+    """One static transform: `T_parent_child` (4, 4) is the pose of the child in its parent."""
+
+    parent: str
+    child: str
+    T_parent_child: Matrix4
+
+
+class StaticTransforms:
+    """All static transforms received so far. Not safe for use from several threads.
+
+    Attributes:
+        replaced: how often a known joint came with another value.
+    """
+
+    def __init__(self) -> None:
+        self.replaced = 0
+        self._joints: dict[str, dict[str, StaticTransform]] = {}
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """All named frames, sorted by name."""
+        return tuple(sorted({*self._joints, *(parent for parents in self._joints.values() for parent in parents)}))
+
+    def add(self, joints: tuple[StaticTransform, ...]) -> None:
+        """Add these joints; they replace earlier joints between the same frames.
+
+        Raises:
+            DecodeError: there would be more than `MAX_JOINTS`; then none is added.
+        """
+        known = {(joint.child, joint.parent) for parents in self._joints.values() for joint in parents.values()}
+        fresh = {(joint.child, joint.parent) for joint in joints} - known
+        if len(known) + len(fresh) > MAX_STATIC_TRANSFORMS:
+            raise DecodeError(Refusal.TRANSFORMS_TOO_MANY, f"more than {MAX_STATIC_TRANSFORMS} static transforms")
+        for joint in joints:
+            parents = self._joints.setdefault(joint.child, {})
+            before = parents.get(joint.parent)
+            if before is not None and not np.array_equal(before.T_parent_child, joint.T_parent_child):
+                self.replaced += 1
+            parents[joint.parent] = joint
+
+    def transform(self, target: str, source: str) -> Matrix4 | None:
+        """T_target_source (4, 4) along the fewest joints; None if no joints connect the two frames."""
+        way = self._path(bare(target), bare(source))
+        return None if way is None else way[-1][1]
+
+    def doubts(self, target: str, source: str) -> tuple[str, ...]:
+        """What violates the tree on the way between two frames, one sentence each: a frame with several parents, of
+        which tf takes the one it heard last, or a loop."""
+        on_the_way = {frame for frame, _ in self._path(bare(target), bare(source)) or ()}
+        several = [
+            f"frame {child!r} has the parents {' and '.join(repr(parent) for parent in sorted(parents))}"
+            for child, parents in sorted(self._joints.items())
+            if len(parents) > 1 and child in on_the_way
+        ]
+        loops = [
+            f"the frames {', '.join(repr(frame) for frame in loop)} form a loop"
+            for loop in self._loops()
+            if on_the_way.intersection(loop)
+        ]
+        return (*several, *loops)
+
+    def _path(self, target: str, source: str) -> list[tuple[str, Matrix4]] | None:
+        """The frames from source to target, each with T_frame_source (4, 4)."""
+        predecessor: dict[str, str] = {source: source}
+        reached = {source: np.eye(4)}
+        frontier = deque([source])
+        neighbours = self._neighbours()
+        while frontier and target not in reached:
+            frame = frontier.popleft()
+            for neighbour, T_neighbour_frame in neighbours.get(frame, {}).items():
+                if neighbour not in reached:
+                    predecessor[neighbour] = frame
+                    reached[neighbour] = T_neighbour_frame @ reached[frame]
+                    frontier.append(neighbour)
+        if target not in reached:
+            return None
+        way = [target]
+        while way[-1] != source:
+            way.append(predecessor[way[-1]])
+        return [(frame, reached[frame]) for frame in reversed(way)]
+
+    def _neighbours(self) -> dict[str, dict[str, Matrix4]]:
+        """T_neighbour_frame by frame and neighbour."""
+        neighbours: dict[str, dict[str, Matrix4]] = {}
+        for parents in self._joints.values():
+            for joint in parents.values():
+                neighbours.setdefault(joint.child, {})[joint.parent] = joint.T_parent_child
+                neighbours.setdefault(joint.parent, {})[joint.child] = inverse(joint.T_parent_child)
+        return neighbours
+
+    def _loops(self) -> Iterator[list[str]]:
+        """Paths from child to parent that lead back to a frame on them, each once. Of several parents only the first is
+        followed, because several parents are reported anyway."""
+        done: set[str] = set()
+        for start in sorted(self._joints):
+            way: dict[str, None] = {}
+            frame: str | None = start
+            while frame is not None and frame not in done and frame not in way:
+                way[frame] = None
+                frame = next(iter(self._joints.get(frame, {})), None)
+            if frame in way:
+                frames = list(way)
+                yield frames[frames.index(frame) :]
+            done.update(way)
+
+
+def decode_static_transforms(payload: bytes) -> tuple[StaticTransform, ...]:
+    """The joints of a `TFMessage` in CDR.
+
+    Raises:
+        DecodeError: not this message, or one of its transforms is invalid.
+    """
+    return tuple(_static_transform(stamped) for stamped in transforms_in(payload))
+
+
+def _static_transform(stamped: Any) -> StaticTransform:
+    parent, child = bare(stamped.header.frame_id), bare(stamped.child_frame_id)
+    if not 0 < len(parent) <= MAX_FRAME_ID or not 0 < len(child) <= MAX_FRAME_ID:
+        what = f"a frame id of a transform is empty or longer than {MAX_FRAME_ID}"
+        raise DecodeError(Refusal.FRAME_ID_INVALID, what)
+    if parent == child:
+        raise DecodeError(Refusal.TRANSFORM_INVALID, "a transform leads from a frame to itself")
+    return StaticTransform(parent, child, pose_of(stamped))
+
+
+MIN_BETWEEN_S: Final = 0.01
+"""Least time between the two poses; then a millimetre, the resolution of a filter's poses, is 0.1 m/s."""
+
+MAX_BETWEEN_S: Final = 0.5
+"""Most time between the two poses; in a longer gap the velocity may have changed unnoticed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    stamp_ns: int
+    T_parent_child: Matrix4
+
+
+class MovingFrame:
+    """Motion of one frame in another, from message to message. Not safe for use from several threads."""
+
+    def __init__(self, parent: str, child: str) -> None:
+        self._parent, self._child = bare(parent), bare(child)
+        self._before: _Pose | None = None
+
+    def motion(self, payload: bytes) -> EgoMotion | None:
+        """The motion since the previous pose, from a `TFMessage` in CDR; None if the message holds no new pose of the
+        frame, or if there was no previous pose.
+
+        Raises:
+            DecodeError: not this message, its pose is invalid, or the motion to it is impossible.
+        """
+        motion = None
+        for stamped in transforms_in(payload):
+            if bare(stamped.child_frame_id) != self._child:
+                continue
+            if bare(stamped.header.frame_id) == self._parent:
+                motion = self._moved_to(_pose(stamped)) or motion
+        return motion
+
+    def _moved_to(self, pose: _Pose) -> EgoMotion | None:
+        before = self._before
+        if before is None:
+            self._before = pose
+            return None
+        between_s = (pose.stamp_ns - before.stamp_ns) * 1e-9
+        if 0.0 <= between_s < MIN_BETWEEN_S:
+            return None
+        self._before = pose
+        if not 0.0 < between_s <= MAX_BETWEEN_S:
+            return None
+        twist = se3.log(se3.inverse(before.T_parent_child) @ pose.T_parent_child) / between_s
+        wx, wy, wz, vx, vy, vz = (float(v) for v in twist)
+        middle_ns = before.stamp_ns + (pose.stamp_ns - before.stamp_ns) // 2
+        return checked(middle_ns, frame_id(self._child), (vx, vy, vz), (wx, wy, wz))
+
+
+def frames_in(payload: bytes) -> set[tuple[str, str]]:
+    """Parent and child of every transform in a `TFMessage` in CDR.
+
+    Raises:
+        DecodeError: not this message.
+    """
+    return {(frame_id(bare(t.header.frame_id)), frame_id(bare(t.child_frame_id))) for t in transforms_in(payload)}
+
+
+def _pose(stamped: Any) -> _Pose:
+    return _Pose(stamp_ns(stamped.header), pose_of(stamped))

@@ -1,1 +1,0 @@
-"""`coec.evaluate`, until it is an entry point of another package."""

@@ -1,0 +1,102 @@
+"""Figures, counts, stamps and holds as text for people: true minus signs, no more digits than can be read, UTC where a
+stamp is a date. It imports nothing heavy: the service itself uses it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from math import floor, isfinite, log10
+
+NONE = "–"
+"""Stands where there is no number."""
+
+GROUPED_FROM = 10_000
+"""Numbers from here on have their digits in threes."""
+
+
+def number(value: float | None, digits: int = 3, sign: bool = False) -> str:
+    """A number with so many digits after the point."""
+    if value is None or not isfinite(value):
+        return NONE
+    # Adding zero turns -0 into 0.
+    return _true_minus(f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}")
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """A number with so many significant digits; all digits before the point are kept."""
+    if value is None or not isfinite(value):
+        return NONE
+    if value == 0.0:
+        return "0"
+    after = min(max(digits - 1 - floor(log10(abs(value))), 0), 6)
+    text = f"{value:.{after}f}"
+    if abs(value) >= GROUPED_FROM:
+        text = f"{value:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+    return _true_minus(text)
+
+
+def count(value: int, one: str, several: str | None = None) -> str:
+    """So many of something: `1 pair`, `2 pairs`."""
+    return f"{value} {one if value == 1 else several or one + 's'}"
+
+
+def percent(share: float | None, digits: int = 1) -> str:
+    """A share of 1 in percent."""
+    return NONE if share is None or not isfinite(share) else f"{100.0 * share:.{digits}f}\N{NARROW NO-BREAK SPACE}%"
+
+
+def size(vector: Sequence[float | None]) -> float | None:
+    """Euclidean length; None where a component is missing."""
+    known = [value for value in vector if value is not None]
+    return sum(value * value for value in known) ** 0.5 if len(known) == len(vector) else None
+
+
+def _true_minus(text: str) -> str:
+    return text.replace("-", "−")
+
+
+NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
+
+FIRST_DATE_NS = 946_684_800 * NS_PER_S
+"""Start of the year 2000. Stamps before it count from something else, mostly from when a sensor was switched on."""
+
+END_NS = 253_402_300_800 * NS_PER_S
+"""End of the year 9999, the last one that ISO 8601 writes with four digits."""
+
+
+def instant(stamp_ns: int) -> str:
+    """The stamp of a frame, to the millisecond."""
+    if not _is_date(stamp_ns):
+        return _bare(stamp_ns)
+    beyond_ms = stamp_ns // NS_PER_MS % 1000
+    return f"{_date(stamp_ns):%Y-%m-%d %H:%M:%S}.{beyond_ms:03d}Z"
+
+
+def second(stamp_ns: int) -> str:
+    """The stamp of an event, to the second."""
+    return f"{_date(stamp_ns):%Y-%m-%d %H:%M:%S}Z" if _is_date(stamp_ns) else _bare(stamp_ns)
+
+
+def day(stamp_ns: int) -> str:
+    """The day of a stamp."""
+    return f"{_date(stamp_ns):%Y-%m-%d}" if _is_date(stamp_ns) else _bare(stamp_ns)
+
+
+def _is_date(stamp_ns: int) -> bool:
+    return FIRST_DATE_NS <= stamp_ns < END_NS
+
+
+def _date(stamp_ns: int) -> datetime:
+    return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC)
+
+
+def _bare(stamp_ns: int) -> str:
+    return f"{stamp_ns / NS_PER_S:.3f} s"
+
+
+def hold_text(sender: str, since_ns: int | None, reason: str | None) -> str:
+    """By whom, since when and why, as far as that is known; the beginning of a sentence."""
+    who = f" by {sender}" if sender else " by command"
+    since = "" if since_ns is None else f" since {second(since_ns)}"
+    return f"held{who}{since}: {reason or 'no reason was given'}"

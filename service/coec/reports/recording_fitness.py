@@ -1,0 +1,314 @@
+"""What a recording holds and what it is good for, before anyone waits for a calibration.
+
+The stamps of all frames are known without loading them; only a few frames, evenly chosen, are loaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.monitor.check_verdict import MIN_PAIRS
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Rig
+from coec.config import PairingConfig, WindowConfig
+from coec.geometry.cameras import in_image
+from coec.geometry.points import lengths
+from coec.geometry.projection import project
+from coec.io.recordings.recording_source import RecordingSource
+from coec.io.recordings.window_cutting import clocks_text, evenly_spread
+
+NS_PER_S = 1e9
+
+SAMPLED_FRAMES = 12
+"""Camera frames that are loaded."""
+
+LITTLE_IN_VIEW = 0.03
+"""Share of a sweep's points in view below which there is a remark. A 60° camera sees a tenth of a turning LiDAR's."""
+
+SOME_NOT_FINITE = 0.01
+"""Share of points without a finite position from which on there is a remark."""
+
+SMEARING_MPS = 1.0
+"""Above this speed an uncompensated sweep of 0.1 s smears near objects by more than the spacing of its beams."""
+
+MANY_GAPS = 3.0
+"""A gap between frames is long from this many median intervals on."""
+
+FEW_PASSES = range(2, 9)
+"""How often the times run through in a cloud joined from several LiDARs; in a cloud stored row by row, more often."""
+
+Level = Literal["ok", "warn", "fail"]
+
+
+@dataclass(frozen=True, slots=True)
+class Cadence:
+    """Timing of one stream: frames, Hz (from the median interval), and its longest gap, seconds."""
+
+    frames: int
+    rate_hz: float
+    longest_gap_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """Something that a person should know: a machine-readable code, and a sentence that says what to do."""
+
+    level: Level
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fitness:
+    """A recording, as far as it was looked at.
+
+    Attributes:
+        seconds: from its first camera frame to its last.
+        camera, lidar, motion: cadence of the streams; motion None where there is none.
+        width, height: of the images, pixels.
+        points, rings: of a sweep, medians; 0 rings where there are none.
+        range_m: (near, far) within which nine of ten points lie.
+        passes: how often the times run from the begin of a sweep to its end, in the order in which points are stored,
+            median; 0 without times.
+        point_time: whether points carry their own time, or the rig knows the sweep's.
+        timed_by: how the times of points were read, in a line; empty where there is no doubt.
+        speed_mps, turn_degps: (median, most) of the vehicle; None where the ego-motion does not tell.
+        standing: share of the pairs that were taken while the vehicle stood; None where the speed is unknown.
+        paired: share of the frames looked at that found a sweep.
+        sync_ms: (median, most) of camera stamp minus sweep stamp, milliseconds.
+        in_view: share of a sweep's points that the nominal extrinsic puts into the image, median.
+        not_finite: share of a sweep's points that have no finite position or time, and are left out, median.
+        clocks: how far the stamps of the streams are apart, in a line; empty where frames find a sweep.
+        remarks: the most important first.
+    """
+
+    seconds: float
+    camera: Cadence
+    lidar: Cadence
+    motion: Cadence | None
+    width: int
+    height: int
+    points: int
+    rings: int
+    range_m: tuple[float, float]
+    passes: int
+    point_time: bool
+    timed_by: str
+    speed_mps: tuple[float, float] | None
+    turn_degps: tuple[float, float] | None
+    standing: float | None
+    paired: float
+    sync_ms: tuple[float, float] | None
+    in_view: float
+    not_finite: float
+    clocks: str
+    remarks: tuple[Notice, ...]
+
+
+def fitness_of(recording: RecordingSource) -> Fitness:
+    """What a recording holds, and remarks on it.
+
+    Raises:
+        SourceError: a file cannot be read, or a cloud contradicts its origin; names the file.
+    """
+    stamps_ns = recording.camera_stamps_ns
+    sampled = evenly_spread(len(stamps_ns), min(SAMPLED_FRAMES, len(stamps_ns)))
+    pairer = Pairer(PairingConfig(max_stamp_jump_s=1e9), expects_motion=bool(recording.motion_stamps_ns))
+    pairs: list[FramePair] = []
+    sweeps: list[LidarFrame] = []
+    motions: list[EgoMotion] = []
+    image: CameraFrame | None = None
+    for message in recording.messages(sampled):
+        match message:
+            case CameraFrame():
+                image = message
+            case LidarFrame():
+                sweeps.append(message)
+            case EgoMotion():
+                motions.append(message)
+        pairs += pairer.push(message)
+    pairs += pairer.flush()
+    rig = recording.rig
+    moving = _known(pair.motion.speed_mps for pair in pairs if pair.motion is not None)
+    standing = None if not moving else float(np.mean(np.array(moving) < WindowConfig().min_speed_mps))
+    sync_ms = np.array([(pair.camera.stamp_ns - pair.lidar.stamp_ns) / 1e6 for pair in pairs])
+    ranges_m = np.concatenate([lengths(sweep.xyz_m) for sweep in sweeps] or [np.zeros(1, np.float32)])
+    near, far = np.percentile(ranges_m[ranges_m > 0.0] if ranges_m.any() else ranges_m, [5, 95]).tolist()
+    seen = Fitness(
+        seconds=(stamps_ns[-1] - stamps_ns[0]) / NS_PER_S if stamps_ns else 0.0,
+        camera=cadence(stamps_ns),
+        lidar=cadence(recording.sweep_stamps_ns),
+        motion=cadence(recording.motion_stamps_ns) if recording.motion_stamps_ns else None,
+        width=rig.camera.width if image is None else image.image.width,
+        height=rig.camera.height if image is None else image.image.height,
+        points=_median([len(sweep.xyz_m) for sweep in sweeps]),
+        rings=_median([0 if sweep.ring is None else len(np.unique(sweep.ring)) for sweep in sweeps]),
+        range_m=(near, far),
+        passes=_median([passes(sweep) for sweep in sweeps]),
+        point_time=rig.sweep is not None or any(sweep.time_offset_s is not None for sweep in sweeps),
+        timed_by=next((sweep.timed_by for sweep in sweeps), ""),
+        speed_mps=_spread(_known(motion.speed_mps for motion in motions)),
+        turn_degps=_spread([float(np.degrees(np.linalg.norm(motion.angular_radps))) for motion in motions]),
+        standing=standing,
+        paired=len(pairs) / len(sampled) if sampled else 0.0,
+        sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
+        in_view=float(np.median([in_view(sweep, rig) for sweep in sweeps])) if sweeps else 0.0,
+        not_finite=float(np.median([_not_finite(sweep) for sweep in sweeps])) if sweeps else 0.0,
+        clocks="" if pairs else clocks_text(stamps_ns, recording.sweep_stamps_ns),
+        remarks=(),
+    )
+    return _with_remarks(seen)
+
+
+def cadence(stamps_ns: Sequence[int]) -> Cadence:
+    """Timing of a stream from its ascending stamps, nanoseconds. With fewer than two, rate and gap are 0."""
+    if len(stamps_ns) < 2:
+        return Cadence(len(stamps_ns), 0.0, 0.0)
+    gaps_s = np.diff(np.array(stamps_ns, dtype=np.int64)) / NS_PER_S
+    median_s = float(np.median(gaps_s))
+    return Cadence(len(stamps_ns), 1.0 / median_s if median_s > 0.0 else 0.0, float(gaps_s.max()))
+
+
+def in_view(sweep: LidarFrame, rig: Rig) -> float:
+    """Share of a sweep's points that the nominal extrinsic puts into the image."""
+    T = rig.T_camera_lidar_nominal
+    p_camera: NDArray[np.float64] = sweep.xyz_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    uv_px, valid = project(rig.camera, p_camera)
+    inside = valid & in_image(rig.camera, uv_px)
+    return float(inside.mean()) if len(inside) else 0.0
+
+
+def passes(sweep: LidarFrame) -> int:
+    """How often the times of a sweep's points run through, in the order in which the points are stored: one more than
+    they begin anew; 0 without times."""
+    times_s = sweep.time_offset_s
+    if times_s is None or len(times_s) == 0:
+        return 0
+    span_s = float(times_s.max() - times_s.min())
+    return 1 + int((np.diff(times_s) < -0.5 * span_s).sum())
+
+
+def _with_remarks(seen: Fitness) -> Fitness:
+    remarks = [notice for notice in _remarks(seen) if notice is not None]
+    return replace(seen, remarks=tuple(sorted(remarks, key=lambda notice: _ORDER[notice.level])))
+
+
+_ORDER: dict[Level, int] = {"fail": 0, "warn": 1, "ok": 2}
+
+
+def _remarks(seen: Fitness) -> list[Notice | None]:
+    return [
+        _too_short(seen),
+        _unpaired(seen),
+        _view(seen),
+        _finite(seen),
+        _motion(seen),
+        _standing(seen),
+        _rings(seen),
+        _joined(seen),
+        _gaps(seen),
+    ]
+
+
+def _too_short(seen: Fitness) -> Notice | None:
+    if seen.camera.frames >= MIN_PAIRS:
+        return None
+    return Notice("fail", "too_few_frames", f"{seen.camera.frames} camera frames; a calibration needs {MIN_PAIRS}.")
+
+
+def _unpaired(seen: Fitness) -> Notice | None:
+    tolerance_ms = 1e3 * PairingConfig().tolerance_s
+    if seen.paired == 0.0:
+        return Notice("fail", "no_pairs", f"No camera frame has a sweep within {tolerance_ms:.0f} ms: {seen.clocks}.")
+    if seen.paired < 0.9:
+        return Notice("warn", "few_pairs", f"{1 - seen.paired:.0%} of the camera frames have no sweep near them.")
+    return None
+
+
+def _view(seen: Fitness) -> Notice | None:
+    if seen.in_view >= LITTLE_IN_VIEW:
+        return None
+    text = f"{seen.in_view:.1%} of the points lie in the image at the nominal extrinsic: is it from LiDAR to camera?"
+    return Notice("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
+
+
+def _not_finite(sweep: LidarFrame) -> float:
+    return sweep.not_finite / (sweep.not_finite + len(sweep.xyz_m))
+
+
+def _finite(seen: Fitness) -> Notice | None:
+    if seen.not_finite < SOME_NOT_FINITE:
+        return None
+    return Notice(
+        "ok",
+        "not_finite",
+        f"{seen.not_finite:.0%} of the points have no finite position or time and are left out. This is so in "
+        "organised clouds, where a beam without an echo gives NaN; if yours is none, see to its driver or filter.",
+    )
+
+
+def _motion(seen: Fitness) -> Notice | None:
+    if seen.motion is None:
+        return Notice("warn", "no_ego_motion", "No ego-motion: sweeps taken while driving cannot be compensated.")
+    if seen.speed_mps is None:
+        text = "Ego-motion is rotation only: sweeps are turned back, not shifted; drive slowly, or add an odometry."
+        return Notice("warn", "rotation_only", text)
+    if not seen.point_time and seen.speed_mps is not None and seen.speed_mps[1] > SMEARING_MPS:
+        text = "Points have no time and the rig no sweep timing: sweeps taken while driving cannot be compensated."
+        return Notice("warn", "no_point_time", text)
+    return None
+
+
+def _standing(seen: Fitness) -> Notice | None:
+    if seen.standing is None or seen.standing < 0.5:
+        return None
+    return Notice(
+        "warn", "standing", f"The vehicle stood in {seen.standing:.0%} of the pairs: they count as few looks."
+    )
+
+
+def _rings(seen: Fitness) -> Notice | None:
+    if seen.rings != 1:
+        return None
+    return Notice(
+        "warn",
+        "constant_ring",
+        "The field `ring` holds one number and is ignored: beams are told apart by their elevation.",
+    )
+
+
+def _joined(seen: Fitness) -> Notice | None:
+    if seen.rings > 0 or seen.passes not in FEW_PASSES:
+        return None
+    return Notice(
+        "warn",
+        "perhaps_concatenated",
+        f"The points' times begin anew {seen.passes} times in a sweep, and no ring tells beams apart: if the cloud is "
+        "of several LiDARs (concatenated), take the topic of one.",
+    )
+
+
+def _gaps(seen: Fitness) -> Notice | None:
+    for name, stream in (("camera", seen.camera), ("LiDAR", seen.lidar)):
+        if stream.rate_hz > 1.0 and stream.longest_gap_s * stream.rate_hz > MANY_GAPS:
+            text = f"The {name} is silent for {stream.longest_gap_s:.1f} s, at {stream.rate_hz:.1f} Hz otherwise."
+            return Notice("ok", "gaps", text)
+    return None
+
+
+def _median(counts: Sequence[int]) -> int:
+    return int(np.median(counts)) if counts else 0
+
+
+def _known(values: Iterable[float | None]) -> list[float]:
+    """The values that are not None."""
+    return [value for value in values if value is not None]
+
+
+def _spread(values: Sequence[float]) -> tuple[float, float] | None:
+    return (float(np.median(values)), float(np.max(values))) if values else None

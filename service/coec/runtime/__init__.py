@@ -1,1 +1,0 @@
-"""The running service. A frame passes its packages in this order: ingest, recording, worker, decisions, api."""

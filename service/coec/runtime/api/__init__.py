@@ -1,1 +1,0 @@
-"""The answers of the service to queries and commands."""

@@ -1,1 +1,0 @@
-"""Windows on the disk: written, kept, removed."""

@@ -1,1 +1,0 @@
-"""Puts together what the pairs of one vehicle report, in one order and on one thread."""

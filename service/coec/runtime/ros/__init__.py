@@ -1,1 +1,0 @@
-"""Output to ROS 2: diagnostics, the calibrated frames, intrinsics, pictures."""

@@ -1,1 +1,0 @@
-"""The process that infers and solves, and the supervisor that watches it."""

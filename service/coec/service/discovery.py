@@ -1,0 +1,468 @@
+"""Discovery: completes a pair whose configuration leaves out its calibration from what was received on the bus, or
+says what is still missing; and stores discovered calibrations in the state directory, so that a restart has the
+same ones, whatever is published by then. What the configuration gives is used as it is; only what it leaves out is
+looked for. Nothing is assumed: the pair stays pending if `/tf_static` does not connect two frames, or an image has
+another size than its `CameraInfo`.
+
+What the configuration gives is used as it is; only what it leaves out is looked for. Nothing is assumed: the pair waits
+if `/tf_static` does not connect two frames, or an image has another size than its `CameraInfo`.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from coec.calibration.types import Matrix4, Reason
+from coec.config import (
+    IDENTITY,
+    AnyStreamConfig,
+    CameraIntrinsics,
+    Config,
+    Matrix4x4,
+    OpenPairConfig,
+    PairConfig,
+    config_hash,
+    describe,
+)
+from coec.errors import ConfigError, SourceError
+from coec.geometry.se3 import difference
+from coec.io.rig_files import matrix_rows, rig_of
+from coec.io.ros.camera_info import CameraInfoContent, info_topic, intrinsics_of_info, is_rectified
+from coec.io.ros.transforms import StaticTransforms, bare
+from coec.io.storage import StateFile
+from coec.schemas.keys import TF_STATIC
+from coec.schemas.message import Part
+
+T = TypeVar("T")
+
+
+CHANGED_RAD, CHANGED_M = 1e-6, 1e-6
+"""A transform that differs by more than this is another one (rad, m). One that is published again differs only by the
+rounding of float64. These limits are a thousandth of what a calibration finds."""
+
+CANNOT_BE_BUILT = "cannot_be_built"
+"""Code of a reason: no rig can be built of what was found."""
+
+SHOWN_FRAMES = 24
+"""How many frames a sentence lists at most."""
+
+_PLAIN = re.compile(r"[A-Za-z0-9_./:-]{1,64}")
+"""Names of frames as people give them. Other names are not repeated, because a sender chose them."""
+
+INTRINSICS, EXTRINSIC, CAMERA_FRAME, LIDAR_FRAME, CLOUD, EGO = (
+    "camera.intrinsics",
+    "T_camera_lidar",
+    "camera.frame_id",
+    "lidar.frame_id",
+    "lidar.T_cloud_lidar",
+    "ego.T_lidar_ego",
+)
+"""Places of a pair's configuration that can be found on the bus."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedImage:
+    """The latest image: the frame in its header and its size, px."""
+
+    frame_id: str
+    width: int
+    height: int
+
+
+@dataclass(slots=True)
+class ReceivedMetadata:
+    """What was heard of one pair so far. `cloud` and `ego` are the frame names in the latest cloud and motion.
+    `refused` says for a source (`camera`, `lidar`, `ego`, `info`) why its latest message could not be used."""
+
+    image: ReceivedImage | None = None
+    cloud: str | None = None
+    ego: str | None = None
+    info: CameraInfoContent | None = None
+    refused: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoveredPair:
+    """A complete pair, and where each found value comes from, by its place in the configuration."""
+
+    pair: PairConfig
+    origins: Mapping[str, str]
+
+
+def info_topic_of(pair: OpenPairConfig) -> str | None:
+    """The topic of the `CameraInfo` with the intrinsics. None if the intrinsics are given, or if the images come on a
+    key, which has no namespace."""
+    camera = pair.camera
+    if camera.intrinsics is not None:
+        return None
+    if camera.info_topic is not None:
+        return camera.info_topic
+    return None if camera.topic is None else info_topic(camera.topic)
+
+
+def needs_transforms(pair: OpenPairConfig) -> bool:
+    """Whether anything that the configuration leaves out comes from `/tf_static`."""
+    ego = pair.ego
+    return (
+        pair.T_camera_lidar is None
+        or (pair.lidar.frame_id is not None and pair.lidar.T_cloud_lidar is None)
+        or (ego is not None and ego.T_lidar_ego is None)
+    )
+
+
+def discover(
+    pair: OpenPairConfig, received: ReceivedMetadata, transforms: StaticTransforms
+) -> DiscoveredPair | tuple[Reason, ...]:
+    """The complete pair; or a reason for each thing that it waits for."""
+    search = _Search(pair, received, transforms)
+    intrinsics = search.resolve(search.intrinsics)
+    camera_frame, cloud_frame = search.resolve(search.camera_frame), search.resolve(search.cloud_frame)
+    lidar_frame = pair.lidar.frame_id or cloud_frame
+    T_cloud_lidar = search.resolve(search.T_cloud_lidar, cloud_frame, lidar_frame)
+    T_camera_lidar = search.resolve(search.T_camera_lidar, camera_frame, lidar_frame)
+    T_lidar_ego = search.resolve(search.T_lidar_ego, lidar_frame)
+    if search.missing:
+        return tuple(search.missing)
+    document = pair.model_dump()
+    document["T_camera_lidar"] = T_camera_lidar
+    document["camera"] |= {"frame_id": camera_frame, "intrinsics": intrinsics}
+    document["lidar"] |= {"frame_id": lidar_frame, "T_cloud_lidar": T_cloud_lidar}
+    if cloud_frame != lidar_frame:
+        document["lidar"]["cloud_frame_id"] = cloud_frame
+    if pair.ego is not None:
+        document["ego"]["T_lidar_ego"] = T_lidar_ego
+    try:
+        return DiscoveredPair(PairConfig.model_validate(document), search.origins)
+    except ValidationError as error:
+        return (Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {describe(error)}."),)
+
+
+class _MissingError(Exception):
+    """A value is missing, for a reason."""
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__(reason.text)
+        self.reason = reason
+
+
+class _Search:
+    """One search for everything that is left out. Each method returns what the configuration gives, else what was
+    found. It returns None if it depends on another value that is missing, and raises if its own value is."""
+
+    def __init__(self, pair: OpenPairConfig, received: ReceivedMetadata, transforms: StaticTransforms) -> None:
+        self._pair = pair
+        self._received = received
+        self._transforms = transforms
+        self.origins: dict[str, str] = {}
+        self.missing: list[Reason] = []
+
+    def resolve(self, question: Callable[..., T | None], *known: str | None) -> T | None:
+        """The value of a question; None, and a reason in `missing`, if it is missing."""
+        try:
+            return question(*known)
+        except _MissingError as error:
+            self.missing.append(error.reason)
+            return None
+
+    def intrinsics(self) -> CameraIntrinsics | None:
+        pair, received = self._pair, self._received
+        if pair.camera.intrinsics is not None:
+            return pair.camera.intrinsics
+        topic = info_topic_of(pair)
+        if topic is None:
+            raise _MissingError(Reason("no_camera_info", "Images on a key have no CameraInfo: set camera.info_topic."))
+        if "info" in received.refused:
+            text = f"The CameraInfo on {topic} is refused: {received.refused['info']}."
+            raise _MissingError(Reason("camera_info_refused", text))
+        if received.info is None:
+            raise _MissingError(Reason("no_camera_info", f"No CameraInfo on {topic} yet."))
+        try:
+            lens = intrinsics_of_info(received.info, rectified=is_rectified(pair.camera.place))
+        except SourceError as error:
+            raise _MissingError(
+                Reason("camera_info_refused", f"The CameraInfo on {topic} cannot be used: {error}.")
+            ) from error
+        size, image = lens.intrinsics, received.image
+        if image is not None and (image.width, image.height) != (size.width, size.height):
+            sizes = f"{image.width} x {image.height} px, the CameraInfo on {topic} is for {size.width} x {size.height}"
+            raise _MissingError(Reason("camera_info_size", f"Images on {pair.camera.place} are {sizes} px."))
+        self.origins[INTRINSICS] = f"CameraInfo on {topic}: {lens.source}"
+        return lens.intrinsics
+
+    def camera_frame(self) -> str | None:
+        pair, image = self._pair, self._received.image
+        if image is None and (pair.camera.frame_id is None or pair.camera.intrinsics is None):
+            raise _MissingError(Reason("no_image", self._silent("camera", "image", pair.camera.place)))
+        if pair.camera.frame_id is not None:
+            return pair.camera.frame_id
+        assert image is not None
+        if not image.frame_id:
+            raise _MissingError(Reason("no_frame_id", _frameless("Images", pair.camera, "camera.frame_id")))
+        self.origins[CAMERA_FRAME] = f"the latest image on {pair.camera.place} before the pair was built"
+        return image.frame_id
+
+    def cloud_frame(self) -> str | None:
+        lidar, cloud = self._pair.lidar, self._received.cloud
+        if lidar.cloud_frame_id is not None:
+            return lidar.cloud_frame_id
+        if cloud is None:
+            raise _MissingError(Reason("no_cloud", self._silent("lidar", "cloud", lidar.place)))
+        if not cloud:
+            raise _MissingError(Reason("no_frame_id", _frameless("Clouds", lidar, "lidar.cloud_frame_id")))
+        if lidar.frame_id is None:
+            self.origins[LIDAR_FRAME] = f"the latest cloud on {lidar.place} before the pair was built"
+        return cloud
+
+    def T_cloud_lidar(self, cloud: str | None, lidar: str | None) -> Matrix4x4 | None:
+        given = self._pair.lidar.T_cloud_lidar
+        if given is not None or cloud is None or lidar is None:
+            return given
+        return IDENTITY if bare(cloud) == bare(lidar) else self._rows(CLOUD, cloud, lidar)
+
+    def T_camera_lidar(self, camera: str | None, lidar: str | None) -> Matrix4x4 | None:
+        given = self._pair.T_camera_lidar
+        return given if given is not None or camera is None or lidar is None else self._rows(EXTRINSIC, camera, lidar)
+
+    def T_lidar_ego(self, lidar: str | None) -> Matrix4x4 | None:
+        ego, frame = self._pair.ego, self._received.ego
+        if ego is None or ego.T_lidar_ego is not None or lidar is None:
+            return None if ego is None else ego.T_lidar_ego
+        if frame is None:
+            raise _MissingError(Reason("no_motion", self._silent("ego", "motion", ego.place)))
+        if not frame:
+            raise _MissingError(Reason("no_frame_id", _frameless("Motions", ego, "ego.T_lidar_ego")))
+        return IDENTITY if bare(frame) == bare(lidar) else self._rows(EGO, lidar, frame)
+
+    def _rows(self, place: str, target: str, source: str) -> Matrix4x4 | None:
+        T_target_source = self._transforms.transform(target, source)
+        names = f"{_named(target)} and {_named(source)}"
+        if T_target_source is None:
+            there = _listed(self._transforms.frames)
+            text = f"{TF_STATIC} does not connect {names} (for {place}): {there}."
+            raise _MissingError(Reason("tf_static", text))
+        doubts = self._transforms.doubts(target, source)
+        if doubts:
+            raise _MissingError(
+                Reason("tf_static_no_tree", f"{TF_STATIC} is no tree between {names}: {'; '.join(doubts)}.")
+            )
+        self.origins[place] = f"{TF_STATIC}, between {names}"
+        return matrix_rows(T_target_source)
+
+    def _silent(self, stream: str, what: str, place: str) -> str:
+        refused = self._received.refused.get(stream)
+        return f"No {what} on {place} yet." if refused is None else f"No {what} on {place} can be used: {refused}."
+
+
+def change_since(
+    discovered: DiscoveredPair, pair: OpenPairConfig, received: ReceivedMetadata, transforms: StaticTransforms
+) -> Reason | None:
+    """In what the bus now contradicts the values with which the pair was built; None if in nothing."""
+    built = discovered.pair
+    changes = []
+    if INTRINSICS in discovered.origins and received.info is not None:
+        try:
+            now: object = intrinsics_of_info(received.info, rectified=is_rectified(pair.camera.place)).intrinsics
+        except SourceError as error:
+            now = str(error)
+        if now != built.camera.intrinsics:
+            changes.append(f"CameraInfo on {info_topic_of(pair)}")
+    ego = None if built.ego is None else built.ego.T_lidar_ego
+    for place, rows, target, source in (
+        (EXTRINSIC, built.T_camera_lidar, built.camera.frame_id, built.lidar.frame_id),
+        (CLOUD, built.lidar.T_cloud_lidar, built.lidar.cloud_frame_id, built.lidar.frame_id),
+        (EGO, ego, built.lidar.frame_id, received.ego),
+    ):
+        if place in discovered.origins and rows is not None and target is not None and source is not None:
+            T_now = transforms.transform(target, source)
+            if T_now is not None and _differ(np.array(rows), T_now):
+                changes.append(f"{TF_STATIC}, for {place}")
+    if not changes:
+        return None
+    text = (
+        f"The bus has changed since this pair was built: {' and '.join(changes)}. What it was built with remains the "
+        "nominal calibration: to take the new one, stop the service, remove nominal.json from its state "
+        "directory, and start it."
+    )
+    return Reason("nominal_changed", text)
+
+
+def _differ(T_a: Matrix4, T_b: Matrix4) -> bool:
+    xi = np.abs(difference(T_a, T_b))
+    return bool(xi[:3].max() > CHANGED_RAD or xi[3:].max() > CHANGED_M)
+
+
+def _frameless(what: str, stream: AnyStreamConfig, place: str) -> str:
+    return f"{what} on {stream.place} name no frame: set {place}."
+
+
+def _named(frame: str) -> str:
+    """The name of a frame for people to read; a name that is not plain is not repeated."""
+    return repr(frame) if _PLAIN.fullmatch(frame) else "(a frame whose name is not plain)"
+
+
+def _listed(frames: Iterable[str]) -> str:
+    known = [frame for frame in frames if _PLAIN.fullmatch(frame)]
+    if not known:
+        return "it names no frames yet"
+    more = f" and {len(known) - SHOWN_FRAMES} more" if len(known) > SHOWN_FRAMES else ""
+    return f"there are {', '.join(known[:SHOWN_FRAMES])}{more}"
+
+
+_log = logging.getLogger(__name__)
+
+NOMINAL_FILE = "nominal.json"
+
+
+class StoredCamera(Part):
+    """What is found of a camera."""
+
+    frame_id: str
+    intrinsics: CameraIntrinsics
+
+
+class StoredLidar(Part):
+    """What is found of a LiDAR."""
+
+    frame_id: str
+    T_cloud_lidar: Matrix4x4
+    cloud_frame_id: str | None
+
+
+class StoredEgo(Part):
+    """What is found of the ego-motion."""
+
+    T_lidar_ego: Matrix4x4
+
+
+class StoredNominal(Part):
+    """What is found of a pair, out of its configuration. The file holds the whole `PairConfig`, which versions before
+    this one require; its other keys may be those of another version."""
+
+    T_camera_lidar: Matrix4x4
+    camera: StoredCamera
+    lidar: StoredLidar
+    ego: StoredEgo | None = None
+
+
+class StoredDiscovery(Part):
+    """`Found` on the disk. `asked` is the hash of what the configuration left out and where it was looked for.
+    `found_ns` is the wall clock when it was found."""
+
+    asked: str
+    found_ns: Annotated[int, Field(ge=0, lt=2**63)]
+    pair: StoredNominal
+    origins: dict[str, str]
+
+
+class DiscoveryStore:
+    """The nominal calibrations of a vehicle, as a book that the scribe writes. Safe to use from several threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self._lock = threading.Lock()
+        self._file = StateFile(folder / NOMINAL_FILE)
+        loaded = self._file.load()
+        for damage in loaded.damage:
+            _log.warning(f"nominal calibrations that were kept cannot be used: {damage}")
+        self._pairs: dict[str, StoredDiscovery] = {}
+        self._documents: dict[str, dict[str, Any]] = {}
+        pairs = (loaded.body or {}).get("pairs")
+        for name, document in (pairs if isinstance(pairs, dict) else {}).items():
+            try:
+                self._pairs[name] = StoredDiscovery.model_validate(document)
+                self._documents[name] = document
+            except ValidationError:
+                self._file.reject()
+                _log.warning("a nominal calibration that was kept has another form", extra={"fields": {"pair": name}})
+
+    def load(self, config: Config) -> dict[str, DiscoveredPair]:
+        """What was found earlier, by pair, for the pairs that this configuration awaits and for which it still asks the
+        same."""
+        pairs = {pair.name: self._restored(pair, config) for pair in config.awaited}
+        return {name: one for name, one in pairs.items() if one is not None}
+
+    def _restored(self, pair: OpenPairConfig, config: Config) -> DiscoveredPair | None:
+        with self._lock:
+            stored = self._pairs.get(pair.name)
+        if stored is None or stored.asked != _request_hash(pair, config):
+            return None
+        document, earlier = pair.model_dump(), stored.pair
+        document["T_camera_lidar"] = earlier.T_camera_lidar
+        document["camera"] |= earlier.camera.model_dump()
+        document["lidar"] |= earlier.lidar.model_dump()
+        if pair.ego is not None and earlier.ego is not None:
+            document["ego"]["T_lidar_ego"] = earlier.ego.T_lidar_ego
+        try:
+            complete = PairConfig.model_validate(document)
+            rig_of(complete)  # may fail, because the mask may have changed on the disk
+        except (ConfigError, ValidationError) as error:
+            _log.warning(f"a nominal calibration that was kept cannot be used: {error}")
+            return None
+        since = datetime.fromtimestamp(stored.found_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return DiscoveredPair(
+            complete, {place: f"{origin}; kept since {since}" for place, origin in stored.origins.items()}
+        )
+
+    def update(self, discovered: DiscoveredPair, requested: OpenPairConfig, config: Config, now_ns: int) -> None:
+        """Keeps what was found; the next `flush` writes it."""
+        document = {
+            "asked": _request_hash(requested, config),
+            "found_ns": now_ns,
+            "pair": discovered.pair.model_dump(mode="json"),
+            "origins": dict(discovered.origins),
+        }
+        stored = StoredDiscovery.model_validate(document)
+        with self._lock:
+            self._pairs = {**self._pairs, requested.name: stored}
+            self._documents = {**self._documents, requested.name: document}
+
+    def flush(self) -> None:
+        """Writes to the disk what is kept.
+
+        Raises:
+            StateError: it cannot be written; the next call tries again.
+        """
+        with self._lock:
+            documents = self._documents
+        self._file.save({"pairs": documents})
+
+
+def _request_hash(pair: OpenPairConfig, config: Config) -> str:
+    """Hash of what the configuration gives and where the rest is looked for. Other settings may change."""
+    question = pair.model_dump(
+        mode="json",
+        include={
+            "camera": {"key", "topic", "info_topic", "frame_id", "intrinsics"},
+            "lidar": {"key", "topic", "frame_id", "T_cloud_lidar", "cloud_frame_id"},
+            "ego": {"key", "topic", "T_lidar_ego"},
+            "T_camera_lidar": True,
+        },
+    )
+    where = {"middleware": config.middleware, **config.ros.model_dump(include={"domain", "namespace"})}
+    return config_hash(json.dumps([question, where], sort_keys=True))
+
+
+def completed(config: Config, discovered: Mapping[str, PairConfig]) -> Config:
+    """The configuration in which these pairs, by their names, are moved from the awaited ones to the complete ones."""
+    joined = tuple(discovered[pair.name] for pair in config.awaited if pair.name in discovered)
+    still = tuple(pair for pair in config.awaited if pair.name not in discovered)
+    return config.model_copy(update={"pairs": (*config.pairs, *joined), "awaited": still})
+
+
+def with_discovered(config: Config) -> Config:
+    """The configuration completed by what a service has found for its awaited pairs and keeps in its state
+    directory."""
+    if not config.awaited:
+        return config
+    stored = DiscoveryStore(config.state.directory).load(config)
+    return completed(config, {name: discovered.pair for name, discovered in stored.items()})

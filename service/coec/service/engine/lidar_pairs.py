@@ -1,0 +1,408 @@
+"""Registers the LiDARs of a vehicle against each other: plans which two of them are registered, takes their sweeps on
+the thread of the intake, submits a registration to the worker, and reports its result to the rig. Only sensor time
+decides which sweeps are taken, and from when their result counts, so a replay of a drive gives the same at any
+rate. The rig waits for everything that counts by its sensor time (`schedule`).
+
+Only sensor time decides which sweeps are taken, and from when their result counts, so a replay of a drive gives the
+same at any rate. The rig waits for everything that counts by its sensor time (`runtime.rig.order`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from coec.calibration.rig.edge_observations import determined_covariance, observation_of_registration, window_of
+from coec.calibration.rig.graph import Edge
+from coec.calibration.rig.lidar_sampling import (
+    LEAST_SHARE,
+    LidarRig,
+    MissedSweep,
+    SampledSweeps,
+    SweepSampler,
+    SweepSet,
+)
+from coec.calibration.rig.rig_estimator import EdgeWindow
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, Rig
+from coec.config import LidarEdgesConfig, PairConfig
+from coec.io import nearest_neighbours
+from coec.io.rig_files import rig_of
+from coec.service.cpu_budget import Budget
+from coec.service.engine.rig_estimator_thread import (
+    LidarPairReport,
+    LidarPairStatus,
+    LidarState,
+    Registration,
+    RigEstimatorThread,
+    graph_of,
+    sensors_of,
+)
+from coec.service.ingest.decoder import EGO, LIDAR, Frame
+from coec.service.ingest.intake import Intake, SensorStream
+from coec.service.timing import NS_PER_S
+from coec.service.worker import worker_jobs
+from coec.service.worker.supervisor import Worker
+from coec.service.worker.worker_jobs import JobOutcome, Registered
+
+MAX_LIDAR_PAIRS = 6
+"""How many combinations of two LiDARs are looked at, in the order of the configuration: all those of four LiDARs. Each
+holds some twenty sweeps."""
+
+NOT_INSTALLED = Reason(
+    "lidars_not_installed",
+    "Not measured: the extra lidars is not installed. Add it (pip install 'coec[lidars]'), or set "
+    "`lidar_edges.period_s: 0`.",
+)
+SWITCHED_OFF = Reason("switched_off", "Not measured: `lidar_edges.period_s` is 0.")
+NO_EGO = Reason(
+    "no_ego_motion",
+    "Not measured: no `ego` is configured, and without ego-motion two sweeps of a moving vehicle are not of one "
+    "instant.",
+)
+NOT_JOINED = Reason(
+    "no_nominal_pose", "Not measured: no cameras and links join the two, so nothing tells where they were built."
+)
+TOO_MANY = Reason("too_many", f"Not measured: {MAX_LIDAR_PAIRS} pairs of LiDARs are looked at, and this is one more.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarOfPair:
+    """A LiDAR of a vehicle: its name, a pair that has it, and the rig of that pair."""
+
+    name: str
+    pair: PairConfig
+    rig: Rig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarPairPlan:
+    """Two LiDARs.
+
+    Attributes:
+        edge: the edge between them, with the pose as built.
+        why_not: why they are not looked at; None if they are.
+    """
+
+    edge: Edge
+    a: LidarOfPair
+    b: LidarOfPair
+    why_not: Reason | None
+
+    @property
+    def rig(self) -> LidarRig:
+        """The two LiDARs as input of a registration."""
+        a, b = self.a, self.b
+        return LidarRig(a.name, b.name, self.edge.T_a_b, a.rig.T_lidar_ego, a.rig.sweep, b.rig.sweep)
+
+
+def plan_lidar_pairs(pairs: Iterable[PairConfig], period_s: float) -> tuple[LidarPairPlan, ...]:
+    """Every two LiDARs of the pairs. The one that comes first in the configuration is a; if one LiDAR is larger, people
+    name it first.
+
+    Raises:
+        ConfigError: the rig of a pair cannot be built.
+    """
+    rigs = {pair.name: (pair, rig_of(pair)) for pair in pairs}
+    lidars: dict[str, LidarOfPair] = {}
+    for pair, rig in rigs.values():
+        name = sensors_of(pair)[1]
+        lidars.setdefault(name, LidarOfPair(name, pair, rig))
+    if len(lidars) < 2:
+        return ()
+    places = _places({name: (pair, rig.T_camera_lidar_nominal) for name, (pair, rig) in rigs.items()})
+    plans: list[LidarPairPlan] = []
+    for a, b in combinations(lidars.values(), 2):
+        T_a_b = places.get(b.name, {}).get(a.name)
+        edge = Edge(f"{a.name} to {b.name}", a.name, b.name, np.eye(4) if T_a_b is None else T_a_b)
+        why_not = NOT_JOINED if T_a_b is None else _why_not(a, period_s)
+        if why_not is None and sum(one.why_not is None for one in plans) >= MAX_LIDAR_PAIRS:
+            why_not = TOO_MANY
+        plans.append(LidarPairPlan(edge, a, b, why_not))
+    return tuple(plans)
+
+
+def _places(pairs: Mapping[str, tuple[PairConfig, Matrix4]]) -> dict[str, Mapping[str, Matrix4]]:
+    """T_sensor_origin (4, 4) by origin and sensor, for sensors that are joined by pairs; empty if there are more
+    sensors than a rig may have."""
+    try:
+        graph = graph_of(pairs, ())
+    except ValueError:
+        return {}
+    return {sensor.name: graph.joined_to(sensor.name) for sensor in graph.sensors}
+
+
+def _why_not(a: LidarOfPair, period_s: float) -> Reason | None:
+    if period_s == 0.0:
+        return SWITCHED_OFF
+    if not nearest_neighbours.installed():
+        return NOT_INSTALLED
+    return NO_EGO if a.pair.ego is None else None
+
+
+COUNTS_AFTER_NS = 15 * NS_PER_S
+"""Sensor time from a look until it counts. A registration takes half a second, and may wait behind the solve of a
+window."""
+
+SWEEP_SETS_WAITING = 2
+"""How many looks may wait for their turn, or for the answer to an earlier one."""
+
+RESTS = 7
+"""How many looks are left out after one that found next to nothing in common. Two LiDARs that do not overlap then cost
+only an eighth. If they overlap after all, in a narrow street, that is noticed within two minutes."""
+
+WEAK = Reason(
+    "surroundings_tell_nothing",
+    "What both see, such as open ground, tells no direction and no place better than it was known before.",
+)
+
+MISSED: Mapping[str, Reason] = {
+    "standing": Reason("vehicle_stands", "The vehicle stands: it sees again what it saw."),
+    "no_sweep": Reason("no_sweep", "There is no sweep of the one near in time to a sweep of the other."),
+    "no_ego_motion": Reason("no_ego_motion", "There is no ego-motion with a velocity at the time of the sweeps."),
+    "no_point_time": Reason(
+        "no_point_time", "Points are not timed, and the vehicle moves: `lidar.sweep` says how they are measured."
+    ),
+}
+
+
+@dataclass(slots=True, eq=False)
+class _PendingRegistration:
+    """A look that was asked for. `rests`: how many looks are left out after it, from its `due_ns` on; None until its
+    answer has come."""
+
+    due_ns: int
+    start_ns: int
+    stamp_ns: int
+    losses: Mapping[str, int]
+    rests: int | None = None
+
+
+class LidarPairStream:
+    """The looks at two LiDARs. Everything but `unanswered` belongs to the thread of the intake.
+
+    Attributes:
+        sensors: the streams of both LiDARs and of the vehicle's motion.
+        unanswered: number of looks that were asked for and have no answer; for any thread.
+    """
+
+    def __init__(
+        self,
+        lidars: LidarPairPlan,
+        period_s: float,
+        intake: Intake,
+        worker: Worker,
+        budget: Budget,
+        rig: RigEstimatorThread,
+    ):
+        a, b = lidars.a.pair, lidars.b.pair
+        assert a.ego is not None
+        self.sensors: Mapping[str, SensorStream] = {
+            "a": intake.sensor(LIDAR, a.lidar),
+            "b": intake.sensor(LIDAR, b.lidar),
+            EGO: intake.sensor(EGO, a.ego),
+        }
+        self.unanswered = 0
+        self._name = lidars.edge.name
+        self._lidars = lidars.rig
+        self._inbox = intake.inbox
+        self._worker = worker
+        self._budget = budget
+        self._rig = rig
+        self._sampler = SweepSampler(
+            period_s,
+            a.pairing.motion_tolerance_s,
+            a.pairing.max_stamp_jump_s,
+            a.window.min_speed_mps,
+            timed_a=a.lidar.sweep is not None,
+            timed_b=b.lidar.sweep is not None,
+        )
+        self._sweep_sets: deque[SweepSet] = deque()
+        self._pending: deque[_PendingRegistration] = deque()
+        self._losses: Counter[str] = Counter()
+        self._resting = 0
+        self._missed = ""
+        self._tried_ns: int | None = None
+        rig.join_lidars(LidarPairStatus(lidars.edge), lambda: self.unanswered == 0)
+        budget.join_checks(self._name, period_s)
+        intake.join(self)
+
+    # --- frames -----------------------------------------------------------------------------------------------------
+
+    def taker(self, name: str) -> Callable[[Frame], None]:
+        """See `intake.Takes`."""
+        return {"a": self._take_a, "b": self._take_b, EGO: self._take_motion}[name]
+
+    def _take_a(self, frame: Frame) -> None:
+        assert isinstance(frame, LidarFrame)
+        before_ns = self._sampler.latest_ns
+        sampled = self._sampler.push_a(frame)
+        now_ns = self._sampler.latest_ns
+        if now_ns == before_ns or now_ns is None:
+            return
+        if before_ns is not None and now_ns < before_ns:
+            self._begin_new_time()
+        self._hold(sampled)
+        self._report_time(now_ns)
+
+    def _take_b(self, frame: Frame) -> None:
+        assert isinstance(frame, LidarFrame)
+        self._hold(self._sampler.push_b(frame))
+
+    def _take_motion(self, frame: Frame) -> None:
+        assert isinstance(frame, EgoMotion)
+        self._hold(self._sampler.push_motion(frame))
+
+    def _hold(self, sampled: SampledSweeps) -> None:
+        for one in sampled:
+            if isinstance(one, MissedSweep):
+                self._miss(one)
+                continue
+            self._missed = ""
+            self._sweep_sets.append(one)
+            if len(self._sweep_sets) > SWEEP_SETS_WAITING:
+                self._sweep_sets.popleft()
+                self._losses["superseded" if self._tried_ns is None else "not_afforded"] += 1
+            self._tried_ns = None
+
+    def _miss(self, missed: MissedSweep) -> None:
+        """No look was possible; reports the cause to the rig if it is new."""
+        if missed.cause != self._missed:
+            self._missed = missed.cause
+            report = LidarPairReport(missed.stamp_ns, None, (MISSED[missed.cause],), self._lost())
+            self._rig.put(self._name, missed.stamp_ns + COUNTS_AFTER_NS, report)
+
+    # --- turns ------------------------------------------------------------------------------------------------------
+
+    def may_choose(self) -> bool:
+        """Whether a look waits, every answer that counts before it has come, and the budget did not refuse it just
+        now."""
+        if not self._sweep_sets or self._tried_ns == self._sampler.latest_ns:
+            return False
+        stamp_ns = self._sweep_sets[0].stamp_ns
+        return all(pending.rests is not None for pending in self._pending if pending.due_ns <= stamp_ns)
+
+    def choose_next(self) -> bool:
+        """Asks for the oldest waiting look, or leaves it out. Returns False if it still waits."""
+        if not self.may_choose():
+            return False
+        sweep_set = self._sweep_sets[0]
+        while self._pending and self._pending[0].due_ns <= sweep_set.stamp_ns:
+            self._resting = self._pending.popleft().rests or 0
+        if self._resting:
+            self._resting -= 1
+            self._losses["rested"] += 1
+        elif self._budget.try_acquire(self._name, sweep_set.stamp_ns, suspected=False):
+            self._submit(sweep_set)
+        else:
+            self._tried_ns = self._sampler.latest_ns
+            return False
+        self._sweep_sets.popleft()
+        return True
+
+    def tick(self, *, waiting: bool) -> None:
+        """Does nothing: nothing here waits for a clock."""
+
+    def _submit(self, sweep_set: SweepSet) -> None:
+        pending = _PendingRegistration(
+            sweep_set.stamp_ns + COUNTS_AFTER_NS, sweep_set.start_ns, sweep_set.stamp_ns, self._lost()
+        )
+        self._pending.append(pending)
+        self.unanswered += 1
+
+        def done(outcome: JobOutcome) -> None:
+            self._budget.release(self._name)
+            self._inbox.call(partial(self._answered, pending, outcome))
+
+        self._worker.submit(worker_jobs.register(self._name, self._lidars, sweep_set.pairs, done))
+
+    # --- answers ----------------------------------------------------------------------------------------------------
+
+    def _answered(self, pending: _PendingRegistration, outcome: JobOutcome) -> None:
+        self.unanswered -= 1
+        if pending not in self._pending:
+            return  # it was asked before sensor time stepped back
+        report, pending.rests = self._report_of(pending, outcome)
+        self._rig.put(self._name, pending.due_ns, report)
+        if self._sampler.latest_ns is not None:
+            self._report_time(self._sampler.latest_ns)
+
+    def _report_time(self, now_ns: int) -> None:
+        waits = any(pending.rests is None and pending.due_ns <= now_ns for pending in self._pending)
+        self._rig.report_time(self._name, now_ns, waits=waits)
+
+    def _report_of(self, pending: _PendingRegistration, outcome: JobOutcome) -> tuple[LidarPairReport, int]:
+        """The outcome of a look, and how many looks are to be left out after it."""
+        answer = outcome.answer
+        if not isinstance(answer, Registered):
+            reasons = () if outcome.reason is None else (outcome.reason,)
+            return LidarPairReport(pending.stamp_ns, None, reasons, pending.losses), 0
+        if answer.reasons:
+            rests = RESTS if answer.share < LEAST_SHARE else 0
+            return LidarPairReport(pending.stamp_ns, None, answer.reasons, pending.losses), rests
+        covariance = determined_covariance(answer.covariance)
+        if covariance is None:
+            return LidarPairReport(pending.stamp_ns, None, (WEAK,), pending.losses), 0
+        registration = Registration(
+            observation_of_registration(self._name, pending.stamp_ns, answer.T_a_b, covariance),
+            EdgeWindow(window_of(pending.stamp_ns, answer.T_a_b, covariance), pending.start_ns),
+            answer.range_bias,
+            answer.rms_m,
+            answer.points,
+            answer.share,
+        )
+        return LidarPairReport(pending.stamp_ns, registration, (), pending.losses), 0
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    def _begin_new_time(self) -> None:
+        """Sensor time has stepped back: drops all looks and questions, whose stamps mean nothing in the new time."""
+        self._losses["time_stepped_back"] += len(self._pending) + len(self._sweep_sets)
+        self._sweep_sets.clear()
+        self._pending.clear()
+        self._resting, self._missed, self._tried_ns = 0, "", None
+
+    def _lost(self) -> dict[str, int]:
+        return {cause: count for cause, count in (self._losses + self._sampler.losses).items() if count}
+
+
+class LidarPairs:
+    """The edges between all LiDARs of a vehicle. For the main thread.
+
+    Attributes:
+        trouble: why no LiDARs are looked at, if people can change that; else None.
+    """
+
+    def __init__(
+        self, config: LidarEdgesConfig, intake: Intake, worker: Worker, budget: Budget, rig: RigEstimatorThread
+    ) -> None:
+        self._period_s = config.period_s
+        self._intake = intake
+        self._worker = worker
+        self._budget = budget
+        self._rig = rig
+        self._names: set[str] = set()
+        self.problem: Reason | None = None
+
+    def grow(self, pairs: Iterable[PairConfig]) -> None:
+        """Takes all present pairs, which the rig knows already, and begins to look at every two of their LiDARs that
+        are new.
+
+        Raises:
+            ConfigError: the rig of a pair cannot be built.
+        """
+        for lidars in plan_lidar_pairs(pairs, self._period_s):
+            if lidars.edge.name in self._names:
+                continue
+            self._names.add(lidars.edge.name)
+            why_not = lidars.why_not
+            if why_not is None:
+                LidarPairStream(lidars, self._period_s, self._intake, self._worker, self._budget, self._rig)
+                continue
+            self._rig.join_lidars(LidarPairStatus(lidars.edge, LidarState.NOT_MEASURED, (why_not,)), lambda: True)
+            if why_not is NOT_INSTALLED:
+                self.problem = why_not

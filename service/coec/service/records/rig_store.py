@@ -1,0 +1,234 @@
+"""The file `sensors.json` keeps over a restart what is known of a rig: where its pairs were, which of its sensors had
+moved, and what was known before they did.
+
+If a sensor is knocked while the service is down, the first looks after the start show it. The file may be of another
+version of the software: an edge, or the move of a sensor, that cannot be read falls back alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from dataclasses import replace
+from math import isfinite
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from coec.calibration.rig import attribution, rig_estimator
+from coec.calibration.rig.attribution import RigState
+from coec.calibration.rig.edge_observations import MOST_SIGMA, EdgeHistory, information_of
+from coec.calibration.rig.graph import MOST_SENSORS
+from coec.calibration.rig.joint_estimate import PreMoveKnowledge
+from coec.calibration.rig.rig_estimator import MoveEvent, VehicleRig
+from coec.calibration.tracker import Measurement
+from coec.calibration.types import Matrix4, Reason, Uncertainty
+from coec.errors import StateError
+from coec.geometry import se3
+from coec.io.storage import StateFile
+from coec.schemas.message import Part
+from coec.schemas.replies import Maybe6x6, Row4, Vector6
+
+RIG_FILE = "sensors.json"
+
+MOST_PAIRS = 128
+"""Most pairs that a file may hold to be read: twice as many as a vehicle may have, and as many edges between its
+LiDARs."""
+
+MOST_TERMS = 32
+"""Most terms of a covariance that a file may hold to be read: three times as many as there are."""
+
+Rows = tuple[Row4, Row4, Row4, Row4]
+Sigma = Annotated[float, Field(gt=0, lt=MOST_SIGMA)]
+Stamp = Annotated[int, Field(gt=-(2**63), lt=2**63)]
+Name = Annotated[str, Field(max_length=256)]
+
+
+class StoredEdge(Part):
+    """A pair: its nominal calibration, and its pose before the looks that were kept, with standard deviations."""
+
+    nominal: Rows
+    T_camera_lidar: Rows
+    sigma: tuple[Sigma | None, Sigma | None, Sigma | None, Sigma | None, Sigma | None, Sigma | None]
+
+
+class StoredKnown(Part):
+    """The pose of a pair by all its windows, exactly; its covariance is in parts, like that of a window."""
+
+    T_camera_lidar: Rows
+    noise: Maybe6x6
+    systematic: dict[Name, Vector6] = Field(max_length=MOST_TERMS)
+    stamp_ns: Stamp
+
+
+class StoredEvent(Part):
+    """A move that is not over, and what was known before it of the pairs of its sensors."""
+
+    sensors: tuple[Name, ...] = Field(min_length=1, max_length=MOST_SENSORS)
+    since_ns: Stamp
+    stepped_ns: Stamp
+    named: tuple[Name, ...] = Field(max_length=MOST_SENSORS)
+    before: dict[Name, StoredKnown] = Field(default={}, max_length=MOST_PAIRS)
+
+
+class StoredRig(Part):
+    """The file: of every edge a `StoredEdge`, and a `StoredEvent` or null."""
+
+    edges: dict[Name, Any] = Field(max_length=MOST_PAIRS)
+    event: Any = None
+
+
+class RigStore:
+    """The file of one rig. `recalled` and `remember` belong to the rig's thread, `flush` to the one that waits for the
+    disk.
+
+    Attributes:
+        damage: what was wrong with the file at the start; empty if nothing was.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._file = StateFile(folder / RIG_FILE)
+        self._lock = threading.Lock()
+        self._body: dict[str, Any] | None = None
+        loaded = self._file.load()
+        self._on_disk = loaded.body
+        damage = [*loaded.damage]
+        self._edges: dict[str, StoredEdge] = {}
+        self._event: StoredEvent | None = None
+        refused = [] if loaded.body is None else self._read(loaded.body)
+        if refused:
+            self._file.reject()
+            self._on_disk = None
+            why = "not in the form of this version, or with a pose that is no rigid transform"
+            damage.append(f"{RIG_FILE}: {', '.join(refused)} ({why})")
+        text = (
+            f"Something that was known of the rig cannot be used: {'; '.join(damage)}. The file is kept aside, what is "
+            "missing is learnt anew, and everything else is kept."
+        )
+        self.damage = (Reason("rig_state_damaged", text),) if damage else ()
+
+    def _read(self, body: dict[str, Any]) -> list[str]:
+        """Reads the edges and the event, each by itself. Returns what could not be read."""
+        try:
+            stored = StoredRig.model_validate(body)
+        except ValidationError:
+            return ["everything"]
+        for name, edge in stored.edges.items():
+            with contextlib.suppress(ValueError):  # of which a ValidationError is one
+                self._edges[name] = _sound_edge(StoredEdge.model_validate(edge))
+        with contextlib.suppress(ValueError):
+            self._event = None if stored.event is None else _sound_event(StoredEvent.model_validate(stored.event))
+        unread = len(stored.edges) - len(self._edges)
+        edges = [f"{unread} of {len(stored.edges)} edges"] if unread else []
+        return edges if self._event is not None or stored.event is None else [*edges, "the move of a sensor"]
+
+    def restored(self, rig: VehicleRig) -> VehicleRig:
+        """Adds to a fresh rig, before any look, what was known before the restart."""
+        histories = dict(rig.believed.histories)
+        for name, edge in rig.graph.edge.items():
+            stored = self._edges.get(name)
+            # With another nominal calibration the mount is another one.
+            if stored is not None and np.array_equal(_pose(stored.nominal), edge.T_a_b):
+                sigma = np.array([np.nan if value is None else value for value in stored.sigma])
+                histories[name] = EdgeHistory.at(_pose(stored.T_camera_lidar), sigma)
+        event = self._event
+        if event is None or not set(event.sensors) <= set(rig.graph.place):
+            return replace(rig, believed=RigState(histories))
+        named = frozenset(event.named) & frozenset(event.sensors)
+        going_on = MoveEvent(event.sensors, event.since_ns, event.stepped_ns)
+        known = {name: _measurement(one) for name, one in event.before.items() if name in rig.graph.edge}
+        believed = RigState(histories, stepped_ns=event.stepped_ns, named=named)
+        return rig_estimator.resumed(replace(rig, believed=believed), going_on, PreMoveKnowledge(event.sensors, known))
+
+    def update(self, rig: VehicleRig) -> None:
+        """Keeps what is known; the next `flush` writes it."""
+        edges = {}
+        for name, edge in rig.graph.edge.items():
+            whole_history = rig.believed.histories[name]
+            history = whole_history.counted() if rig.believed.calm else whole_history
+            sigma = [float(value) if 0.0 < value < MOST_SIGMA else None for value in history.sigma.tolist()]
+            edges[name] = {"nominal": edge.T_a_b.tolist(), "T_camera_lidar": history.pose.tolist(), "sigma": sigma}
+        event = rig.event
+        event_document = None
+        if event is not None:
+            event_document = {
+                "sensors": list(event.sensors),
+                "since_ns": event.since_ns,
+                "stepped_ns": max(event.stepped_ns, attribution.BEFORE_ALL_NS),
+                "named": sorted(rig.believed.named),
+                "before": {} if rig.before is None else {name: _stored(of) for name, of in rig.before.edges.items()},
+            }
+        with self._lock:
+            self._body = {"edges": edges, "event": event_document}
+
+    def flush(self) -> None:
+        """Writes what is kept to the disk, and what was written before if the file is gone.
+
+        Raises:
+            StateError: the disk refuses; the next call tries again.
+        """
+        with self._lock:
+            body, self._body = self._body, None
+        if body is None and not self._file.exists():
+            body = self._on_disk
+        if body is None:
+            return
+        try:
+            self._file.save(body)
+        except StateError:
+            with self._lock:
+                self._body = body if self._body is None else self._body
+            raise
+        self._on_disk = body
+
+
+def _sound_edge(edge: StoredEdge) -> StoredEdge:
+    """The edge, with its poses checked: the checksum does not prove that this service wrote it.
+
+    Raises:
+        ValueError: a pose is no rigid transform.
+    """
+    if not (se3.is_rigid(_pose(edge.nominal)) and se3.is_rigid(_pose(edge.T_camera_lidar))):
+        raise ValueError("a pose is no rigid transform")
+    return edge
+
+
+def _sound_event(event: StoredEvent) -> StoredEvent:
+    """The event, with its poses and covariances checked likewise.
+
+    Raises:
+        ValueError: a pose is no rigid transform, or a matrix is no covariance.
+    """
+    for known in event.before.values():
+        measured = _measurement(known)
+        if not se3.is_rigid(measured.T_camera_lidar):
+            raise ValueError("a pose is no rigid transform")
+        information_of(measured.uncertainty.noise)
+        if any(abs(value) >= MOST_SIGMA for shift in known.systematic.values() for value in shift):
+            raise ValueError("a shift is larger than any that is estimated")
+    return event
+
+
+def _stored(known: Measurement) -> dict[str, Any]:
+    noise = [[value if isfinite(value) else None for value in row] for row in known.uncertainty.noise.tolist()]
+    systematic = {name: shift.tolist() for name, shift in known.uncertainty.systematic.items()}
+    return {
+        "T_camera_lidar": known.T_camera_lidar.tolist(),
+        "noise": noise,
+        "systematic": systematic,
+        "stamp_ns": known.stamp_ns,
+    }
+
+
+def _measurement(stored: StoredKnown) -> Measurement:
+    """The measurement on the disk. How many looks its windows were worth is not kept, because it does not matter for a
+    mount that has moved since."""
+    noise = np.array([[np.nan if value is None else value for value in row] for row in stored.noise])
+    systematic = {name: np.array(shift) for name, shift in stored.systematic.items()}
+    return Measurement(_pose(stored.T_camera_lidar), Uncertainty(noise, systematic, np.nan), stored.stamp_ns)
+
+
+def _pose(rows: Rows) -> Matrix4:
+    return np.array(rows, dtype=np.float64)

@@ -1,0 +1,63 @@
+"""What all pairs of a vehicle share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from coec.calibration.types import FramePair, Matrix4, Reason
+from coec.config import PairConfig
+from coec.io.disk_writer import DiskWriter
+from coec.io.zenoh.bus import Answer
+from coec.io.zenoh.ros_node import RosTopicList
+from coec.schemas.keys import Keys
+from coec.service.cpu_budget import Budget
+from coec.service.discovery_listener import NominalStatus
+from coec.service.engine.rig_estimator_thread import RigEstimatorThread
+from coec.service.ingest.intake import Intake
+from coec.service.recording.snippets import SnippetStore
+from coec.service.recording.window_store import WindowStore
+from coec.service.records.state_store import StateStore
+from coec.service.worker.supervisor import Worker
+
+
+def configured_nominal(pair: str) -> NominalStatus:
+    """Default of `Outside.nominal`: the pair's configuration gives its nominal calibration."""
+    del pair
+    return NominalStatus()
+
+
+def no_rig_problems(pair: str) -> tuple[Reason, ...]:
+    """Default of `Outside.rig_troubles`: the pair contradicts no other."""
+    del pair
+    return ()
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleContext:
+    """Everything that a pair shares with the others. The callables may be called from any thread.
+
+    Attributes:
+        intake: takes the samples of all pairs.
+        show: `show(pair, drawn, pose)` reports a pair of frames that is being checked at an extrinsic (4, 4).
+        topics: the topics that the vehicle's ROS publishes now.
+        nominal: where the nominal calibration of a pair, given by name, comes from.
+        rig_troubles: in what a pair, given by name, contradicts the vehicle's other pairs.
+        snippets: store for the seconds around an event; None: they are not kept.
+    """
+
+    keys: Keys
+    intake: Intake
+    store: StateStore
+    disk_writer: DiskWriter
+    folder: WindowStore
+    worker: Worker
+    budget: Budget
+    rig: RigEstimatorThread
+    publish: Callable[[str, Answer], None]
+    vehicle_problems: Callable[[], tuple[Reason, ...]]
+    show: Callable[[PairConfig, FramePair, Matrix4], None]
+    topics: Callable[[], RosTopicList]
+    nominal: Callable[[str], NominalStatus] = configured_nominal
+    rig_problems: Callable[[str], tuple[Reason, ...]] = no_rig_problems
+    snippets: SnippetStore | None = None

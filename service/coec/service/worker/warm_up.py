@@ -1,0 +1,180 @@
+"""The warm-up of a worker: runs every kernel once on a few invented points, so that no work waits for a compiler. What
+a check needs comes first, because windows take longer to come. The kernels that a solve uses after its edges are
+extracted take half of the compiling time; `late_kernels` runs each of them on tiny inputs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose
+from coec.calibration.objective.mutual_information import SearchBox
+from coec.calibration.pipeline import calibrate
+from coec.calibration.ports import Silence
+from coec.calibration.search.global_search import sample_reach
+from coec.calibration.types import (
+    CameraFrame,
+    DepthMap,
+    EgoMotion,
+    EncodedImage,
+    FramePair,
+    ImageFormat,
+    LidarFrame,
+    Rig,
+    Window,
+)
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError, DecodeError
+from coec.geometry.cameras import Camera, scaled
+from coec.geometry.edges.alignment import (
+    AscentStart,
+    EdgeFrames,
+    alignment_of_parts,
+    alignments,
+    alignments_of_late,
+    ascend,
+    significances,
+)
+from coec.geometry.edges.charts import charted_significances, edge_charts, pattern_search, select_separated
+from coec.geometry.mutual_information import BinnedFrames, information_of_each, mutual_information, share_of_pixels
+from coec.geometry.projection import project
+from coec.io.images import GreyImages, encode_jpeg
+
+LATE_CAMERA_PX = 64
+"""Longer side of the image: kernels are compiled for types, not for sizes."""
+
+BLUR_RAD = 0.1
+"""Blur that gives a chart of few cells, rad."""
+
+
+def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
+    """The functions to run; those that a solve needs last come first."""
+    scale = min(1.0, LATE_CAMERA_PX / max(camera.width, camera.height))
+    camera = scaled(camera, scale, scale)
+    edges, pose = one_edge(camera), np.eye(4)
+    two, point = np.stack([pose, pose]), np.zeros((3, 1), np.float32)
+    charts = edge_charts(camera, edges.maps, BLUR_RAD, edges.xyz_m, edges.weight, np.zeros(1, np.int64))
+    steps, reach = np.full(6, 0.01), np.array([0.01, 0.01])
+    binned = _binned(camera)
+    values = np.ones((camera.height, camera.width), np.float32)
+    return (
+        lambda: ascend(edges, [AscentStart(pose, 0, 1)], pose[None, None]),
+        lambda: alignments_of_late(edges, point, point, point.T, two),
+        lambda: pattern_search(charts, two, steps, 1, pose, reach),
+        lambda: charted_significances(charts, two),
+        lambda: information_of_each(binned, two),
+        lambda: mutual_information(binned, pose),
+        lambda: share_of_pixels(values, values > 0.0, np.ones(1, np.float32)),
+        lambda: significances(edges, two),
+        lambda: sample_reach(pose, SearchBox(0.1, 0.0), 8),
+        lambda: select_separated(two, np.arange(2), 1, 3.0),
+        lambda: alignments(edges, two),
+        lambda: alignment_of_parts(edges, np.zeros(1, np.uint8), 1, two),
+        lambda: project(camera, np.ones((1, 3))),
+    )
+
+
+def one_edge(camera: Camera) -> EdgeFrames:
+    """Input with one range edge, and an image without edges."""
+    maps = np.zeros((1, camera.height, camera.width), np.int8)
+    return EdgeFrames(camera, np.ones((3, 1), np.float32), np.ones(1, np.float32), np.array([0, 1]), maps)
+
+
+def _binned(camera: Camera) -> BinnedFrames:
+    """Input with one point, and an image of a single depth."""
+    return BinnedFrames(
+        camera=camera,
+        xyz_m=np.ones((3, 1), np.float32),
+        range_bin=np.zeros(1, np.uint8),
+        first_point=np.array([0, 1]),
+        depth_bin=np.zeros((1, camera.height * camera.width + 1), np.uint8),
+        depth_bins=1,
+        range_bins=1,
+    )
+
+
+POINTS = 4000
+DEPTH_PX = (48, 64)
+
+CAMERA_PX = 128
+"""Longer side of the images of the warm-up. Kernels are compiled for types, not for sizes, and a few milliseconds of
+work at this size would be more than a second at the size of a camera's images."""
+
+EVALUATIONS, REACH_DEG = 4, 4.0
+"""Limits of the searches of the warm-up."""
+
+
+def warm_up_check(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> None:
+    """Runs the kernels that a check of one pair uses."""
+    rig = small(rig)
+    with contextlib.suppress(CalibrationError, DecodeError):
+        diagnose(invented_window(rig), _Ramp(), images, _short(calibration), None)
+
+
+def warm_up_solve(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> Iterator[None]:
+    """Runs the kernels that the solve of a window of one pair uses, a few seconds of compiling in each step."""
+    rig = small(rig)
+    for run in reversed(late_kernels(rig.camera)):
+        run()
+        yield
+    with contextlib.suppress(CalibrationError, DecodeError):
+        calibrate(invented_window(rig), _Ramp(), images, _short(calibration), Silence())
+    # These two kernels compute the uncertainty of a result, and an invented window need not give a result.
+    project(rig.camera, np.ones((1, 3)))
+    alignment_of_parts(one_edge(rig.camera), np.zeros(1, np.uint8), 1, np.eye(4)[None])
+    yield
+
+
+def _short(calibration: CalibrationConfig) -> CalibrationConfig:
+    search = calibration.search.model_copy(update={"max_evaluations": EVALUATIONS, "reach_deg": REACH_DEG})
+    return calibration.model_copy(update={"search": search})
+
+
+class _Ramp:
+    """A depth network that gives the same map for every image: depth grows from left to right."""
+
+    @property
+    def identity(self) -> str:
+        return "warm-up"
+
+    def infer(self, frame: CameraFrame) -> DepthMap:
+        del frame
+        height, width = DEPTH_PX
+        return DepthMap(np.tile(np.linspace(1.0, 2.0, width, dtype=np.float32), (height, 1)))
+
+
+def small(rig: Rig) -> Rig:
+    """The rig with a camera of fewer pixels and the same field of view. One corner is masked, so that code for the
+    borders of masks runs, too."""
+    scale = min(1.0, CAMERA_PX / max(rig.camera.width, rig.camera.height))
+    camera = scaled(rig.camera, scale, scale)
+    mask = np.ones((camera.height, camera.width), np.bool_)
+    mask[0, 0] = False
+    return replace(rig, camera=camera, mask=mask)
+
+
+def invented_window(rig: Rig) -> Window:
+    """A window with random points all around the LiDAR, from a fixed seed. Its arrays are like those of a window from
+    the disk, so that the kernels are compiled for the same types: read-only sweeps, images from a decoder, motion to
+    compensate."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(POINTS, 3))
+    range_m = rng.uniform(5.0, 30.0, size=(POINTS, 1))
+    xyz_m = (range_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    xyz_m.setflags(write=False)
+    width, height = rig.camera.width, rig.camera.height
+    jpeg = encode_jpeg(rng.integers(0, 256, (height, width), np.uint8))
+    image = EncodedImage(ImageFormat.JPEG, width, height, jpeg)
+    pairs = tuple(
+        FramePair(
+            CameraFrame(stamp, rig.camera_frame, image),
+            LidarFrame(stamp, rig.lidar_frame, xyz_m),
+            EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
+        )
+        for stamp in range(0, MIN_PAIRS * 100_000_000, 100_000_000)
+    )
+    return Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)

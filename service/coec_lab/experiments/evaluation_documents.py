@@ -1,0 +1,143 @@
+"""Converts the statistics of an evaluation to wire models: degrees instead of radians, null instead of NaN."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from math import degrees
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.schemas.replies import Maybe6
+from coec_lab.experiments import evaluation_schema as wire
+from coec_lab.experiments import mount_steps, solve_statistics
+from coec_lab.experiments.closure import Closure
+from coec_lab.experiments.detection import TriedCheck, table
+from coec_lab.experiments.mount_steps import MountStepTrial
+from coec_lab.experiments.solve_statistics import BIN_EDGES, CONFIDENCES, Halves, NormalisedErrors
+
+
+def spread_of(spread: solve_statistics.SpreadStatistics, scale: float = 1.0) -> wire.Spread:
+    """The spread of a figure, times `scale`."""
+    return wire.Spread(
+        median=number(scale * spread.median), p95=number(scale * spread.p95), max=number(scale * spread.max)
+    )
+
+
+def angle_spread_of(spread_rad: solve_statistics.SpreadStatistics) -> wire.Spread:
+    """The spread of an angle, radians, in degrees."""
+    return spread_of(spread_rad, degrees(1.0))
+
+
+def verdicts_of(verdicts: solve_statistics.Verdicts) -> wire.VerdictCounts:
+    """The same counts."""
+    return wire.VerdictCounts(**asdict(verdicts))
+
+
+def frames_point_of(point: solve_statistics.FrameCountStatistics) -> wire.FramesPoint:
+    """Errors of windows of one number of frames."""
+    return wire.FramesPoint(
+        frames=point.frames,
+        subsets=point.subsets,
+        hit_rate=point.hit_rate,
+        rotation_deg=angle_spread_of(point.rotation_rad),
+        translation_m=spread_of(point.translation_m),
+        sigma_deg=number(degrees(point.sigma_rad)),
+    )
+
+
+def slice_point_of(point: solve_statistics.SliceStatistics) -> wire.SlicePoint:
+    """Errors of windows from slices of one length."""
+    return wire.SlicePoint(
+        length_s=point.length_s,
+        slices=point.slices,
+        pairs=point.frames,
+        solves=point.solves,
+        hit_rate=point.hit_rate,
+        rotation_deg=angle_spread_of(point.rotation_rad),
+        translation_m=spread_of(point.translation_m),
+        sigma_deg=number(degrees(point.sigma_rad)),
+    )
+
+
+def halves_of(halves: Halves) -> wire.HalvesReport:
+    """Differences between halves."""
+    return wire.HalvesReport(
+        splits=halves.splits,
+        pairs=halves.pairs,
+        solved=halves.solved,
+        accepted=halves.accepted,
+        hits=halves.hits,
+        rms=in_degrees(halves.rms),
+        largest=in_degrees(halves.largest),
+        sigma=in_degrees(halves.sigma),
+        claimed=cast("wire.Counts6", tuple(int(count) for count in halves.claimed)),
+        covered=cast("Maybe6", tuple(_numbers(halves.covered))),
+    )
+
+
+def detection_of(tried: Sequence[TriedCheck], splits: int, pairs: int) -> wire.DetectionReport:
+    """The checks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
+    moves = tuple(wire.DetectionRow(**asdict(row)) for row in table(tried))
+    return wire.DetectionReport(splits=splits, pairs=pairs, moves=moves)
+
+
+def steps_of(tried: Sequence[MountStepTrial]) -> tuple[wire.StepRow, ...]:
+    """The windows of `try_knocks`, counted by knock."""
+    return tuple(wire.StepRow(**asdict(row)) for row in mount_steps.table(tried))
+
+
+def normalised_of(against: str, errors: NormalisedErrors) -> wire.NormalisedErrorsReport:
+    """Normalised errors, relative to what `against` names."""
+    within = [cast("Maybe6", tuple(_numbers(row))) for row in errors.coverage]
+    low, high = errors.nees_bounds
+    return wire.NormalisedErrorsReport(
+        against=against,
+        judged=errors.judged,
+        refused=errors.refused,
+        independent=errors.independent,
+        rms=in_degrees(errors.rms),
+        largest=in_degrees(errors.largest),
+        sigma=in_degrees(errors.sigma),
+        sigma_over_rms=cast("Maybe6", tuple(_numbers(errors.sigma_over_rms))),
+        within_1_sigma=within[0],
+        within_2_sigma=within[1],
+        within_3_sigma=within[2],
+        bin_edges=BIN_EDGES,
+        histogram=tuple(tuple(int(count) for count in row) for row in errors.histogram),
+        confidences=CONFIDENCES,
+        reliability=tuple(tuple(_numbers(column)) for column in errors.reliability.T),
+        nees=number(errors.nees),
+        nees_low=number(low),
+        nees_high=number(high),
+    )
+
+
+def closure_of(closure: Closure) -> wire.ClosureGroup:
+    """Closure errors on some frames."""
+    pairs_a, pairs_b = closure.pairs
+    return wire.ClosureGroup(
+        frames=closure.frames.value,
+        pairs_a=pairs_a,
+        pairs_b=pairs_b,
+        errors=normalised_of("the known pose between both", closure.normalised),
+        rotation_deg=angle_spread_of(closure.rotation_rad),
+        translation_m=spread_of(closure.translation_m),
+    )
+
+
+def in_degrees(rad_m: NDArray[np.float64]) -> Maybe6:
+    """(6,) radians and metres to degrees and metres, None where there is no figure."""
+    return cast("Maybe6", tuple(_numbers(np.concatenate([np.degrees(rad_m[:3]), rad_m[3:]]))))
+
+
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    return [number(float(value)) for value in values]
+
+
+def number(value: float) -> float | None:
+    """The value, or None where it is not finite."""
+    return value if math.isfinite(value) else None

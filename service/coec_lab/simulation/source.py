@@ -1,0 +1,192 @@
+"""A simulated drive as a SOURCE: `sim:seed=1&seconds=60&camera=fisheye700&faults=step:30:rx=3;dark:50-55`."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from typing import TYPE_CHECKING
+
+from coec.errors import SourceError, UsageError
+from coec_lab.simulation.faults import parse_fault, parse_sensor_fault
+
+if TYPE_CHECKING:
+    from coec_lab.simulation.drive import DriveConfig, SimulatedDrive
+    from coec_lab.simulation.rig_drive import RigDrive, SimulatedRigPair
+
+NUMBERS: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**31 - 1),
+    "seconds": (0.1, 86400),
+    "half_view_deg": (20, 110),
+    "camera_hz": (0.01, 100),
+    "lidar_hz": (0.01, 10),
+    "ego_hz": (0.1, 1000),
+    "camera_delay_s": (0, 1),
+    "start_m": (0, 1e6),
+    "speed_mps": (0, 45),
+    "go_s": (1, 86400),
+    "stop_s": (0, 86400),
+    "rolling_shutter_s": (0, 0.1),
+}
+"""Query keys with a number, and its least and greatest value. The defaults are those of `DriveConfig`."""
+WHOLE = ("seed",)
+NAMES = ("scene", "camera", "lidar")
+"""Query keys with a name; `DriveConfig` says which names exist."""
+SWITCHES = ("depth", "traffic")
+TEXT_KEYS = (*NAMES, *SWITCHES, "faults", "workshop", "intrinsics_off")
+
+
+MOST_OFF_PERCENT = 20.0
+"""Intrinsics that are wrong by more than this belong to another camera."""
+
+
+def open_sim(query: dict[str, str]) -> SimulatedDrive:
+    """The drive of `sim:KEY=VALUE&...`, see `drive_config_of`.
+
+    Raises:
+        UsageError: an unknown key, or a value that does not fit; names the key.
+        SourceError: the optional extra is not installed.
+    """
+    config = drive_config_of(query)
+    from coec_lab.simulation.drive import SimulatedDrive
+
+    return SimulatedDrive(config)
+
+
+def drive_config_of(query: dict[str, str]) -> DriveConfig:
+    """The configuration that `sim:KEY=VALUE&...` describes; every key may be left out.
+
+    `faults` are separated by `;` (see `faults.FORMS`), `workshop` is rx,ry,rz[,tx,ty,tz] in degrees and metres,
+    `intrinsics_off` is FOCAL[,CX,CY] in percent, `depth` and `traffic` are `yes` or `no`.
+
+    Raises:
+        UsageError: an unknown key, or a value that does not fit; names the key.
+        SourceError: the optional extra is not installed.
+    """
+    require_extra()
+    from coec_lab.simulation.drive import DriveConfig
+
+    known = (*NUMBERS, *TEXT_KEYS)
+    if unknown := sorted(set(query) - set(known)):
+        raise UsageError(f"unknown query key {', '.join(unknown)} of a simulated drive; known: {', '.join(known)}")
+    values = _values(query)
+    if "faults" in query:
+        values["faults"] = tuple(parse_fault(text) for text in query["faults"].split(";"))
+    if "workshop" in query:
+        values["workshop"] = _six(query["workshop"])
+    if "intrinsics_off" in query:
+        values["intrinsics_off"] = _three(query["intrinsics_off"])
+    return DriveConfig(**values)  # type: ignore[arg-type]  # checked key by key above
+
+
+def require_extra() -> None:
+    """Raises SourceError, which says what to install, if ray casting is not installed."""
+    if importlib.util.find_spec("embreex") is None:
+        raise SourceError("a simulated drive needs the optional extra `sim`: pip install 'coec[sim]'")
+
+
+RIG_KEYS = (
+    *("seed", "seconds", "camera_hz", "lidar_hz", "ego_hz", "start_m", "speed_mps"),
+    *("rig", "pair", "scene", "camera", "depth", "traffic", "faults", "workshop"),
+)
+"""Query keys of a rig; numbers have the limits of `NUMBERS`."""
+
+
+def open_rig(query: dict[str, str]) -> RigDrive:
+    """The drive of `sim:rig=four-fisheyes&KEY=VALUE&...`; all keys but `rig` may be left out, `pair` is ignored.
+
+    `faults` are separated by `;`; those of a sensor begin with its name (see `faults.parse_sensor_fault`). `workshop`
+    is SENSOR:rx,ry,rz[,tx,ty,tz] in degrees and metres about the sensor's axes, separated by `;`.
+
+    Raises:
+        UsageError: an unknown key, or a value that does not fit; names the key.
+        SourceError: the optional extra is not installed.
+    """
+    require_extra()
+    from coec_lab.simulation.rig_drive import RIGS, RigDrive, RigDriveConfig
+
+    if unknown := sorted(set(query) - set(RIG_KEYS)):
+        raise UsageError(f"unknown query key {', '.join(unknown)} of a simulated rig; known: {', '.join(RIG_KEYS)}")
+    if query["rig"] not in RIGS:
+        raise UsageError(f"there is no rig {query['rig']!r}; choose one of {', '.join(RIGS)}")
+    layout = RIGS[query["rig"]]
+    values = _values({key: value for key, value in query.items() if key not in ("rig", "pair", "lidar")})
+    if not query.get("camera", "fisheye").startswith("fisheye"):
+        raise UsageError(f"camera={query['camera']}: this rig has fisheyes; write fisheye700 (any width)")
+    if "faults" in query:
+        cameras, lidars = ([sensor.name for sensor in kind] for kind in (layout.cameras, layout.lidars))
+        values["faults"] = tuple(parse_sensor_fault(text, cameras, lidars) for text in query["faults"].split(";"))
+    if "workshop" in query:
+        parts = [part.partition(":") for part in query["workshop"].split(";")]
+        if not all(colon for _, colon, _ in parts):
+            raise UsageError(f"workshop={query['workshop']} of a rig: of which sensor? Write roof:0,0,1;front:0,1,0")
+        values["workshop"] = tuple((sensor, _six(numbers)) for sensor, _, numbers in parts)
+    return RigDrive(RigDriveConfig(layout, **values))  # type: ignore[arg-type]  # checked key by key above
+
+
+def open_pair_of_rig(query: dict[str, str]) -> SimulatedRigPair:
+    """The recording of `sim:rig=...&pair=CAMERA-LIDAR&...`.
+
+    Raises:
+        UsageError, SourceError: as `open_rig`, and if `pair` is missing or there is no such pair.
+    """
+    drive = open_rig(query)
+    pairs = [f"{camera}-{lidar}" for camera, lidar in drive.config.layout.pairs]
+    if query.get("pair") not in pairs:
+        raise UsageError(f"one pair of the rig is a recording: write pair=... with one of {', '.join(pairs)}")
+    camera, _, lidar = query["pair"].partition("-")
+    return drive.pair(camera, lidar)
+
+
+def _values(query: dict[str, str]) -> dict[str, object]:
+    """Numbers, names and switches of a query.
+
+    Raises:
+        UsageError: a value that does not fit; names the key.
+    """
+    values: dict[str, object] = {key: _number(key, query[key]) for key in NUMBERS if key in query}
+    values |= {key: int(query[key]) for key in WHOLE if key in query}
+    values |= {key: query[key] for key in NAMES if key in query}
+    for key in SWITCHES:
+        if key in query:
+            if query[key] not in ("yes", "no"):
+                raise UsageError(f"{key}={query[key]} of a simulated drive: write yes or no")
+            values[key] = query[key] == "yes"
+    return values
+
+
+def _number(key: str, text: str) -> float:
+    low, high = NUMBERS[key]
+    try:
+        value = float(int(text)) if key in WHOLE else float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        kind = "a whole number" if key in WHOLE else "a number"
+        raise UsageError(f"{key}={text} of a simulated drive: expected {kind} from {low:.10g} to {high:.10g}")
+    return value
+
+
+def _six(text: str) -> tuple[float, ...]:
+    numbers = _numbers(text)
+    if len(numbers) not in (3, 6):
+        raise UsageError(f"workshop={text} of a simulated drive: write rx,ry,rz or rx,ry,rz,tx,ty,tz (degrees, metres)")
+    return (*numbers, 0.0, 0.0, 0.0)[:6]
+
+
+def _three(text: str) -> tuple[float, ...]:
+    numbers = _numbers(text)
+    if len(numbers) not in (1, 3) or max(map(abs, numbers)) > MOST_OFF_PERCENT:
+        raise UsageError(
+            f"intrinsics_off={text} of a simulated drive: write FOCAL or FOCAL,CX,CY in percent, "
+            f"each {MOST_OFF_PERCENT:g} at most"
+        )
+    return (*numbers, 0.0, 0.0)[:3]
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """The numbers of a comma-separated list; empty if one of them is not a finite number."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return ()
+    return numbers if all(math.isfinite(number) for number in numbers) else ()
