@@ -110,12 +110,16 @@ _ADDED = ("evaluate",)
 
 TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than everything here
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
     from coec import client
     from coec.api import calibrate, open
     from coec.calibration_options import CalibrationOptions, SolverOptions
     from coec.config import CalibrationConfig
     from coec.recording import Description, Recording, Result, Window
-    from coec_lab.experiments.evaluation_run import evaluate  # until it is an entry point of another package
+
+    evaluate: Callable[..., Any]  # of another package
 else:  # hidden from type checkers: with this function in sight they would accept every misspelt name
 
     def __getattr__(name: str) -> object:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from importlib.metadata import entry_points
 from os import PathLike, fspath
 from typing import Any, Unpack
@@ -15,9 +14,6 @@ from coec.recording import Recording, Result, Window
 
 GROUP = "coec.api"
 """Group of entry points by which another package adds a function to `coec`: its name, and `module:function`."""
-
-# To be removed when the laboratory is a package of its own and registers its function.
-IN_THIS_PACKAGE = {"evaluate": "coec_lab.experiments.evaluation_run"}
 
 
 def open(source: str | PathLike[str]) -> Recording:
@@ -81,9 +77,6 @@ def added(name: str) -> Callable[..., Any]:
 
     Without such a package it is a function that raises UsageError, which names what to install.
     """
-    if name in IN_THIS_PACKAGE:
-        in_this_package: Callable[..., Any] = getattr(import_module(IN_THIS_PACKAGE[name]), name)
-        return in_this_package
     for point in entry_points(group=GROUP, name=name):
         function: Callable[..., Any] = point.load()
         return function

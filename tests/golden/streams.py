@@ -33,6 +33,24 @@ def entries(bench: PairBench) -> list[dict[str, Any]]:
     return [entry.model_copy(update=changed).model_dump(mode="json") for entry in bench.entries("state", "extrinsic")]
 
 
+def evidence(bench: PairBench) -> list[dict[str, Any]]:
+    """What the monitor concludes of each check. The state of health beside it may be the clock's on the wall to say."""
+    names = (
+        "stamp_ns",
+        "outcome",
+        "evidence",
+        "offset",
+        "sigma",
+        "drift",
+        "drift_sigma",
+        "flagged",
+        "undecided",
+        "weak",
+    )
+    replies = [check.model_dump(mode="json") for check in bench.store.publishable_records().checks]
+    return [{"reply": {name: reply[name] for name in names}} for reply in replies]
+
+
 def _windows(events: list[Any]) -> Iterator[dict[str, Any]]:
     """Every window: stamps of its pairs, pose at its begin, and how it ended."""
     stamps: list[int] = []
@@ -59,6 +77,7 @@ def of_pair(watched: pair_drive.Watched) -> tuple[list[dict[str, Any]], list[dic
     decided: list[dict[str, Any]] = [
         *({"entry": entry} for entry in history if entry["kind"] != "state"),
         *checks,
+        *evidence(watched.bench),
         *_windows(watched.windows),
         {"losses": sorted([*reason, count] for reason, count in watched.bench.losses.items())},
         {"states": watched.told["states"], "unpaired": plain(watched.told["unpaired"])},
@@ -87,6 +106,7 @@ def driven(folder: Path, apply: str) -> list[dict[str, Any]]:
     return [
         *({"entry": entry} for entry in entries(bench)),
         *({"stamps_ns": list(stamps)} for stamps in checked),
+        *evidence(bench),
         {"pose": bench.pose[:3].ravel().tolist(), "health": bench.health},
     ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -11,7 +12,6 @@ from typing import Any
 import pytest
 
 import coec
-from coec.cli.main import main
 from golden.recorded import FILE, WINDOWS, content, path_of, record
 from golden.reference import Tolerance, canonical, differences, is_identical, read, sha256, write
 from golden.test_windows import LOOSE
@@ -30,8 +30,9 @@ def decided(name: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[st
     capsys.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["coec", "replay", str(path_of(name)), "--json"])
-        status = main()
-    return status, json.loads(capsys.readouterr().out)
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_module("coec", run_name="__main__")
+    return int(ended.value.code or 0), json.loads(capsys.readouterr().out)
 
 
 @pytest.fixture(scope="module", autouse=True)

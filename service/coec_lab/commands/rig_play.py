@@ -6,20 +6,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from coec.geometry.se3 import inverse
-from coec.io.recordings.recording_source import SourceSpec
 from coec.io.rig_files import intrinsics_config, mask_to_png, matrix_rows
 from coec.io.ros.message_encoding import PlacedFrame
 from coec.io.ros.topics import SensorTopics, TopicInfo, TopicMessage, VehicleSensors
 from coec.io.user_files import write_output
 from coec.io.zenoh.player import SensorKeys
 from coec_lab.simulation.rig_drive import RigDrive
-from coec_lab.simulation.source import open_rig
-
-if TYPE_CHECKING:
-    from coec_lab.simulation.rig_drive import RigDrive
 
 
 def document_of(drive: RigDrive, lidars: Sequence[str], folder: Path) -> dict[str, Any]:
@@ -100,12 +95,3 @@ class PlayedRig:
             for message in topics.of(drive.message(entries[0])) if entries else ():
                 infos[message.topic] = TopicInfo(message.type_name, len(entries))
         return infos
-
-
-def open_played_rig(spec: SourceSpec) -> PlayedRig:
-    """The rig that a source names.
-
-    Raises:
-        UsageError, SourceError: see `open_rig`.
-    """
-    return PlayedRig(open_rig(spec.query))

@@ -10,6 +10,8 @@ from coec.errors import SourceError, UsageError
 from coec_lab.simulation.faults import parse_fault, parse_sensor_fault
 
 if TYPE_CHECKING:
+    from coec.io.recordings.lidar_recordings import LidarRecording
+    from coec_lab.commands.rig_play import PlayedRig
     from coec_lab.simulation.drive import DriveConfig, SimulatedDrive
     from coec_lab.simulation.rig_drive import RigDrive, SimulatedRigPair
 
@@ -190,3 +192,57 @@ def _numbers(text: str) -> tuple[float, ...]:
     except ValueError:
         return ()
     return numbers if all(math.isfinite(number) for number in numbers) else ()
+
+
+def open_recording(query: dict[str, str]) -> SimulatedDrive | SimulatedRigPair:
+    """The drive of one pair that `sim:KEY=VALUE&...` describes: of a rig, if the query has one.
+
+    Raises:
+        UsageError, SourceError: see `open_sim` and `open_pair_of_rig`.
+    """
+    return open_pair_of_rig(query) if "rig" in query else open_sim(query)
+
+
+def open_lidars(query: dict[str, str], a: str, b: str) -> LidarRecording:
+    """Sweeps of two LiDARs of a simulated rig, for `coec lidars`.
+
+    Raises:
+        UsageError: no such LiDAR, or the query does not fit.
+        SourceError: the optional extra is not installed.
+    """
+    from coec.calibration.rig.lidar_sampling import LidarRig
+    from coec.calibration.types import EgoMotion, LidarFrame
+    from coec.geometry.se3 import inverse
+    from coec.io.recordings.lidar_recordings import FrameStream, LidarRecording
+
+    drive = open_rig(query)
+    if unknown := [name for name in (a, b) if name not in drive.lidars]:
+        raise UsageError(f"the rig has no LiDAR {', '.join(unknown)}; it has {', '.join(drive.lidars)}")
+
+    def frames(sensor: str) -> FrameStream:
+        places = [entry for entry in drive.plan if entry.stream == drive.stream(sensor)]
+
+        def load(place: int) -> LidarFrame | EgoMotion:
+            frame = drive.message(places[place])
+            assert isinstance(frame, LidarFrame | EgoMotion)
+            return frame
+
+        return FrameStream(tuple(entry.stamp_ns for entry in places), load)
+
+    T_a_ego = drive.T_sensor_ego_nominal(a)
+    rig = LidarRig(a, b, T_a_ego @ inverse(drive.T_sensor_ego_nominal(b)), T_a_ego)
+    return LidarRecording(
+        drive.name, rig, frames(a), frames(b), frames("ego"),
+        lambda stamp_ns: drive.T_sensor_ego(a, stamp_ns) @ inverse(drive.T_sensor_ego(b, stamp_ns)),
+    )  # fmt: skip
+
+
+def open_played_rig(query: dict[str, str]) -> PlayedRig:
+    """A simulated rig, for `coec play`.
+
+    Raises:
+        UsageError, SourceError: see `open_rig`.
+    """
+    from coec_lab.commands.rig_play import PlayedRig
+
+    return PlayedRig(open_rig(query))

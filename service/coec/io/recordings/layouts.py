@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 from coec.errors import SourceError, UsageError
-from coec.io.recordings.recording_source import FORMS, RecordingSource, SourceSpec, is_bag, parse_spec
+from coec.io.recordings.recording_source import FORMS, RecordingSource, SourceSpec, installed_layout, is_bag, parse_spec
 
 __all__ = ["RecordingSource", "open_source"]
 
@@ -31,9 +31,8 @@ def open_source(spec: str) -> RecordingSource:
 
             return open_kitti_raw(parsed)
         case "sim":
-            from coec_lab.simulation.source import open_pair_of_rig, open_sim
-
-            return open_pair_of_rig(parsed.query) if "rig" in parsed.query else open_sim(parsed.query)
+            source: RecordingSource = installed_layout("sim").open_recording(parsed.query)
+            return source
     return _open_path(parsed)
 
 

@@ -12,7 +12,14 @@ from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_index import CLOUD_TYPES, VELOCITY_TYPES, CloudDecoder, MessageLocation, build_index
 from coec.io.recordings.bag_storage import BagStorage, open_storage
-from coec.io.recordings.recording_source import MOTION_REACH_NS, SourceSpec, is_bag, is_rig, parse_spec
+from coec.io.recordings.recording_source import (
+    MOTION_REACH_NS,
+    SourceSpec,
+    installed_layout,
+    is_bag,
+    is_rig,
+    parse_spec,
+)
 from coec.io.ros.transforms import bare
 
 MAX_STAMP_DIFFERENCE_NS = 60_000_000
@@ -82,36 +89,11 @@ def open_lidars(source: str, a: str, b: str) -> LidarRecording:
         raise UsageError(f"{a} is named twice: name two LiDARs")
     spec = parse_spec(source)
     if is_rig(spec):
-        return _of_rig(spec, a, b)
+        recording: LidarRecording = installed_layout("sim").open_lidars(spec.query, a, b)
+        return recording
     if is_bag(spec):
         return lidars_of_bag(spec, a, b)
     raise UsageError(f"{source} has no two LiDARs: give a bag, or sim:rig=four-fisheyes&... without `pair`")
-
-
-def _of_rig(spec: SourceSpec, a: str, b: str) -> LidarRecording:
-    from coec.geometry.se3 import inverse
-    from coec_lab.simulation.source import open_rig
-
-    drive = open_rig(spec.query)
-    if unknown := [name for name in (a, b) if name not in drive.lidars]:
-        raise UsageError(f"the rig has no LiDAR {', '.join(unknown)}; it has {', '.join(drive.lidars)}")
-
-    def frames(sensor: str) -> FrameStream:
-        places = [entry for entry in drive.plan if entry.stream == drive.stream(sensor)]
-
-        def load(place: int) -> LidarFrame | EgoMotion:
-            frame = drive.message(places[place])
-            assert isinstance(frame, LidarFrame | EgoMotion)
-            return frame
-
-        return FrameStream(tuple(entry.stamp_ns for entry in places), load)
-
-    T_a_ego = drive.T_sensor_ego_nominal(a)
-    rig = LidarRig(a, b, T_a_ego @ inverse(drive.T_sensor_ego_nominal(b)), T_a_ego)
-    return LidarRecording(
-        drive.name, rig, frames(a), frames(b), frames("ego"),
-        lambda stamp_ns: drive.T_sensor_ego(a, stamp_ns) @ inverse(drive.T_sensor_ego(b, stamp_ns)),
-    )  # fmt: skip
 
 
 def _nearest(frames: FrameStream, stamp_ns: int, within_ns: int) -> int | None:

@@ -6,8 +6,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 from urllib.parse import parse_qsl
 
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
@@ -196,6 +197,18 @@ class SourceSpec:
             known = f"known here: {', '.join(keys)}" if keys else "this kind of source takes none"
             raise UsageError(f"unknown query key {', '.join(unknown)} in {self.text}; {known}", FORMS)
         return self.query
+
+
+def installed_layout(name: str) -> Any:
+    """The module that reads sources of the form `NAME:...`, found by the entry points of group `coec.sources`. It has
+    `open_recording(query)`, `open_lidars(query, a, b)` and `open_played_rig(query)`.
+
+    Raises:
+        UsageError: no installed package reads such sources.
+    """
+    for point in entry_points(group="coec.sources", name=name):
+        return point.load()
+    raise UsageError(f"sources of the form `{name}:` come with the laboratory: `pip install coec-lab`")
 
 
 def parse_spec(text: str) -> SourceSpec:
