@@ -30,7 +30,7 @@ from coec.io.serialise import result_of
 from coec.reports import fleet_page, incident_page
 from coec.reports.baseline_page import baselines_page
 from coec.reports.calibration import calibration_page
-from coec.reports.diagnosis import check_page, detection_page
+from coec.reports.diagnosis import check_page
 from coec.reports.incident_page import FetchedIncident
 from coec.reports.page import Compare, Page, Pictures
 from coec.reports.page_parts import file_picture
@@ -54,6 +54,7 @@ from coec_lab.demo.pair_client import Moment, outcome_of
 from coec_lab.demo.pair_report import demo_page
 from coec_lab.experiments import evaluation_charts, evaluation_page, paper_figures
 from coec_lab.experiments.evaluation_charts import bullseye
+from coec_lab.experiments.evaluation_page import detection_page
 from coec_lab.experiments.evaluation_schema import (
     ComparisonReport,
     DetectionReport,

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from coec.calibration.monitor.change_detector import Observation
     from coec.calibration.types import Window
     from coec.reports import diagnosis
-    from coec.reports.progress import StageTimes
-    from coec_lab.experiments.evaluation_schema import DetectionReport
 
 REACH_DEG = 8.0
 """How far around the given pose the pose is searched: as far as a knock moves a mount. Beyond that, use
@@ -60,11 +58,12 @@ def diagnose(
     from coec.reports import console, diagnosis
     from coec.reports.progress import StageTimes
 
+    experiment = _detection_experiment() if detection > 0 else None
     with console.progress() as bars:
         times = StageTimes(bars)
         rigged = load((source,), SolverOptions(depth=depth, frames=frames), times)
-        if detection > 0:
-            report = _detection(rigged, detection, checks, times)
+        if experiment is not None:
+            report = experiment.measure(rigged, detection, checks, times)
         else:
             window = _moved(rigged.windows[0], perturb)
             seen = check_extrinsic(
@@ -73,8 +72,9 @@ def diagnose(
             # For a commissioned rig, the bias is known for checks only, not for a solve.
             needs_solve = seen.flagged and not seen.causes and rig is None
             measured = _measured(rigged, window, seen) if needs_solve else None
-    if detection > 0:
-        return _show_detection(report, source, output, as_json=as_json)
+    if experiment is not None:
+        experiment.show(report, source, output, as_json=as_json)
+        return 0
     if output is not None:
         _write(output, seen, window, rigged, measured)
     finding = diagnosis.finding_of(seen, in_degrees(seen.offset), in_degrees(seen.sigma), measured)
@@ -85,39 +85,13 @@ def diagnose(
     return int(finding.state != "right")
 
 
-def _detection(rigged: RigWindows, splits: int, checks: int, times: StageTimes) -> DetectionReport:
-    """How well moved extrinsics are detected on the window."""
-    from coec.calibration.commissioning import FAR_RAD
-    from coec.calibration.monitor.check import gather
-    from coec.calibration.solver import prepare_window_data
-    from coec_lab.experiments.detection import try_detection
-    from coec_lab.experiments.evaluation_documents import detection_of
+def _detection_experiment() -> Any:
+    """The module behind `--detection`, which another package registers by the entry points of `coec.experiments`."""
+    from importlib.metadata import entry_points
 
-    window = rigged.windows[0]
-    evidence = gather(prepare_window_data(window, rigged.depth, rigged.images, rigged.configuration, times), FAR_RAD)
-    tried = try_detection(
-        evidence,
-        window.T_camera_lidar_start,
-        rigged.configuration,
-        splits,
-        checks,
-        lambda done, total: times.step("splits", done, total),
-    )
-    return detection_of(tried, splits, len(evidence.pairs))
-
-
-def _show_detection(report: DetectionReport, source: str, output: Path | None, *, as_json: bool) -> int:
-    from coec.reports import console, page, provenance
-    from coec.reports.diagnosis import detection_page
-    from coec_lab.experiments import evaluation_tables
-
-    if output is not None:
-        page.write(output / "report.html", detection_page(report, source, provenance.here()))
-    if as_json:
-        console.print_json({"source": source, **report.model_dump(mode="json")})
-    else:
-        evaluation_tables.show_detection(report)
-    return 0
+    for point in entry_points(group="coec.experiments", name="detection"):
+        return point.load()
+    raise UsageError("--detection is an experiment of the laboratory: `pip install coec-lab`")
 
 
 def _moved(window: Window, perturb: str | None) -> Window:

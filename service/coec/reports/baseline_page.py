@@ -11,9 +11,8 @@ from coec.config import VerdictConfig
 from coec.io.baseline_file import baseline_hash
 from coec.reports.formatting import count, number, percent, significant
 from coec.reports.page import Block, Cell, Facts, Page, Section, Table, Text, VerdictBanner
-from coec.reports.page_parts import axes_table
+from coec.reports.page_parts import axes_table, in_degrees
 from coec.reports.provenance import Provenance
-from coec_lab.experiments.evaluation_documents import in_degrees
 
 CHECK_PAIRS = 6
 """Number of pairs in the check whose spread is shown."""

@@ -15,14 +15,19 @@ from coec.calibration.types import Reason as Found
 from coec.calibration.types import Window
 from coec.io.serialise import metric_of
 from coec.reports import console
-from coec.reports.formatting import NONE, count, number, second
+from coec.reports.formatting import NONE, number, second
 from coec.reports.page import Page, Pictures, Section, Text, VerdictBanner
-from coec.reports.page_parts import advice_of, axes_table, axis_value, figures_block, file_picture, turn_and_shift
+from coec.reports.page_parts import (
+    advice_of,
+    axes_table,
+    axis_value,
+    figures_block,
+    file_picture,
+    in_degrees,
+    turn_and_shift,
+)
 from coec.reports.provenance import Provenance, content_hash, depth_items
 from coec.schemas.replies import Reason
-from coec_lab.experiments.evaluation_documents import in_degrees
-from coec_lab.experiments.evaluation_page import detection_table
-from coec_lab.experiments.evaluation_schema import DetectionReport
 
 TELLING = 2.0
 """Standard deviations from which an axis is named as off: chance alone reaches this on one axis in twenty."""
@@ -229,19 +234,6 @@ def check_page(
         ),
     )  # fmt: skip
     return Page("coec diagnose", f"Check of {window.rig.pair}", (_verdict(seen, measured),), sections)
-
-
-def detection_page(detection: DetectionReport, source: str, made: Provenance) -> Page:
-    """How well wrong extrinsics are detected on a recording."""
-    checks = sum(row.checks for row in detection.moves)
-    sentence = f"{count(checks, 'check')} at the right extrinsic and at moved ones; see which of them are flagged."
-    sections = (
-        Section("Checks by move", (detection_table(detection),)),
-        made.section((("Source", source),)),
-    )
-    return Page(
-        "coec diagnose", "How well a wrong extrinsic is seen", (VerdictBanner("none", "Tried.", sentence),), sections
-    )
 
 
 def _by_axis(measured: SolvedOffset) -> list[str]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
-from math import log2
+from math import isfinite, log2
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coec.calibration.figures import FIGURES, OTHER_ADVICE
 from coec.calibration.monitor.sensor_faults import CAUSES
@@ -26,7 +28,7 @@ from coec.reports.page import (
     Picture,
     Tone,
 )
-from coec.schemas.replies import MetricReply, Reason, Transform
+from coec.schemas.replies import Maybe6, MetricReply, Reason, Transform
 
 TONES: Mapping[str, Tone] = {
     "accepted": "good",
@@ -244,3 +246,18 @@ def _columns(rows: Sequence[Sequence[str]]) -> str:
     """Rows as lines, with aligned columns."""
     widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=False)) for row in rows)
+
+
+def in_degrees(rad_m: NDArray[np.float64]) -> Maybe6:
+    """(6,) radians and metres to degrees and metres, None where there is no figure."""
+    return cast("Maybe6", tuple(finite_values(np.concatenate([np.degrees(rad_m[:3]), rad_m[3:]]))))
+
+
+def finite_values(values: Iterable[float]) -> list[float | None]:
+    """The values, None where one is not finite."""
+    return [finite_or_none(float(value)) for value in values]
+
+
+def finite_or_none(value: float) -> float | None:
+    """The value, or None where it is not finite."""
+    return value if isfinite(value) else None

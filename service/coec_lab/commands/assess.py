@@ -129,8 +129,8 @@ def _report(
     """The report of a network and a source, by their `names`."""
     import numpy as np
 
+    from coec.reports.page_parts import finite_or_none
     from coec_lab.experiments import depth_quality
-    from coec_lab.experiments.evaluation_documents import number
     from coec_lab.experiments.evaluation_schema import DepthFrame, ModelAssessment
 
     suitability, sentence = depth_quality.suitability(quality)
@@ -143,14 +143,14 @@ def _report(
         depth_identity=identity,
         suitability=suitability.value,
         verdict=sentence,
-        rank_correlation=number(quality.rank_correlation),
+        rank_correlation=finite_or_none(quality.rank_correlation),
         covered=quality.covered,
         inference_ms=float(np.median(timed)) if timed else None,
         mi=quality.mi,
         mi_of_unrelated=quality.mi_of_unrelated,
         mi_over_unrelated=quality.mi_over_unrelated,
         bias_deg=cast("Vector3", tuple(np.degrees(quality.bias).tolist())),
-        half_width_deg=cast("Maybe3", tuple(number(degrees(width)) for width in quality.half_width)),
+        half_width_deg=cast("Maybe3", tuple(finite_or_none(degrees(width)) for width in quality.half_width)),
         # Per square degree.
         peakedness_per_deg2=cast("Vector3", tuple((quality.peakedness / degrees(1.0) ** 2).tolist())),
         search_deg=depth_quality.SEARCH_DEG,
@@ -159,7 +159,7 @@ def _report(
                 stamp_ns=pair.stamp_ns,
                 points=len(pairing.value),
                 covered=pairing.covered,
-                rank_correlation=number(pairing.rank_correlation),
+                rank_correlation=finite_or_none(pairing.rank_correlation),
                 inference_ms=elapsed_ms,
             )
             for pair, pairing, elapsed_ms in zip(window.pairs, quality.pairings, times_ms, strict=True)

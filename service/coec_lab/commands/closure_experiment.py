@@ -17,11 +17,12 @@ from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
 from coec.io.recordings import window_cutting
 from coec.reports import console
+from coec.reports.page_parts import in_degrees
 from coec.schemas.message import to_json
 from coec.schemas.replies import Vector6
 from coec_lab.experiments import evaluation_tables, solve_experiments
 from coec_lab.experiments.closure import Between, Closure, Solve, between, close
-from coec_lab.experiments.evaluation_documents import closure_of, in_degrees
+from coec_lab.experiments.evaluation_documents import closure_of
 from coec_lab.experiments.evaluation_run import Plan, configuration_of
 from coec_lab.experiments.evaluation_schema import ClosureReport
 from coec_lab.experiments.solve_experiments import Bench, Stages

@@ -34,8 +34,8 @@ from coec.calibration.monitor.sequential_tests import FREEDOM
 from coec.config import MonitorConfig
 from coec.geometry.points import random_direction
 from coec.reports import console
+from coec.reports.page_parts import finite_or_none
 from coec_lab.experiments import evaluation_schema as wire
-from coec_lab.experiments.evaluation_documents import number
 
 STREET_CHECKS = 24
 """Checks in one street, on average: two minutes at one every five seconds."""
@@ -357,4 +357,4 @@ def delay_curve(report: wire.AlarmsReport) -> bytes:
 def _spread(values: Sequence[float]) -> wire.Spread:
     """Spread of some delays; a figure is None if the delay there is infinite, that is, not noticed in time."""
     median, p95 = (float(np.percentile(values, share, method="higher")) for share in (50, 95))
-    return wire.Spread(median=number(median), p95=number(p95), max=number(max(values)))
+    return wire.Spread(median=finite_or_none(median), p95=finite_or_none(p95), max=finite_or_none(max(values)))

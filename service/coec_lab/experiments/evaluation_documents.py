@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from math import degrees
 from typing import cast
 
-import numpy as np
-from numpy.typing import NDArray
-
+from coec.reports.page_parts import finite_or_none, finite_values, in_degrees
 from coec.schemas.replies import Maybe6
 from coec_lab.experiments import evaluation_schema as wire
 from coec_lab.experiments import mount_steps, solve_statistics
@@ -23,7 +20,9 @@ from coec_lab.experiments.solve_statistics import BIN_EDGES, CONFIDENCES, Halves
 def spread_of(spread: solve_statistics.SpreadStatistics, scale: float = 1.0) -> wire.Spread:
     """The spread of a figure, times `scale`."""
     return wire.Spread(
-        median=number(scale * spread.median), p95=number(scale * spread.p95), max=number(scale * spread.max)
+        median=finite_or_none(scale * spread.median),
+        p95=finite_or_none(scale * spread.p95),
+        max=finite_or_none(scale * spread.max),
     )
 
 
@@ -45,7 +44,7 @@ def frames_point_of(point: solve_statistics.FrameCountStatistics) -> wire.Frames
         hit_rate=point.hit_rate,
         rotation_deg=angle_spread_of(point.rotation_rad),
         translation_m=spread_of(point.translation_m),
-        sigma_deg=number(degrees(point.sigma_rad)),
+        sigma_deg=finite_or_none(degrees(point.sigma_rad)),
     )
 
 
@@ -59,7 +58,7 @@ def slice_point_of(point: solve_statistics.SliceStatistics) -> wire.SlicePoint:
         hit_rate=point.hit_rate,
         rotation_deg=angle_spread_of(point.rotation_rad),
         translation_m=spread_of(point.translation_m),
-        sigma_deg=number(degrees(point.sigma_rad)),
+        sigma_deg=finite_or_none(degrees(point.sigma_rad)),
     )
 
 
@@ -75,7 +74,7 @@ def halves_of(halves: Halves) -> wire.HalvesReport:
         largest=in_degrees(halves.largest),
         sigma=in_degrees(halves.sigma),
         claimed=cast("wire.Counts6", tuple(int(count) for count in halves.claimed)),
-        covered=cast("Maybe6", tuple(_numbers(halves.covered))),
+        covered=cast("Maybe6", tuple(finite_values(halves.covered))),
     )
 
 
@@ -92,7 +91,7 @@ def steps_of(tried: Sequence[MountStepTrial]) -> tuple[wire.StepRow, ...]:
 
 def normalised_of(against: str, errors: NormalisedErrors) -> wire.NormalisedErrorsReport:
     """Normalised errors, relative to what `against` names."""
-    within = [cast("Maybe6", tuple(_numbers(row))) for row in errors.coverage]
+    within = [cast("Maybe6", tuple(finite_values(row))) for row in errors.coverage]
     low, high = errors.nees_bounds
     return wire.NormalisedErrorsReport(
         against=against,
@@ -102,17 +101,17 @@ def normalised_of(against: str, errors: NormalisedErrors) -> wire.NormalisedErro
         rms=in_degrees(errors.rms),
         largest=in_degrees(errors.largest),
         sigma=in_degrees(errors.sigma),
-        sigma_over_rms=cast("Maybe6", tuple(_numbers(errors.sigma_over_rms))),
+        sigma_over_rms=cast("Maybe6", tuple(finite_values(errors.sigma_over_rms))),
         within_1_sigma=within[0],
         within_2_sigma=within[1],
         within_3_sigma=within[2],
         bin_edges=BIN_EDGES,
         histogram=tuple(tuple(int(count) for count in row) for row in errors.histogram),
         confidences=CONFIDENCES,
-        reliability=tuple(tuple(_numbers(column)) for column in errors.reliability.T),
-        nees=number(errors.nees),
-        nees_low=number(low),
-        nees_high=number(high),
+        reliability=tuple(tuple(finite_values(column)) for column in errors.reliability.T),
+        nees=finite_or_none(errors.nees),
+        nees_low=finite_or_none(low),
+        nees_high=finite_or_none(high),
     )
 
 
@@ -127,17 +126,3 @@ def closure_of(closure: Closure) -> wire.ClosureGroup:
         rotation_deg=angle_spread_of(closure.rotation_rad),
         translation_m=spread_of(closure.translation_m),
     )
-
-
-def in_degrees(rad_m: NDArray[np.float64]) -> Maybe6:
-    """(6,) radians and metres to degrees and metres, None where there is no figure."""
-    return cast("Maybe6", tuple(_numbers(np.concatenate([np.degrees(rad_m[:3]), rad_m[3:]]))))
-
-
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    return [number(float(value)) for value in values]
-
-
-def number(value: float) -> float | None:
-    """The value, or None where it is not finite."""
-    return value if math.isfinite(value) else None

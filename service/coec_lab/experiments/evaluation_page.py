@@ -317,3 +317,16 @@ def _origin(report: EvaluationReport) -> tuple[tuple[str, str], ...]:
         *depth_items(report.depth_identity),
         ("Configuration, hash", report.config_hash),
     )
+
+
+def detection_page(detection: DetectionReport, source: str, made: Provenance) -> Page:
+    """How well wrong extrinsics are detected on a recording."""
+    checks = sum(row.checks for row in detection.moves)
+    sentence = f"{count(checks, 'check')} at the right extrinsic and at moved ones; see which of them are flagged."
+    sections = (
+        Section("Checks by move", (detection_table(detection),)),
+        made.section((("Source", source),)),
+    )
+    return Page(
+        "coec diagnose", "How well a wrong extrinsic is seen", (VerdictBanner("none", "Tried.", sentence),), sections
+    )

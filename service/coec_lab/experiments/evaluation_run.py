@@ -24,6 +24,7 @@ from coec.io.recordings.recording_source import HasGroundTruth
 from coec.io.recordings.window_cutting import with_thinned_pairs
 from coec.recording import CallbackProgress, Recording, fit_camera
 from coec.recording import Window as PublicWindow
+from coec.reports.page_parts import in_degrees
 from coec.schemas.replies import Vector6
 from coec_lab.experiments import solve_experiments, solve_statistics
 from coec_lab.experiments.detection import require_enough
@@ -32,7 +33,6 @@ from coec_lab.experiments.evaluation_documents import (
     detection_of,
     frames_point_of,
     halves_of,
-    in_degrees,
     normalised_of,
     slice_point_of,
     spread_of,

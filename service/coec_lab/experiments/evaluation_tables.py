@@ -12,9 +12,9 @@ from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.reports import console
 from coec.reports.formatting import count
+from coec.reports.page_parts import in_degrees
 from coec_lab.experiments import solve_statistics
 from coec_lab.experiments.detection import RIGHT
-from coec_lab.experiments.evaluation_documents import in_degrees
 from coec_lab.experiments.evaluation_schema import (
     ClosureReport,
     ComparisonReport,
