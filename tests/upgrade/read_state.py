@@ -10,34 +10,47 @@ from __future__ import annotations
 import inspect
 import json
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from coec.calibration import state as lifecycle
-from coec.calibration.state import PairState
-from coec.io.baseline_file import BASELINES, load_baseline
-from coec.io.rig_files import rig_from_json
-from coec.service.records.history import PairHistory
-from coec.service.records.incidents import Incidents
-from coec.service.records.state_store import StateStore
+
+def module(*names: str) -> Any:
+    """The first of the modules that this version has."""
+    for name in names:
+        try:
+            return import_module(name)
+        except ModuleNotFoundError:
+            continue
+    raise ModuleNotFoundError(names)
 
 
-def state_of(remembered: Any) -> PairState:
+# The second names are those of versions until 26 November 2026.
+lifecycle = module("coec.calibration.state", "coec.calibration.lifecycle")
+baseline_file = module("coec.io.baseline_file", "coec.adapters.files.baseline_file")
+rig_files = module("coec.io.rig_files", "coec.adapters.files.rig")
+history_module = module("coec.service.records.history", "coec.runtime.decisions.history")
+incidents = module("coec.service.records.incidents", "coec.runtime.decisions.incidents")
+state_store = module("coec.service.records.state_store", "coec.runtime.decisions.state_store")
+
+
+def state_of(remembered: Any) -> Any:
     """The state; the first versions returned it beside other things."""
     state = getattr(remembered, "state", remembered)
-    return state if isinstance(state, PairState) else remembered[0]
+    return state if isinstance(state, lifecycle.PairState) else remembered[0]
 
 
 def books_of(folder: Path, pair: str, remembered: Any) -> Any:
-    history: Any = PairHistory
-    if "pair" in inspect.signature(PairHistory).parameters:
+    history = getattr(history_module, "PairHistory", None) or history_module.History
+    if "pair" in inspect.signature(history).parameters:
         return history(folder, pair, 1000, getattr(remembered, "history_heads", {}))
     return history(folder / f"history-{pair}.jsonl", 1000, getattr(remembered, "history_head", None))
 
 
-def pair_read(store: StateStore, folder: Path, name: str, rig_document: Any) -> dict[str, Any]:
+def pair_read(store: Any, folder: Path, name: str, rig_document: Any) -> dict[str, Any]:
     try:
-        remembered = store.load(rig_from_json(rig_document, None))
+        load = store.load if hasattr(store, "load") else store.recall
+        remembered = load(rig_files.rig_from_json(rig_document, None))
     except Exception as error:  # whatever an old version raises is what is to be told
         return {"error": f"{type(error).__name__}: {error}"}
     if remembered is None:
@@ -56,18 +69,18 @@ def pair_read(store: StateStore, folder: Path, name: str, rig_document: Any) -> 
         "damage": books.damage,
         "history": [kept.entry.text for kept in books.entries()],
         "results": len(books.results()),
-        "windows_of_events": sorted(Incidents(folder / "evidence", name, 4).window_ids),
+        "windows_of_events": sorted(incidents.Incidents(folder / "evidence", name, 4).window_ids),
     }
 
 
 def read(folder: Path, expected: dict[str, Any]) -> dict[str, Any]:
-    store = StateStore(folder, "shuttle-7")
+    store = state_store.StateStore(folder, "shuttle-7")
     told: dict[str, Any] = {
         "damage": list(store.damage),
         "pairs": {name: pair_read(store, folder, name, pair["rig"]) for name, pair in expected["pairs"].items()},
     }
     try:
-        told["baseline"] = load_baseline(folder / BASELINES, "front") is not None
+        told["baseline"] = baseline_file.load_baseline(folder / baseline_file.BASELINES, "front") is not None
     except Exception as error:  # likewise
         told["baseline"] = f"{type(error).__name__}: {error}"
     return told

@@ -1,75 +1,57 @@
-"""Writes a state directory as the version of coec on PYTHONPATH writes it, and beside it what stands in it.
+"""Writes a state directory as the version of coec that it belongs to writes it, and beside it what stands in it.
 
     PYTHONPATH=service:tests python tests/upgrade/write_state.py FOLDER
 
-It runs with versions since 22 November 2026, with the tests of that version on the path: `given` leaves out arguments
-that a version does not know yet. Everything is made by the version's own functions, with two pairs: `front` was
-corrected by a window, is healthy and held by a person; of `rear` the monitor suspects a move, and an alarm goes on.
+Everything is made by the version's own functions, with two pairs: `front` was corrected by a window, is healthy and
+held by a person; of `rear` the monitor suspects a move, and an alarm goes on.
 """
 
 from __future__ import annotations
 
-import inspect
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import fields, replace
-from importlib import import_module
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from baselines import a_baseline
-from estimates import RIG, estimate
 
-from coec.adapters.files.baseline_file import BASELINES, baseline_hash, save_baseline
-from coec.adapters.files.conversions import check_of, result_of, transform_of
-from coec.adapters.files.rig import rig_to_json
-from coec.adapters.files.state_file import StateFile
-from coec.calibration import lifecycle
-from coec.calibration.commissioning.baseline import learned_hash
-from coec.calibration.lifecycle import PairState
+from coec.calibration import state as lifecycle
+from coec.calibration.baseline import learned_hash
 from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.state import ExtrinsicHold, PairRules, PairState
+from coec.calibration.state_machine import AlarmRecord
 from coec.calibration.types import Rig
-from coec.config import CalibrationConfig, Config, PolicyConfig, TrackerConfig
-from coec.runtime.decisions.check_log import CheckLog
-from coec.runtime.decisions.history import History
-from coec.runtime.decisions.incidents import Incidents
-from coec.runtime.decisions.state_store import StateStore
+from coec.config import CalibrationConfig, Config, MonitorConfig, PairConfig, PolicyConfig, TrackerConfig
+from coec.io.baseline_file import BASELINES, baseline_hash, save_baseline
+from coec.io.rig_files import rig_to_json
+from coec.io.serialise import check_of, result_of, transform_of
+from coec.io.storage import StateFile
 from coec.schemas.replies import EvidenceEvent, HistoryEntry, Reason
+from coec.service.discovery import DiscoveredPair, DiscoveryStore
+from coec.service.records.history import CheckLog, PairHistory
+from coec.service.records.incidents import Incidents
+from coec.service.records.rig_store import RIG_FILE, RigStore
+from coec.service.records.state_store import StateStore
+from coec.service.records.stored_pair import Clocks
+from support.estimates import ESTIMATE_RIG, a_baseline, estimate
 
 S = 1_000_000_000
 VEHICLE = "shuttle-7"
-FRONT, REAR = RIG, replace(RIG, pair="rear")
+FRONT, REAR = ESTIMATE_RIG, replace(ESTIMATE_RIG, pair="rear")
 SENDER, WHY = "workshop", "the mirror is being changed"
 CHECKS = 8
 
 
-def given(make: Callable[..., Any], *args: Any, **more: Any) -> Any:
-    """Calls with those of the arguments by name that this version knows."""
-    known = inspect.signature(make).parameters
-    return make(*args, **{name: value for name, value in more.items() if name in known})
-
-
-def module(name: str) -> Any:
-    """The module; None if this version does not have it."""
-    try:
-        return import_module(name)
-    except ModuleNotFoundError:
-        return None
-
-
-def rules() -> Any:
-    monitor = getattr(import_module("coec.config"), "MonitorConfig", None)
-    parts = {"policy": PolicyConfig(apply="always"), "tracker": TrackerConfig()}
-    return given(lifecycle.Rules, **parts, monitor=None if monitor is None else monitor())
+def rules() -> PairRules:
+    return PairRules(policy=PolicyConfig(apply="always"), tracker=TrackerConfig(), monitor=MonitorConfig())
 
 
 def checked(state: PairState, number: int, yaw_rad: float) -> tuple[PairState, Observation]:
     """The state after a check of four new pairs that puts the mount `yaw_rad` beside the served extrinsic."""
     scatter = np.random.default_rng(number).normal(size=6) * 1e-4
-    one = given(
-        Observation,
+    one = Observation(
         stamp_ns=(10 + 5 * number) * S,
         pair_stamps_ns=tuple((10 + 5 * number) * S - k * S // 2 for k in (3, 2, 1, 0)),
         metrics=(),
@@ -84,45 +66,36 @@ def checked(state: PairState, number: int, yaw_rad: float) -> tuple[PairState, O
         flagged_by_paper=None,
         causes=(),
     )
-    return given(lifecycle.after_observation, state, one, rules=rules()), one
+    return lifecycle.after_observation(state, one, rules()), one
 
 
 def front_state() -> tuple[PairState, list[Observation]]:
-    state = given(lifecycle.after_estimate, lifecycle.initial_state(FRONT), estimate(1), 0, rules())
+    state = lifecycle.after_estimate(lifecycle.initial_state(FRONT), estimate(1), 0, rules())
     made = []
     for number in range(CHECKS):
         state, one = checked(state, number, 0.0)
         made.append(one)
-    hold = getattr(lifecycle, "Hold", None)
-    held: Any = lifecycle.held
-    state = held(state) if hold is None else held(state, hold(7 * S, SENDER, WHY))
-    record = getattr(lifecycle, "AlarmRecord", None)
-    return (state if record is None else replace(state, record=record(3600 * S, 1, 2, False))), made
+    state = lifecycle.held(state, ExtrinsicHold(7 * S, SENDER, WHY))
+    return replace(state, record=AlarmRecord(3600 * S, 1, 2, False)), made
 
 
 def rear_state() -> tuple[PairState, list[Observation]]:
-    state = given(lifecycle.after_estimate, lifecycle.initial_state(REAR), estimate(2), 0, rules())
+    state = lifecycle.after_estimate(lifecycle.initial_state(REAR), estimate(2), 0, rules())
     made = []
     for number in range(2 * CHECKS):
         state, one = checked(state, number, 0.0 if number < CHECKS else 0.03)
         made.append(one)
-    record = getattr(lifecycle, "AlarmRecord", None)
-    return (state if record is None else replace(state, record=record(1800 * S, 0, 0, True))), made
+    return replace(state, record=AlarmRecord(1800 * S, 0, 0, True)), made
 
 
-def write_history(folder: Path, rig: Rig, state: PairState) -> tuple[Any, list[str]]:
+def write_history(folder: Path, rig: Rig, state: PairState) -> tuple[PairHistory, list[str]]:
     """Entries of all books; returns the books, and the texts of the entries."""
-    history: Any = History
-    if "pair" in inspect.signature(History).parameters:
-        books = history(folder, rig.pair, 1000, {})
-    else:
-        books = history(folder / f"history-{rig.pair}.jsonl", 1000)
+    books = PairHistory(folder, rig.pair, 1000, {})
     assert state.accepted is not None
 
     def append(kind: str, code: str, text: str, result: Any = None, **more: Any) -> None:
-        known = {name: value for name, value in more.items() if name in HistoryEntry.model_fields}
         place = {"sequence": 0, "previous_sha256": 64 * "0", "wall_ns": 5 * S}
-        books.append(HistoryEntry.model_validate({"kind": kind, "code": code, "text": text, **place, **known}), result)
+        books.append(HistoryEntry.model_validate({"kind": kind, "code": code, "text": text, **place, **more}), result)
 
     window_id, served = state.accepted.window_id, transform_of(state.T_camera_lidar)
     result = result_of(state.accepted, rig, VEHICLE)
@@ -131,8 +104,7 @@ def write_history(folder: Path, rig: Rig, state: PairState) -> tuple[Any, list[s
     append("state", state.health.value, "The state of health.")
     append("command", "done", "hold: held", sender=SENDER, reason=WHY)
     append("commissioned", "commissioned", "From 2 windows.")
-    if hasattr(books, "flush"):
-        books.flush()
+    books.flush()
     return books, [kept.entry.text for kept in books.entries()]
 
 
@@ -150,8 +122,7 @@ def write_evidence(folder: Path, rig: Rig, state: PairState) -> str:
     )
     evidence = Incidents(folder / "evidence", rig.pair, 4)
     evidence.begin(event)
-    if hasattr(evidence, "flush"):
-        evidence.flush()
+    evidence.flush()
     return event.event_id
 
 
@@ -159,31 +130,22 @@ def write_checks(folder: Path, rig: Rig, state: PairState, made: list[Observatio
     log = CheckLog(folder / f"checks-{rig.pair}.jsonl", 100)
     for one in made[-2:]:
         log.append(check_of(one, state))
-    if hasattr(log, "flush"):
-        log.flush()
+    log.flush()
     return len(log.checks())
 
 
 def write_rig_file(folder: Path) -> list[str]:
     """Where the pairs of the vehicle are, as the rig keeps it; checked by the version itself."""
-    rig_file = module("coec.runtime.rig.rig_file")
-    if rig_file is None:
-        return []
-    nominal = RIG.T_camera_lidar_nominal.tolist()
+    nominal = ESTIMATE_RIG.T_camera_lidar_nominal.tolist()
     edge = {"nominal": nominal, "T_camera_lidar": estimate(1).optimum.T_camera_lidar.tolist(), "sigma": [1e-3] * 6}
     event = {"sensors": ["front"], "since_ns": 9 * S, "stepped_ns": 0, "named": ["front"]}
-    StateFile(folder / rig_file.FILE).save({"edges": {"front": edge, "rear": edge}, "event": event})
-    assert not rig_file.RigFile(folder).damage
+    StateFile(folder / RIG_FILE).save({"edges": {"front": edge, "rear": edge}, "event": event})
+    assert not RigStore(folder).damage
     return ["front", "rear"]
 
 
 def write_nominal(folder: Path) -> dict[str, Any]:
     """A calibration that was found on the bus for a pair that leaves it out; returns the configuration of it."""
-    kept = module("coec.runtime.nominal.kept")
-    if kept is None:
-        return {}
-    found = module("coec.runtime.nominal.findings").Found
-    pair_config = module("coec.config").PairConfig
     configured = {"middleware": "rmw_zenoh", "pairs": [{"name": "side", "camera": "/side/image", "points": "/top"}]}
     config = Config.model_validate(configured)
     document = {
@@ -196,27 +158,24 @@ def write_nominal(folder: Path) -> dict[str, Any]:
         "lidar": {"topic": "/top", "frame_id": "top"},
         "T_camera_lidar": [[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, 0.2], [1.0, 0.0, 0.0, -0.7], [0.0, 0.0, 0.0, 1.0]],
     }
-    book = kept.KeptNominals(folder)
-    book.keep(
-        found(pair_config.model_validate(document), {"T_camera_lidar": "/tf_static"}), config.awaited[0], config, S
-    )
-    book.flush()
+    store = DiscoveryStore(folder)
+    discovered = DiscoveredPair(PairConfig.model_validate(document), {"T_camera_lidar": "/tf_static"})
+    store.update(discovered, config.awaited[0], config, S)
+    store.flush()
     return configured
 
 
 def write(folder: Path) -> dict[str, Any]:
     """Writes the state directory. Returns what stands in it."""
     folder.mkdir(parents=True, exist_ok=True)
-    store_module = module("coec.runtime.decisions.stored_pair") or module("coec.runtime.decisions.state_store")
     store = StateStore(folder, VEHICLE)
     told: dict[str, Any] = {"nominal": write_nominal(folder), "edges": write_rig_file(folder), "pairs": {}}
     for rig, (state, made) in ((FRONT, front_state()), (REAR, rear_state())):
         books, texts = write_history(folder, rig, state)
-        heads = books.durable_heads if hasattr(books, "durable_heads") else books.durable_head
-        by_call = "Callable" in str(inspect.signature(store.remember).parameters.get("history_heads"))
-        clocks = store_module.Clocks(6 * S, 8 * S, 4 * S)
-        more = {"commissioned_from": (f"{rig.pair}-1",)}
-        given(store.remember, rig, state, clocks, (lambda kept=heads: kept) if by_call else heads, **more)
+        commissioned_from = (f"{rig.pair}-1",)
+        store.update(
+            rig, state, Clocks(6 * S, 8 * S, 4 * S), partial(getattr, books, "durable_heads"), commissioned_from
+        )
         told["pairs"][rig.pair] = {
             "rig": rig_to_json(rig),
             "T_camera_lidar": state.T_camera_lidar.tolist(),
@@ -229,19 +188,14 @@ def write(folder: Path) -> dict[str, Any]:
             "outcome": state.monitor.outcome.value,
             "evidence": state.monitor.evidence,
             "is_held": rig is FRONT,
-            "hold": [SENDER, WHY] if rig is FRONT and hasattr(state, "hold") else None,
-            "record": {one.name: getattr(state.record, one.name) for one in fields(state.record)}
-            if hasattr(state, "record")
-            else None,
-            "commissioned_from": list(more["commissioned_from"])
-            if "commissioned_from" in inspect.signature(store.remember).parameters
-            else [],
+            "hold": [SENDER, WHY] if rig is FRONT else None,
+            "record": {one.name: getattr(state.record, one.name) for one in fields(state.record)},
+            "commissioned_from": list(commissioned_from),
             "history": texts,
             "checks": write_checks(folder, rig, state, made),
             "event": write_evidence(folder, rig, state),
         }
-    if hasattr(store, "flush"):
-        store.flush()
+    store.flush()
     baseline = replace(a_baseline(), config_hash=learned_hash(CalibrationConfig()))
     save_baseline(folder / BASELINES, baseline)
     return told | {"baseline": baseline_hash(baseline), "learned": baseline.config_hash}

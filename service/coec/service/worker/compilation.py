@@ -132,30 +132,27 @@ class Compilation:
 
 
 COMMON: Mapping[str, tuple[str, ...]] = {
-    "bearings": ("_bearings", "grid_counts"),
-    "cover": ("moved_by", "unit_ball"),
-    "deskew": ("_deskew",),
-    "edges.charts": ("_cells", "_charted_z", "_climb", "keep_apart"),
+    "edges.charts": (
+        "_cells", "_charted_z", "_pattern_search", "moved_by", "select_separated", "unit_ball",
+    ),
     "edges.image_edges": (
         "_eroded_by", "_gain_over", "_gradient", "_less", "_over_local_mean", "_row_sums", "_smoothed", "_stepped",
         "halved",
     ),
     "edges.range_edges": ("_along_the_rows", "_jumps"),
-    "mutual_information": ("_information", "_informations", "_tasks"),
-    "picture": ("level_counts", "neighbour_differences", "square_sums"),
-    "shares": ("_count_reached",),
+    "images": ("level_counts", "neighbour_differences", "square_sums"),
+    "mutual_information": ("_count_reached", "_information", "_informations", "_tasks"),
+    "sweep_kernels": ("_bearings", "_deskew", "grid_counts"),
 }  # fmt: skip
 """Kernels that are the same for every lens, by their module in `coec.geometry`."""
 
 OF_A_LENS: Mapping[str, tuple[str, ...]] = {
     "edges.alignment": (
-        "_late_sums", "_nearest_pixel_z", "_smooth_sums", "_smooth_sums_of_parts", "_sums_on_each_map",
+        "_ascend", "_late_sums", "_nearest_pixel_z", "_smooth_sums", "_smooth_sums_of_parts", "_sums_on_each_map",
     ),
     "edges.charts": ("_pixels",),
-    "edges.climbs": ("_climb",),
     "mutual_information": ("_count",),
-    "pixel_lookup": ("_largest_error_px",),
-    "projection": ("_project", "_unproject"),
+    "projection": ("_largest_error_px", "_project", "_unproject"),
 }  # fmt: skip
 """Kernels that are compiled for each model of a lens."""
 
