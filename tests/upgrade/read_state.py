@@ -10,34 +10,39 @@ from __future__ import annotations
 import inspect
 import json
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from coec.calibration import state as lifecycle
-from coec.calibration.state import PairState
-from coec.io.baseline_file import BASELINES, load_baseline
-from coec.io.rig_files import rig_from_json
-from coec.service.records.history import PairHistory
-from coec.service.records.incidents import Incidents
-from coec.service.records.state_store import StateStore
+names = import_module(f"{__package__}.names" if __package__ else "names")
+"""The file beside this one, which runs as a program, too."""
+
+lifecycle = names.first_of("coec.calibration.state", "coec.calibration.lifecycle")
+baseline_file = names.first_of("coec.io.baseline_file", "coec.adapters.files.baseline_file")
+rig_from_json = names.first_of("coec.io.rig_files:rig_from_json", "coec.adapters.files.rig:rig_from_json")
+PairHistory = names.first_of("coec.service.records.history:PairHistory", "coec.runtime.decisions.history:History")
+Incidents = names.first_of("coec.service.records.incidents:Incidents", "coec.runtime.decisions.incidents:Incidents")
+StateStore = names.first_of(
+    "coec.service.records.state_store:StateStore", "coec.runtime.decisions.state_store:StateStore"
+)
 
 
-def state_of(remembered: Any) -> PairState:
+def state_of(remembered: Any) -> Any:
     """The state; the first versions returned it beside other things."""
     state = getattr(remembered, "state", remembered)
-    return state if isinstance(state, PairState) else remembered[0]
+    return state if isinstance(state, lifecycle.PairState) else remembered[0]
 
 
 def books_of(folder: Path, pair: str, remembered: Any) -> Any:
-    history: Any = PairHistory
     if "pair" in inspect.signature(PairHistory).parameters:
-        return history(folder, pair, 1000, getattr(remembered, "history_heads", {}))
-    return history(folder / f"history-{pair}.jsonl", 1000, getattr(remembered, "history_head", None))
+        return PairHistory(folder, pair, 1000, getattr(remembered, "history_heads", {}))
+    return PairHistory(folder / f"history-{pair}.jsonl", 1000, getattr(remembered, "history_head", None))
 
 
-def pair_read(store: StateStore, folder: Path, name: str, rig_document: Any) -> dict[str, Any]:
+def pair_read(store: Any, folder: Path, name: str, rig_document: Any) -> dict[str, Any]:
+    load = store.load if hasattr(store, "load") else store.recall
     try:
-        remembered = store.load(rig_from_json(rig_document, None))
+        remembered = load(rig_from_json(rig_document, None))
     except Exception as error:  # whatever an old version raises is what is to be told
         return {"error": f"{type(error).__name__}: {error}"}
     if remembered is None:
@@ -67,7 +72,7 @@ def read(folder: Path, expected: dict[str, Any]) -> dict[str, Any]:
         "pairs": {name: pair_read(store, folder, name, pair["rig"]) for name, pair in expected["pairs"].items()},
     }
     try:
-        told["baseline"] = load_baseline(folder / BASELINES, "front") is not None
+        told["baseline"] = baseline_file.load_baseline(folder / baseline_file.BASELINES, "front") is not None
     except Exception as error:  # likewise
         told["baseline"] = f"{type(error).__name__}: {error}"
     return told
