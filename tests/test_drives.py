@@ -31,7 +31,7 @@ def test_every_module_that_drawing_loads_is_in_the_fingerprint() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=environment(), check=True)
     loaded = {Path(name) for name in done.stdout.split()}
     assert any(path.name == "render.py" for path in loaded)
-    assert loaded <= simulated_drives.modules_behind(simulated_drives.SERVICE / "coec" / "simulation" / "drive.py")
+    assert loaded <= simulated_drives.modules_behind(simulated_drives.SERVICE / "coec_lab" / "simulation" / "drive.py")
 
 
 def test_a_drawn_drive_is_the_drive() -> None:

@@ -102,13 +102,13 @@ def _fingerprint() -> str:
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
         digest.update(f"{library} {version(library)}\n".encode())
-    for path in sorted(set().union(*(modules_behind(SERVICE / "coec" / "simulation" / root) for root in ROOTS))):
+    for path in sorted(set().union(*(modules_behind(SERVICE / "coec_lab" / "simulation" / root) for root in ROOTS))):
         digest.update(f"{path.relative_to(SERVICE)}\n".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def modules_behind(path: Path) -> set[Path]:
-    """The files of coec that a module reaches by its imports, wherever in them an import stands; itself among them."""
+    """The files of coec and coec_lab that a module reaches by its imports, wherever in them an import stands; itself among them."""
     reached: set[Path] = set()
     waiting = [path]
     while waiting:

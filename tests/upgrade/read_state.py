@@ -14,24 +14,17 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+names = import_module(f"{__package__}.names" if __package__ else "names")
+"""The file beside this one, which runs as a program, too."""
 
-def module(*names: str) -> Any:
-    """The first of the modules that this version has."""
-    for name in names:
-        try:
-            return import_module(name)
-        except ModuleNotFoundError:
-            continue
-    raise ModuleNotFoundError(names)
-
-
-# The second names are those of versions until 26 November 2026.
-lifecycle = module("coec.calibration.state", "coec.calibration.lifecycle")
-baseline_file = module("coec.io.baseline_file", "coec.adapters.files.baseline_file")
-rig_files = module("coec.io.rig_files", "coec.adapters.files.rig")
-history_module = module("coec.service.records.history", "coec.runtime.decisions.history")
-incidents = module("coec.service.records.incidents", "coec.runtime.decisions.incidents")
-state_store = module("coec.service.records.state_store", "coec.runtime.decisions.state_store")
+lifecycle = names.first_of("coec.calibration.state", "coec.calibration.lifecycle")
+baseline_file = names.first_of("coec.io.baseline_file", "coec.adapters.files.baseline_file")
+rig_from_json = names.first_of("coec.io.rig_files:rig_from_json", "coec.adapters.files.rig:rig_from_json")
+PairHistory = names.first_of("coec.service.records.history:PairHistory", "coec.runtime.decisions.history:History")
+Incidents = names.first_of("coec.service.records.incidents:Incidents", "coec.runtime.decisions.incidents:Incidents")
+StateStore = names.first_of(
+    "coec.service.records.state_store:StateStore", "coec.runtime.decisions.state_store:StateStore"
+)
 
 
 def state_of(remembered: Any) -> Any:
@@ -41,16 +34,15 @@ def state_of(remembered: Any) -> Any:
 
 
 def books_of(folder: Path, pair: str, remembered: Any) -> Any:
-    history = getattr(history_module, "PairHistory", None) or history_module.History
-    if "pair" in inspect.signature(history).parameters:
-        return history(folder, pair, 1000, getattr(remembered, "history_heads", {}))
-    return history(folder / f"history-{pair}.jsonl", 1000, getattr(remembered, "history_head", None))
+    if "pair" in inspect.signature(PairHistory).parameters:
+        return PairHistory(folder, pair, 1000, getattr(remembered, "history_heads", {}))
+    return PairHistory(folder / f"history-{pair}.jsonl", 1000, getattr(remembered, "history_head", None))
 
 
 def pair_read(store: Any, folder: Path, name: str, rig_document: Any) -> dict[str, Any]:
+    load = store.load if hasattr(store, "load") else store.recall
     try:
-        load = store.load if hasattr(store, "load") else store.recall
-        remembered = load(rig_files.rig_from_json(rig_document, None))
+        remembered = load(rig_from_json(rig_document, None))
     except Exception as error:  # whatever an old version raises is what is to be told
         return {"error": f"{type(error).__name__}: {error}"}
     if remembered is None:
@@ -69,12 +61,12 @@ def pair_read(store: Any, folder: Path, name: str, rig_document: Any) -> dict[st
         "damage": books.damage,
         "history": [kept.entry.text for kept in books.entries()],
         "results": len(books.results()),
-        "windows_of_events": sorted(incidents.Incidents(folder / "evidence", name, 4).window_ids),
+        "windows_of_events": sorted(Incidents(folder / "evidence", name, 4).window_ids),
     }
 
 
 def read(folder: Path, expected: dict[str, Any]) -> dict[str, Any]:
-    store = state_store.StateStore(folder, "shuttle-7")
+    store = StateStore(folder, "shuttle-7")
     told: dict[str, Any] = {
         "damage": list(store.damage),
         "pairs": {name: pair_read(store, folder, name, pair["rig"]) for name, pair in expected["pairs"].items()},

@@ -239,8 +239,9 @@ class FrameSelector:
                 self._end(event, pair.stamp_ns)
                 self._urgency.on_slice_closed(event, self._cutter, self._pace.rate_hz)
             else:
-                detail = f"pairs of {event.carried_over.window_id} since {event.carried_over.since_ns} ns are in no other window"
-                self._losses.add("window", "kept_pairs_forgotten", event.carried_over.pairs, detail=detail)
+                lost = event.carried_over
+                detail = f"pairs of {lost.window_id} since {lost.since_ns} ns are in no other window"
+                self._losses.add("window", "kept_pairs_forgotten", lost.pairs, detail=detail)
         self._frozen |= self._cutter.rejections["frozen"] > frozen_before
         check = self._sampler.offer(pair)
         if check is not None:
