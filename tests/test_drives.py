@@ -22,7 +22,7 @@ from coec.io.recordings.recording_source import parse_spec
 before = set(sys.modules)
 for _ in open_sim(parse_spec({TINY!r}).query).messages():
     pass
-print(*(sys.modules[name].__file__ for name in sys.modules if name.split(".")[0] == "coec" and name not in before))
+print(*(sys.modules[name].__file__ for name in sys.modules if name.split(".")[0] in ("coec", "coec_lab") and name not in before))
 """
 
 
@@ -31,7 +31,7 @@ def test_every_module_that_drawing_loads_is_in_the_fingerprint() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=environment(), check=True)
     loaded = {Path(name) for name in done.stdout.split()}
     assert any(path.name == "render.py" for path in loaded)
-    assert loaded <= simulated_drives.modules_behind(simulated_drives.SERVICE / "coec" / "simulation" / "drive.py")
+    assert loaded <= simulated_drives.modules_behind(simulated_drives.SERVICE / "coec_lab" / "simulation" / "drive.py")
 
 
 def test_a_drawn_drive_is_the_drive() -> None:
