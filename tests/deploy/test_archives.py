@@ -61,7 +61,7 @@ def test_the_wheel_holds_the_networks_whose_cards_are_built_in(wheel: Path) -> N
     assert [path.stem for path in shipped] == ["street"]
     with zipfile.ZipFile(wheel) as archive:
         for path in shipped:
-            assert archive.read(f"coec/adapters/depth/cards/{path.name}") == path.read_bytes()
+            assert archive.read(f"coec/io/depth/cards/{path.name}") == path.read_bytes()
 
 
 def test_the_source_archive_holds_every_file_under_version_control(sdist: Path) -> None:

@@ -223,7 +223,7 @@ def test_the_wheel_of_the_dockerfile_runs_beside_the_packages_of_this_environmen
     (wheel,) = (context / "dist").glob("coec-*.whl")
     target = tmp_path / "installed"
     zipfile.ZipFile(wheel).extractall(target)  # which is what installing a wheel of plain Python comes to
-    assert (target / "coec" / "adapters" / "depth" / "cards" / "street.onnx").is_file()
+    assert (target / "coec" / "io" / "depth" / "cards" / "street.onnx").is_file()
     program = f"import sys; sys.path.insert(0, {str(target)!r}); from coec.cli.main import main; sys.exit(main())"
     checked = [sys.executable, "-I", "-c", program]
     ended = subprocess.run([*checked, *stages()[-1].last("CMD").words()], capture_output=True, text=True, cwd=tmp_path)

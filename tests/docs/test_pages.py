@@ -30,7 +30,7 @@ COMPOSED = {
     "windows_in_vain",
     "service_stuck",
 }
-"""Codes that are put together, or handed on, in `runtime/decisions`; `service_stuck` stands with the wire models."""
+"""Codes that are put together, or handed on, in `service/decisions`; `service_stuck` stands with the wire models."""
 
 
 @pytest.mark.parametrize("name", list(PAGES))
@@ -55,10 +55,10 @@ def reasons_made() -> set[str]:
     """Codes of the reasons that the service makes itself, as they stand in its source."""
     found: set[str] = set()
     for path in (
-        *(PACKAGE / "daemon").glob("*.py"),
-        PACKAGE / "adapters/files/scribe.py",
+        PACKAGE / "daemon.py",
+        PACKAGE / "io/disk_writer.py",
         # Why two LiDARs are not measured is said of them, and of nothing else: `lidars` of the key `rig`.
-        *(path for path in (PACKAGE / "runtime").rglob("*.py") if path.parent.name != "edges"),
+        *(path for path in (PACKAGE / "service").rglob("*.py") if path.name != "lidar_pairs.py"),
     ):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         named = {

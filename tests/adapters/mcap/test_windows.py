@@ -723,7 +723,7 @@ import resource, signal, sys
 sys.path[:0] = {paths!r}
 from pathlib import Path
 from test_windows import CONFIGURATION, a_pair, a_result, a_rig, a_window
-from coec.adapters.mcap.windows import WindowWriter, write_result
+from coec.io.mcap.window_writer import WindowWriter, write_result
 from coec.errors import RecordingError
 folder, limit = Path(sys.argv[1]), int(sys.argv[2])
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # the write then fails with EFBIG, as with ENOSPC on a full disk

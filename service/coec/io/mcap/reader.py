@@ -40,7 +40,7 @@ _FOOTER = struct.Struct("<QQI")
 _TAIL_BYTES = _PREFIX.size + _FOOTER.size + len(MAGIC)
 
 
-class McapDamagedError(CoecError): - caught by name where it becomes a SourceError or a WindowError
+class McapDamagedError(CoecError):
     """The file is not MCAP, is cut off, or a CRC is wrong; the message begins with the offset of the byte.
 
     Attributes:
