@@ -1,6 +1,6 @@
 """Simulated drives for tests: each is drawn once, and kept under pytest's cache until something it is made of changes.
 
-A drive is made of every module of coec that `coec_lab.simulation.drive` and `rig_drive` reach by their imports, and of
+A drive is made of every module that `coec_lab.simulation.drive` and `rig_drive` reach by their imports, and of
 the libraries that draw it: their bytes and versions name the folder, so nobody has to remember to empty it.
 """
 
@@ -102,13 +102,13 @@ def _fingerprint() -> str:
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
         digest.update(f"{library} {version(library)}\n".encode())
-    for path in sorted(set().union(*(modules_behind(SERVICE / "coec" / "simulation" / root) for root in ROOTS))):
+    for path in sorted(set().union(*(modules_behind(SERVICE / "coec_lab" / "simulation" / root) for root in ROOTS))):
         digest.update(f"{path.relative_to(SERVICE)}\n".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def modules_behind(path: Path) -> set[Path]:
-    """The files of coec that a module reaches by its imports, wherever in them an import stands; itself among them."""
+    """The files of both packages that a module reaches by its imports, wherever one stands; itself among them."""
     reached: set[Path] = set()
     waiting = [path]
     while waiting:

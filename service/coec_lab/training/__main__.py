@@ -1,4 +1,4 @@
-"""`python -m coec.simulation.training render|train|export`: see the package."""
+"""`python -m coec_lab.training render|train|export`: see the package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FIRST = 1000
 def main() -> None:
     """Runs the command line."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    parser = argparse.ArgumentParser(prog="python -m coec.simulation.training", description="Our own depth network.")
+    parser = argparse.ArgumentParser(prog="python -m coec_lab.training", description="Our own depth network.")
     commands = parser.add_subparsers(required=True)
     render = commands.add_parser("render", help="render frames to learn from; goes on where it was stopped")
     render.add_argument("folder", type=Path)
