@@ -1,8 +1,7 @@
 """Simulated drives for tests: each is drawn once, and kept under pytest's cache until something it is made of changes.
 
-A drive is made of every module of coec and coec_lab that `coec_lab.simulation.drive` and `rig_drive` reach by their
-imports, and of the libraries that draw it: their bytes and versions name the folder, so nobody has to remember to empty
-it.
+A drive is made of every module that `coec_lab.simulation.drive` and `rig_drive` reach by their imports, and of
+the libraries that draw it: their bytes and versions name the folder, so nobody has to remember to empty it.
 """
 
 from __future__ import annotations
@@ -109,7 +108,7 @@ def _fingerprint() -> str:
 
 
 def modules_behind(path: Path) -> set[Path]:
-    """The files of `service` that a module reaches by its imports, wherever in them an import stands; itself among them."""
+    """The files of both packages that a module reaches by its imports, wherever one stands; itself among them."""
     reached: set[Path] = set()
     waiting = [path]
     while waiting:

@@ -416,7 +416,7 @@ def _placed(sections: tuple[Section, ...]) -> list[_Placed]:
 @cache
 def _environment() -> Environment:
     made = Environment(
-        loader=PackageLoader("coec.reports.page"),
+        loader=PackageLoader("coec.reports"),
         autoescape=True,
         undefined=StrictUndefined,
         finalize=_finalized,
@@ -424,7 +424,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     made.globals.update(
-        drawn=charts.layout, legend=charts.legend, WIDE=charts.WIDE, NARROW=charts.NARROW, SMALL=charts.SMALL,
+        layout=charts.layout, legend=charts.legend, WIDE=charts.WIDE, NARROW=charts.NARROW, SMALL=charts.SMALL,
         disc_place=charts.dot_position, DISC_SIDE=charts.DISC_SIDE_PX, DISC_RADIUS=charts.DISC_RADIUS_PX,
         trend_paths=_trend_paths, TREND_WIDTH=TREND_WIDTH, TREND_HEIGHT=TREND_HEIGHT,
     )  # fmt: skip
@@ -451,7 +451,7 @@ def _prose(text: str) -> Markup:
 
 @cache
 def _asset(name: str) -> str:
-    return (files("coec.reports.page") / "templates" / name).read_text(encoding="utf-8")
+    return (files("coec.reports") / "templates" / name).read_text(encoding="utf-8")
 
 
 def _trend_paths(trend: Trend) -> tuple[str, str]:
