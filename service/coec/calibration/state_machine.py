@@ -70,10 +70,12 @@ class HealthEvent(StrEnum):
 MEANING: Mapping[HealthEvent, str] = MappingProxyType(
     {
         HealthEvent.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
-        HealthEvent.CONFIRMED_EARLIER: "an accepted window is served, or agrees, but its data are older than three periods",
+        HealthEvent.CONFIRMED_EARLIER: "an accepted window is served, or agrees, but its data are older than three "
+        "periods",
         HealthEvent.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
         HealthEvent.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
-        HealthEvent.REFUSED_ELSEWHERE: "a window was refused, but it, or its end, shows a pose other than what is served",
+        HealthEvent.REFUSED_ELSEWHERE: "a window was refused, but it, or its end, shows a pose other than what is "
+        "served",
         HealthEvent.CLEAR: "a check acquits an extrinsic that a window has confirmed",
         HealthEvent.NO_OBJECTION: "a check acquits an extrinsic that no window has confirmed",
         HealthEvent.SUSPECTED: "the monitor suspects that the mount has moved, or checks accuse it and none acquits it "
@@ -81,11 +83,13 @@ MEANING: Mapping[HealthEvent, str] = MappingProxyType(
         HealthEvent.MOUNT_MOVED: "the monitor is certain that the mount has moved",
         HealthEvent.AT_ODDS: "checks accuse the mount, but do not add up to a move",
         HealthEvent.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
-        HealthEvent.NOT_ACQUITTED: "three periods passed in which checks were completed, and none acquits the extrinsic",
+        HealthEvent.NOT_ACQUITTED: "three periods passed in which checks were completed, and none acquits the "
+        "extrinsic",
         HealthEvent.OVERDUE: "no check has been completed for three periods of the monitor",
         HealthEvent.AGED: "no check has been completed for `stale_after_s`",
         HealthEvent.REPLACED: "a person replaced the extrinsic (apply, rollback, reset)",
-        HealthEvent.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing has been checked in the new time",
+        HealthEvent.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing has been checked in the new "
+        "time",
         HealthEvent.RESTARTED: "the service was started again: nothing has been checked since",
     }
 )

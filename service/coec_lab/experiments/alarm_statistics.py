@@ -158,8 +158,8 @@ def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarmCount, 
 def delay(config: MonitorConfig, step_deg: float, steps: int) -> Delay:
     """Steps about drawn axes, each after `SETTLED_CHECKS` checks of a right mount."""
     suspect, confirmed = [], []
-    for number in range(steps):
-        rng = np.random.default_rng([SEED, round(step_deg * 1000), number])
+    for index in range(steps):
+        rng = np.random.default_rng([SEED, round(step_deg * 1000), index])
         truth = np.zeros((SETTLED_CHECKS + PATIENCE_CHECKS, 6))
         truth[SETTLED_CHECKS:, :3] = radians(step_deg) * random_direction(rng)
         first = _first(config, _stream(rng, truth, config), SETTLED_CHECKS)
@@ -173,8 +173,8 @@ def creep(config: MonitorConfig) -> Creep:
     checks = round(CREEP_H * S_PER_H / config.period_s)
     hours = np.arange(checks) * config.period_s / S_PER_H
     suspect, confirmed = [], []
-    for number in range(CREEPS):
-        rng = np.random.default_rng([SEED, number])
+    for index in range(CREEPS):
+        rng = np.random.default_rng([SEED, index])
         truth = np.zeros((checks, 6))
         truth[:, :3] = np.radians(CREEP_DEG_PER_H * hours)[:, None] * random_direction(rng)
         first = _first(config, _stream(rng, truth, config), 0)
@@ -186,8 +186,8 @@ def creep(config: MonitorConfig) -> Creep:
 def from_start(config: MonitorConfig, off_deg: float, rigs: int) -> FromStart:
     """Rigs that are wrong about drawn axes from the first check on."""
     requested_s, levels = [], alarm_levels(config)
-    for number in range(rigs):
-        rng = np.random.default_rng([SEED, round(off_deg * 1000), number, WRONG_CHECKS])
+    for index in range(rigs):
+        rng = np.random.default_rng([SEED, round(off_deg * 1000), index, WRONG_CHECKS])
         truth = np.zeros((WRONG_CHECKS, 6))
         truth[:, :3] = radians(off_deg) * random_direction(rng)
         states = enumerate(_states(_stream(rng, truth, config), levels), start=1)
@@ -196,16 +196,16 @@ def from_start(config: MonitorConfig, off_deg: float, rigs: int) -> FromStart:
 
 
 def _first(config: MonitorConfig, stream: Iterator[Observation], after: int) -> tuple[float, float]:
-    """Checks from number `after` on until the evidence reached the suspect level and the confirmed level."""
+    """Checks from index `after` on until the evidence reached the suspect level and the confirmed level."""
     levels = alarm_levels(config)
     suspect = float("inf")
-    for number, state in enumerate(_states(stream, levels)):
-        if number < after:
+    for index, state in enumerate(_states(stream, levels)):
+        if index < after:
             continue
         if state.evidence >= levels.suspect:
-            suspect = min(suspect, float(number - after + 1))
+            suspect = min(suspect, float(index - after + 1))
         if state.evidence >= levels.confirmed:
-            return suspect, float(number - after + 1)
+            return suspect, float(index - after + 1)
     return suspect, float("inf")
 
 
@@ -239,19 +239,19 @@ def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: Monito
         squares.max(axis=1) / UNCOMMISSIONED.max_farthest2_pose,
     )
     period_ns = round(config.period_s * 1e9)
-    for number in range(checks):
-        begin_ns = number * period_ns
+    for index in range(checks):
+        begin_ns = index * period_ns
         yield Observation(
             stamp_ns=begin_ns + period_ns - 1,
             pair_stamps_ns=tuple(begin_ns + pair for pair in range(config.pairs)),
             metrics=(),
-            offset=offset[number],
+            offset=offset[index],
             sigma=sigma,
             noise=noise,
             place=STREET,
             dispersion=1.0,
-            distance2=float(distance2[number]),
-            flagged=bool(distance2[number] > 1.0),
+            distance2=float(distance2[index]),
+            flagged=bool(distance2[index] > 1.0),
             weak=False,
             flagged_by_paper=None,
             causes=(),

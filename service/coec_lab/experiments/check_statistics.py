@@ -388,8 +388,8 @@ def _moved(
     flagged = sum(check.flagged for check in clear)
     low, high = interval(flagged, len(clear)) if clear else (None, None)
     return MovedStatistics(
-        moved=name, drives=drives, checks=len(everything), blind=tally.blind, weak=tally.weak, undecided=tally.undecided,
-        clear=len(clear), flagged=flagged,
+        moved=name, drives=drives, checks=len(everything), blind=tally.blind, weak=tally.weak,
+        undecided=tally.undecided, clear=len(clear), flagged=flagged,
         flagged_low=low, flagged_high=high, suspected=suspected, confirmed=len(delays), delay_checks=tuple(delays),
     )  # fmt: skip
 

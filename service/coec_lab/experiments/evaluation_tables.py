@@ -265,8 +265,8 @@ def _show_normalised(errors: NormalisedErrorsReport) -> None:
     if errors.nees is not None:
         limits = f"{console.figure(errors.nees_low, 2)} to {console.figure(errors.nees_high, 2)}"
         console.show(
-            f"NEES per axis {errors.nees:.2f}; of true claims {limits} in 95 % of evaluations with {errors.independent} "
-            "results that share no frame"
+            f"NEES per axis {errors.nees:.2f}; of true claims {limits} in 95 % of evaluations with "
+            f"{errors.independent} results that share no frame"
         )
 
 

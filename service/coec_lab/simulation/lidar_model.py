@@ -16,7 +16,8 @@ from coec_lab.simulation.mesh import Floats, Material
 from coec_lab.simulation.scene import Hits, Scene
 from coec_lab.simulation.weather import CLEAR, DROP_M, DROP_REFLECTANCE, Air
 
-DoublesOfPatterns = NDArray[np.float64]
+Doubles = NDArray[np.float64]
+
 
 PRISM_HZ = (121.57, -77.73)
 """Turns of the two prisms, 7294 and -4664 a minute, as in the first Livox sensors. Their ratio is not one of small
@@ -33,8 +34,8 @@ class Fired(NamedTuple):
         offset_s: (columns,) when each column is fired, relative to the stamp.
     """
 
-    rays: DoublesOfPatterns
-    offset_s: DoublesOfPatterns
+    rays: Doubles
+    offset_s: Doubles
 
 
 class Pattern(Protocol):
@@ -143,8 +144,6 @@ def _columns(width_rad: float, columns: int, elevations_rad: tuple[float, ...], 
     )
     return Fired(rays, -period_s * azimuth / width_rad)
 
-
-Doubles = NDArray[np.float64]
 
 WEAKEST = 4.0e-6
 """Returns below this (reflectance · cosine / range², 1/m²) are not detected: a reflectance of 0.05 at 110 m

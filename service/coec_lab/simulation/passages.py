@@ -115,8 +115,6 @@ class Site:
         return np.stack([a[:-1], a[1:], b[1:], b[:-1]], axis=1).astype(np.float32)
 
 
-DoublesOfTunnel = NDArray[np.float64]
-
 HIGH_M = 4.8
 """Height of the ceiling above the road: room for a lorry of 4.0 m and for signs."""
 VERGE_M = 0.8
@@ -145,7 +143,7 @@ class Bore:
         light: of its lamps, relative to those of a tunnel.
     """
 
-    spine: DoublesOfTunnel
+    spine: Doubles
     half_m: float
     high_m: float = HIGH_M
     light: float = 1.0
@@ -185,7 +183,7 @@ def dig(site: Site, span: RoadSpan, part: RoadSpan, lane_m: float) -> None:
 
 
 def _face(site: Site, at_m: float, half_m: float, top_m: float) -> None:
-    def across(*corners: tuple[float, float]) -> DoublesOfTunnel:
+    def across(*corners: tuple[float, float]) -> Doubles:
         """(4, 3) of corners (left, up)."""
         left, up = np.array(corners).T
         return site.road.points(at_m, left, up) - site.origin_m

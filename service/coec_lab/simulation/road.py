@@ -67,8 +67,7 @@ def _waves(rng: np.random.Generator, s_m: Doubles, sizes: tuple[float, ...], len
     return total
 
 
-DoublesOfTraffic = NDArray[np.float64]
-Progress = Callable[[DoublesOfTraffic], DoublesOfTraffic]
+Progress = Callable[[Doubles], Doubles]
 """Arc length in metres at times in seconds."""
 
 MODELS = 10
@@ -93,7 +92,7 @@ class Mover:
     left_m: float
     oncoming: bool
 
-    def poses(self, road: Road, time_s: DoublesOfTraffic) -> DoublesOfTraffic:
+    def poses(self, road: Road, time_s: Doubles) -> Doubles:
         """(N, 4): x, y, z in metres and heading in radians."""
         s = self.progress(time_s)
         xyz = road.points(s, self.left_m, 0.0)

@@ -20,7 +20,8 @@ from coec_lab.simulation.passages import SPINE_M
 from coec_lab.simulation.scene import Hits, Scene
 from coec_lab.simulation.weather import Sky
 
-DoublesOfLamps = NDArray[np.float64]
+Doubles = NDArray[np.float64]
+
 
 # Unit of light: that of the sun on a white wall, as in `Sky`.
 MOUTH_SHARE, MOUTH_DEPTH_M = 0.5, 7.0
@@ -45,7 +46,7 @@ class Incident(NamedTuple):
     lamps: Floats
 
 
-def incident(scene: Scene, origin_m: DoublesOfLamps, directions: Floats, hits: Hits) -> Incident:
+def incident(scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits) -> Incident:
     """The light, by lamps and tunnels, at the points where rays from `origin_m` (world) hit something."""
     share, lamps = np.ones(len(directions), np.float32), np.zeros(len(directions), np.float32)
     origin = np.asarray(origin_m, np.float64)
@@ -57,7 +58,7 @@ def incident(scene: Scene, origin_m: DoublesOfLamps, directions: Floats, hits: H
     return Incident(share, lamps)
 
 
-def around(scene: Scene, place_m: DoublesOfLamps) -> tuple[float, float]:
+def around(scene: Scene, place_m: Doubles) -> tuple[float, float]:
     """Share of the sky's light, and light of lamps, on a surface at a place (3,), world, that faces down."""
     still = Hits(np.zeros(1, np.float32), np.zeros(1, np.int32), np.array([[0.0, 0.0, -1.0]], np.float32))
     light = incident(scene, place_m, np.array([[0.0, 0.0, 1.0]], np.float32), still)
@@ -70,7 +71,7 @@ def night_sky(sky: Sky) -> Sky:
     return replace(sky, sun=(0.0, 0.0, 0.0), zenith=(zenith,) * 3, horizon=(horizon,) * 3)
 
 
-def headlights(T_world_ego: Matrix4) -> DoublesOfLamps:
+def headlights(T_world_ego: Matrix4) -> Doubles:
     """(2, 4, 3): for each dipped beam its place and its axes forward, left and up, world."""
     axes = T_world_ego[:3, :3].T
     return np.array(
@@ -80,7 +81,7 @@ def headlights(T_world_ego: Matrix4) -> DoublesOfLamps:
 
 @njit(cache=True, parallel=PRANGE)
 def _in_bore(
-    origin: DoublesOfLamps, directions: Floats, range_m: Floats, normal: Floats, spine: DoublesOfLamps, half_m: float, high_m: float,
+    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, spine: Doubles, half_m: float, high_m: float,
     light: float, share: Floats, lamps: Floats,
 ) -> None:  # fmt: skip
     last = len(spine) - 1
@@ -112,7 +113,7 @@ def _in_bore(
 
 @njit(cache=True, parallel=PRANGE)
 def _headlit(
-    origin: DoublesOfLamps, directions: Floats, range_m: Floats, normal: Floats, beams: DoublesOfLamps, lamps: Floats
+    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, beams: Doubles, lamps: Floats
 ) -> None:
     for i in prange(len(directions)):
         r = float(range_m[i])
@@ -137,8 +138,6 @@ def _headlit(
             beam = math.exp(-across * across - over * over) + BEAM_SPILL
             lamps[i] += BEAM_LIGHT_M2 * beam * facing / squared
 
-
-Doubles = NDArray[np.float64]
 
 # The numbers of `Material`, as constants of the compiled code.
 ASPHALT, PAVING, GRASS, BRICK, PLASTER, GLASS, LACQUER, FOLIAGE, BARK, TILES, MARKING = range(1, 12)

@@ -186,7 +186,8 @@ class SimulatedLidar:
         if self._own_body is not None:
             measured = _past(self._own_body, mounted, measured)
         return LidarFrame(
-            stamp_ns, self._wire.name, measured.xyz_m, measured.intensity, measured.ring, measured.time_offset_s, sequence=index
+            stamp_ns, self._wire.name, measured.xyz_m, measured.intensity, measured.ring, measured.time_offset_s,
+            sequence=index,
         )  # fmt: skip
 
 

@@ -19,7 +19,9 @@ from coec_lab.simulation.mesh import Colour, Material, Mesh, box, join, quads, t
 from coec_lab.simulation.passages import Passages, Site, dig
 from coec_lab.simulation.road import Road
 
-DoublesOfHouses = NDArray[np.float64]
+Doubles = NDArray[np.float64]
+
+
 Floating = NDArray[np.floating]
 
 FOOT_M = -2.5
@@ -78,9 +80,9 @@ def _wall(
     rng: np.random.Generator,
     plan: HousePlan,
     width_m: float,
-    colour: DoublesOfHouses,
+    colour: Doubles,
     kind: Material,
-    frame: DoublesOfHouses,
+    frame: Doubles,
     *,
     door: bool,
 ) -> Mesh:
@@ -158,7 +160,7 @@ def _turned(mesh: Mesh, at_m: tuple[float, float], angle_rad: float) -> Mesh:
     return mesh.placed(at_m[0], at_m[1], 0.0, angle_rad)
 
 
-def _roof(rng: np.random.Generator, plan: HousePlan, colour: DoublesOfHouses, wall: Material) -> Mesh:
+def _roof(rng: np.random.Generator, plan: HousePlan, colour: Doubles, wall: Material) -> Mesh:
     w, d, h = plan.width_m, plan.depth_m, plan.height_m
     if not plan.gabled:
         top, rim = h + rng.uniform(0.3, 0.9), 0.3
@@ -192,7 +194,7 @@ def _roof(rng: np.random.Generator, plan: HousePlan, colour: DoublesOfHouses, wa
     return join(parts)
 
 
-def _balconies(rng: np.random.Generator, plan: HousePlan, frame: DoublesOfHouses) -> Mesh:
+def _balconies(rng: np.random.Generator, plan: HousePlan, frame: Doubles) -> Mesh:
     width = rng.uniform(2.0, 3.5)
     x = rng.uniform(0.3, max(0.4, plan.width_m - width - 0.3))
     out = rng.uniform(0.9, 1.4)
@@ -205,8 +207,6 @@ def _balconies(rng: np.random.Generator, plan: HousePlan, frame: DoublesOfHouses
             parts.append(box([post, -out, z + 0.16], [post + 0.03, -out + 0.03, z + 0.95], frame, Material.PAINT))
     return join(parts)
 
-
-Doubles = NDArray[np.float64]
 
 STRETCH_M = 48.0
 GROUND_STEP_M = 3.0

@@ -30,7 +30,8 @@ from coec_lab.simulation.vehicle_motion import P_EGO_CAMERA_M, body
 from coec_lab.simulation.weather import sample_sky
 from coec_lab.training.training_frames import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, TrainingFrame
 
-DoublesOfScenes = NDArray[np.float64]
+Doubles = NDArray[np.float64]
+
 
 PLACES = 3
 """Places of each seed."""
@@ -121,7 +122,7 @@ class JamScene:
         """See `Place`."""
         return self._scene
 
-    def _on_road(self, mesh: Mesh, ahead_m: float, left_m: float, origin_m: DoublesOfScenes) -> Mesh:
+    def _on_road(self, mesh: Mesh, ahead_m: float, left_m: float, origin_m: Doubles) -> Mesh:
         s = self._at_m + ahead_m
         x, y, z = self._road.points(s, left_m, 0.0) - origin_m
         return mesh.placed(x, y, z, float(self._road.at(s)[3]))
@@ -180,7 +181,7 @@ def _ego(road: Road, at_m: float, left_m: float, rng: np.random.Generator) -> Ma
     return _upright(road.points(at_m, left_m, 0.0), heading)
 
 
-def _upright(position_m: DoublesOfScenes | list[float], heading_rad: float) -> Matrix4:
+def _upright(position_m: Doubles | list[float], heading_rad: float) -> Matrix4:
     pose = np.eye(4)
     pose[:3, :3] = rotation_exp(np.array([0.0, 0.0, heading_rad]))
     pose[:3, 3] = position_m
@@ -214,7 +215,7 @@ def _bridge(rng: np.random.Generator) -> Mesh:
     return join([deck, quads([under], colour, Material.CONCRETE), *pillars])
 
 
-def _doors(a: DoublesOfScenes, b: DoublesOfScenes, height_m: float, rng: np.random.Generator) -> list[Mesh]:
+def _doors(a: Doubles, b: Doubles, height_m: float, rng: np.random.Generator) -> list[Mesh]:
     """Gates and doors, some ribbed, 5 cm in front of a wall from a to b (2,)."""
     inward = -(a + b) / 2
     inward /= np.linalg.norm(inward)
@@ -235,7 +236,7 @@ def _doors(a: DoublesOfScenes, b: DoublesOfScenes, height_m: float, rng: np.rand
 def _block(
     x_m: float,
     y_m: float,
-    half_m: DoublesOfScenes,
+    half_m: Doubles,
     low_m: float,
     high_m: float,
     rng: np.random.Generator,
@@ -252,8 +253,6 @@ def _grey(rng: np.random.Generator) -> NDArray[np.float64]:
     """A colour of walls: grey with a hint of a tint."""
     return np.clip(rng.uniform(0.06, 0.8) * np.exp(rng.normal(0, 0.08, 3)), 0, 1)
 
-
-Doubles = NDArray[np.float64]
 
 FRAMES_PER_PLACE = 4
 """More than one, because laying out a place takes longer than rendering a frame."""

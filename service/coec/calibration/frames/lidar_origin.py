@@ -114,8 +114,6 @@ def elevation_rad(xyz_m: Doubles, cones: Doubles) -> Doubles:
     return np.asarray(np.arctan2(along_m, across_m))
 
 
-DoublesOfConcatenation = NDArray[np.float64]
-
 MIN_SEPARATION_M = 0.3
 """Origins nearer to each other than this count as one: the height of a sensor."""
 
@@ -149,7 +147,7 @@ class SeveralOrigins:
         cause, setting: as in `ApparentOrigin`.
     """
 
-    cones: tuple[DoublesOfConcatenation, DoublesOfConcatenation]
+    cones: tuple[Doubles, Doubles]
 
     cause: ClassVar[str] = "cloud_concatenated"
     setting: ClassVar[str] = "source"
@@ -188,9 +186,7 @@ def several_origins(rings: Rings, before: SeveralOrigins | None = None) -> Sever
     return SeveralOrigins((cones, second[1]))
 
 
-def _beginning(
-    rings: Rings, guesses: tuple[DoublesOfConcatenation, ...]
-) -> tuple[Rings, DoublesOfConcatenation] | None:
+def _beginning(rings: Rings, guesses: tuple[Doubles, ...]) -> tuple[Rings, Doubles] | None:
     """The longest block at the beginning of the points that lies on cones, and those cones; None if none does."""
     for share in BEGINNINGS:
         block = rings.part(0, int(share * len(rings.xyz_m)))
@@ -204,7 +200,7 @@ def _beginning(
     return None
 
 
-def _fits(rings: Rings, block: Rings, cones: DoublesOfConcatenation) -> NDArray[np.bool_]:
+def _fits(rings: Rings, block: Rings, cones: Doubles) -> NDArray[np.bool_]:
     """(N,) whether each point lies on the beam of its ring in the block; rings that are not in the block have no
     beam."""
     beams_rad = np.full(int(rings.names.max()) + 1, np.nan)
@@ -218,14 +214,12 @@ def _ends(fits: NDArray[np.bool_], end: int) -> bool:
     return bool(fits[:end].mean() >= WITHIN and fits[end:].mean() <= BEYOND)
 
 
-def _sectors(xyz_m: DoublesOfConcatenation, cones: DoublesOfConcatenation) -> NDArray[np.bool_]:
+def _sectors(xyz_m: Doubles, cones: Doubles) -> NDArray[np.bool_]:
     """(SECTORS,) whether each sector holds points, seen from the tip of the cones."""
     ray_m = xyz_m - cones[:3]
     sector = ((np.arctan2(ray_m[:, 1], ray_m[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
     return np.bincount(sector, minlength=SECTORS) > 0
 
-
-DoublesOfOrigin = NDArray[np.float64]
 
 POINTS = 6000
 """How many evenly chosen points are used: some hundred per ring of a 64-beam sensor."""
@@ -297,7 +291,7 @@ class OriginCheck:
     """
 
     def __init__(self) -> None:
-        self._cones: DoublesOfOrigin | None = None
+        self._cones: Doubles | None = None
         self._several: SeveralOrigins | None = None
         self._unexplained = 0
 
@@ -322,10 +316,10 @@ class OriginCheck:
         spread_rad = rings.spread_rad(cones)
         return ApparentOrigin((x, y, z), spread_rad, stated_rad) if math.hypot(x, y, z) >= MIN_SEPARATION_M else None
 
-    def _one_of(self, rings: Rings, stated_rad: float) -> DoublesOfOrigin | None:
+    def _one_of(self, rings: Rings, stated_rad: float) -> Doubles | None:
         """The cones of a single LiDAR, if they explain the rings."""
 
-        def explain(cones: DoublesOfOrigin) -> bool:
+        def explain(cones: Doubles) -> bool:
             return rings.spread_rad(cones) <= EXPLAINED * stated_rad
 
         if self._cones is None or not explain(self._cones):

@@ -37,7 +37,9 @@ from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, in_image, project_point
 from coec.geometry.points import BAND_RAD, distinct_rings
 
-NS_PER_S_BETWEEN = 1_000_000_000
+NS_PER_S = 1_000_000_000
+
+
 MIB = 2**20
 
 POINTS = 12_000
@@ -74,7 +76,7 @@ class BetweenPairs:
     def begin(self, config: WindowConfig, start_ns: int, length_ns: int) -> None:
         """Begins a slice that is cut by `config`. If its chosen pairs will be so near to each other that they show the
         time as well, it has no pairs between."""
-        spacing_ns = round(config.between_s * NS_PER_S_BETWEEN)
+        spacing_ns = round(config.between_s * NS_PER_S)
         enabled = config.between_mib > 0 and length_ns >= 2 * spacing_ns * config.pairs
         self._open = (
             _ThinnedSlice(start_ns, length_ns, spacing_ns, config.between_mib * MIB, start_ns) if enabled else None
@@ -147,8 +149,6 @@ def _bytes(lidar: LidarFrame) -> int:
     return sum(column.nbytes for column in (lidar.xyz_m, lidar.ring, lidar.time_offset_s) if column is not None)
 
 
-NS_PER_S_SAMPLING = 1_000_000_000
-
 SPAN_PERIODS = 6
 """Periods that the pairs of one check may span. The slowest useful stream, with a pair per period, fills the four pairs
 of a check in four periods; two more allow for losses. Pairs further apart do not belong to one check. From then on its
@@ -174,7 +174,7 @@ class CheckSampler:
 
     def __init__(self, config: MonitorConfig) -> None:
         self._config = config
-        self._period_ns = round(config.period_s * NS_PER_S_SAMPLING)
+        self._period_ns = round(config.period_s * NS_PER_S)
         self._pairs: list[FramePair] = []
         self._new = 0
         self._period = self._cell = -1
@@ -204,8 +204,6 @@ class CheckSampler:
             del self._pairs[: -self._config.pairs]
         return check
 
-
-NS_PER_S = 1_000_000_000
 
 CELLS = 180
 """Cells of the table of directions in view, from the optical axis to its opposite (1° each) and all around it (2°)."""
@@ -466,8 +464,6 @@ TRIES = 3
 
 MARGIN = 1.2
 """Factor by which a slice is longer than its pairs need at the rate at which they come."""
-
-NS_PER_S_URGENT = 1_000_000_000
 
 
 class UrgentWindow:

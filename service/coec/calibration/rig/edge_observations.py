@@ -541,8 +541,6 @@ def _volume(covariance: Array) -> Array:
     return np.asarray(0.5 * linalg.log_determinant(linalg.cholesky(covariance)) + 3.0 * log(2.0 * pi))
 
 
-ArrayOfRegistration = NDArray[np.float64]
-
 PLACE = np.array([radians(0.02)] * 3 + [0.004] * 3)
 """Standard deviation by which the pose between two LiDARs differs from street to street, beyond what a look claims
 (rad, m): within simulated drives (seeds 41000 to 41005) looks scattered by 0.01 to 0.03° and 1 to 4 mm."""
@@ -560,7 +558,7 @@ UNDETERMINED_TIMES = 5.0
 of such looks together then say less than was known before."""
 
 
-def determined_covariance(covariance: ArrayOfRegistration) -> ArrayOfRegistration | None:
+def determined_covariance(covariance: Array) -> Array | None:
     """The covariance (6, 6) of what the surroundings determined; None if they determined no direction. Directions in
     which they say hardly more than was known before are made so wide that they count as not determined.
 
@@ -578,9 +576,7 @@ def determined_covariance(covariance: ArrayOfRegistration) -> ArrayOfRegistratio
     return widened * unit if any_determined else None
 
 
-def observation_of_registration(
-    edge: str, stamp_ns: int, T_a_b: Matrix4, covariance: ArrayOfRegistration
-) -> EdgeObservation:
+def observation_of_registration(edge: str, stamp_ns: int, T_a_b: Matrix4, covariance: Array) -> EdgeObservation:
     """A look at an edge that found `T_a_b` (4, 4); `covariance` (6, 6) is that of `told_by`.
 
     Raises:
@@ -589,7 +585,7 @@ def observation_of_registration(
     return EdgeObservation(edge, stamp_ns, T_a_b, information_of(covariance), PLACE, BIAS)
 
 
-def window_of(stamp_ns: int, T_a_b: Matrix4, covariance: ArrayOfRegistration) -> Measurement:
+def window_of(stamp_ns: int, T_a_b: Matrix4, covariance: Array) -> Measurement:
     """The same for the joint estimate. There it stands for all looks at the edge, so the errors that they have in
     common count as noise."""
     return Measurement(T_a_b, Uncertainty(covariance + np.diag(PLACE**2 + BIAS**2), {}, float("nan")), stamp_ns)

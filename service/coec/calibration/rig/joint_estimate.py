@@ -44,7 +44,8 @@ from coec.calibration.types import Matrix4
 from coec.config import TrackerConfig
 from coec.geometry import linalg, se3
 
-ArrayOfSystem = NDArray[np.float64]
+Array = NDArray[np.float64]
+
 
 BUILT = np.array([radians(5.0)] * 3 + [0.3] * 3)
 """How far each sensor may be from where the vehicle was built (rad, m): wide beside all that is measured, because it
@@ -88,11 +89,11 @@ class MeasuredEdge:
 
     known: KnownTransform
     T_a_b: Matrix4
-    information: ArrayOfSystem  # (6, 6) of the noise
-    shared: Mapping[str, ArrayOfSystem]  # (6,) shift by one standard deviation, by owner and name of the error
+    information: Array  # (6, 6) of the noise
+    shared: Mapping[str, Array]  # (6,) shift by one standard deviation, by owner and name of the error
 
     @property
-    def covariance(self) -> ArrayOfSystem:
+    def covariance(self) -> Array:
         """(6, 6) of all errors; at least as wide as `BUILT` on axes that were not determined."""
         noise = linalg.inverse(self.information + np.diag(1.0 / BUILT**2) * 1e-2)
         for name in sorted(self.shared):
@@ -107,7 +108,7 @@ class Solution:
     poses: tuple[Matrix4, ...]
     chi2: float
     freedom: int
-    of_edges: ArrayOfSystem
+    of_edges: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,9 +181,7 @@ class System:
             of_edges=linalg.product(linalg.product(design, covariance), design.T),
         )
 
-    def _linear(
-        self, one: MeasuredEdge, poses: Sequence[Matrix4], shared: ArrayOfSystem
-    ) -> tuple[ArrayOfSystem, ArrayOfSystem]:
+    def _linear(self, one: MeasuredEdge, poses: Sequence[Matrix4], shared: Array) -> tuple[Array, Array]:
         """The derivative (6, unknowns) of a measurement, and its residual (6,) at some poses."""
         known = one.known
         away = se3.difference(one.T_a_b, self.predicted(poses, known.a, known.b))
@@ -194,7 +193,7 @@ class System:
             common, shared
         )
 
-    def _design(self, poses: Sequence[Matrix4], a: str, b: str) -> ArrayOfSystem:
+    def _design(self, poses: Sequence[Matrix4], a: str, b: str) -> Array:
         """(6, 6·S) how T_a_b moves with the sensors."""
         design = np.zeros((6, 6 * len(poses)))
         i, j = 6 * self.graph.place[a], 6 * self.graph.place[b]
@@ -211,7 +210,7 @@ def _of_window(known: KnownTransform, window: Measurement) -> MeasuredEdge:
     except ValueError as error:
         raise ValueError(f"{known.name}: {error}") from error
     determined = information.diagonal() > 0.0
-    shared: dict[str, ArrayOfSystem] = {}
+    shared: dict[str, Array] = {}
     for name, shift in window.uncertainty.systematic.items():
         if shift.shape != (6,) or not np.isfinite(shift[determined]).all() or np.abs(shift[determined]).max() > 10.0:
             raise ValueError(f"{known.name}: the error {name} must be a shift of six finite numbers")
@@ -295,8 +294,6 @@ def remembered(known: Measurement, stamp_ns: int) -> Measurement:
             noise = noise + shift[:, None] * shift
     return replace(known, uncertainty=replace(uncertainty, noise=noise, systematic=lasting))
 
-
-Array = NDArray[np.float64]
 
 INCONSISTENT_AT = 1e-3
 """Chance of a sum of squares below which the pairs do not fit each other: by chance that happens once in a thousand

@@ -40,7 +40,8 @@ from coec.geometry.linalg import congruent, eigen, inverted, solved
 from coec.geometry.points import lengths
 from coec.geometry.sweep_kernels import deskew, planes_through
 
-DoublesOfSweeps = NDArray[np.float64]
+Doubles = NDArray[np.float64]
+
 
 THINNED_M = 0.3
 """One point of b is kept in every cube of this size; otherwise near things would count for everything."""
@@ -60,19 +61,19 @@ class Cloud:
         T_a_ego: (4, 4) maps ego coordinates to those of a.
     """
 
-    a_m: DoublesOfSweeps
+    a_m: Doubles
     raw_b_m: NDArray[np.float32]
-    after_s: DoublesOfSweeps
+    after_s: Doubles
     motion: EgoMotion | None
     T_a_ego: Matrix4
 
-    def b_m(self, T_a_b: Matrix4) -> DoublesOfSweeps:
+    def b_m(self, T_a_b: Matrix4) -> Doubles:
         """(M, 3) the points of b in the frame of b at the instant, if b has the pose T_a_b (4, 4) in a. They depend on
         that pose, because a turned LiDAR moves another way in its own frame: 1.4 cm aside in 90 ms at 8 m/s and 1°."""
         return _at(self.raw_b_m, self.after_s, self.motion, se3.inverse(T_a_b) @ self.T_a_ego)
 
     @property
-    def twist(self) -> DoublesOfSweeps:
+    def twist(self) -> Doubles:
         """(6,) twist of a in its own frame, rad/s and m/s; zero if unknown."""
         if self.motion is None:
             return np.zeros(6)
@@ -91,15 +92,13 @@ def clouds_of(rig: LidarRig, pair: SweepPair) -> Cloud:
     return Cloud(a_m, np.ascontiguousarray(b.xyz_m[indices]), after_s, pair.motion, rig.T_a_ego)
 
 
-def _offsets_s(sweep: LidarFrame, timing: SweepTiming | None) -> DoublesOfSweeps:
+def _offsets_s(sweep: LidarFrame, timing: SweepTiming | None) -> Doubles:
     if sweep.time_offset_s is not None:
         return sweep.time_offset_s.astype(np.float64)
     return np.zeros(len(sweep.xyz_m)) if timing is None else azimuth_offsets_s(sweep.xyz_m, timing)
 
 
-def _at(
-    xyz_m: NDArray[np.float32], after_s: DoublesOfSweeps, motion: EgoMotion | None, T_lidar_ego: Matrix4
-) -> DoublesOfSweeps:
+def _at(xyz_m: NDArray[np.float32], after_s: Doubles, motion: EgoMotion | None, T_lidar_ego: Matrix4) -> Doubles:
     if motion is None:
         return xyz_m.astype(np.float64)
     angular, linear = sensor_twist(motion, T_lidar_ego)
@@ -113,8 +112,6 @@ def _first_of_each_cube(points_m: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.sort(first)
 
 
-DoublesOfSpread = NDArray[np.float64]
-
 AZIMUTHS, ELEVATIONS = 8, 2
 """Sectors of the surroundings of a: by azimuth, and above or below its horizon."""
 CLOCK_S = 0.001
@@ -127,9 +124,7 @@ LEANING = 2.0
 no better than a variance of a dozen neighbours."""
 
 
-def covariance_of(
-    met: Met, weight: DoublesOfSpread, prior: DoublesOfSpread, noise_m: float, clouds: Sequence[Cloud]
-) -> DoublesOfSpread:
+def covariance_of(met: Met, weight: Doubles, prior: Doubles, noise_m: float, clouds: Sequence[Cloud]) -> Doubles:
     """The covariance (8, 8) of ξ and of the range biases of a and b.
 
     Args:
@@ -154,19 +149,19 @@ def covariance_of(
     return _no_wider(covariance, prior) + np.outer(moved, moved) + resolution
 
 
-def _held(information: DoublesOfSpread, prior: DoublesOfSpread) -> DoublesOfSpread:
+def _held(information: Doubles, prior: Doubles) -> Doubles:
     """The matrix without its negative eigenvalues, with each unknown in units of its prior."""
     unit = prior[:, None] * prior
     return _reshaped(information * unit, lambda value: max(value, 0.0)) / unit
 
 
-def _no_wider(covariance: DoublesOfSpread, prior: DoublesOfSpread) -> DoublesOfSpread:
+def _no_wider(covariance: Doubles, prior: Doubles) -> Doubles:
     """The covariance combined with the prior, because a scatter that few points hold may be wider than the prior."""
     unit = prior[:, None] * prior
     return _reshaped(covariance / unit, lambda value: max(value, 0.0) / (1.0 + max(value, 0.0))) * unit
 
 
-def _reshaped(symmetric: DoublesOfSpread, of: Callable[[float], float]) -> DoublesOfSpread:
+def _reshaped(symmetric: Doubles, of: Callable[[float], float]) -> Doubles:
     """The matrix (8, 8) with its eigenvalues replaced by a function of them."""
     result = np.zeros((8, 8))
     for value, vector in eigen(symmetric.tolist()):
@@ -174,7 +169,7 @@ def _reshaped(symmetric: DoublesOfSpread, of: Callable[[float], float]) -> Doubl
     return result
 
 
-def _cells(met: Met, score: DoublesOfSpread) -> DoublesOfSpread:
+def _cells(met: Met, score: Doubles) -> Doubles:
     """(8, pairs, sectors) sums of the score (N, 8) over each pair and sector."""
     azimuth = np.arctan2(met.place[:, 1], met.place[:, 0])
     around = np.minimum(((azimuth / (2 * np.pi) + 0.5) * AZIMUTHS).astype(np.int64), AZIMUTHS - 1)
@@ -185,8 +180,6 @@ def _cells(met: Met, score: DoublesOfSpread) -> DoublesOfSpread:
         np.add.at(cells[column], (met.pair, sector), score[:, column])
     return cells
 
-
-Doubles = NDArray[np.float64]
 
 REACHES_M = (2.0, 1.0, 0.6, 0.4, 0.3)
 """How far a point may lie from its surface, step by step: 5° at 20 m is 1.7 m. The last reach is repeated until the

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.frames.window import NS_PER_S_BETWEEN, BetweenPairs
+from coec.calibration.frames.window import NS_PER_S, BetweenPairs
 from coec.calibration.search.prior import MOUNT_RAD
 from coec.calibration.types import FramePair, Matrix4, Window
 from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
@@ -231,7 +231,7 @@ def _pairs(recording: RecordingSource, window: Window, config: WindowConfig) -> 
     for index, stamp_ns in enumerate(recording.camera_stamps_ns):
         if not window.pairs[0].stamp_ns <= stamp_ns <= window.stamp_ns:
             continue
-        if stamp_ns in own or stamp_ns - last_ns >= round(config.between_s * NS_PER_S_BETWEEN):
+        if stamp_ns in own or stamp_ns - last_ns >= round(config.between_s * NS_PER_S):
             selected.append(index)
             last_ns = stamp_ns
     pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
