@@ -165,10 +165,10 @@ def test_without_a_network_the_one_that_comes_with_coec_is_used(coec: Coec) -> N
 @pytest.mark.parametrize(
     ("arguments", "module"),
     [
-        (("evaluate", SMALL, "--rotation-deg", 1), "library.evaluating"),
-        (("commission", SMALL), "adapters.depth.maps"),
-        (("diagnose", SMALL), "adapters.depth.maps"),
-        (("paper", SMALL), "cli.paper"),
+        (("evaluate", SMALL, "--rotation-deg", 1), "coec_lab.experiments.evaluation_run"),
+        (("commission", SMALL), "coec.io.depth.depth_maps"),
+        (("diagnose", SMALL), "coec.io.depth.depth_maps"),
+        (("paper", SMALL), "coec_lab.commands.paper_experiments"),
     ],
 )
 def test_so_do_the_other_commands(
@@ -180,7 +180,7 @@ def test_so_do_the_other_commands(
         asked.append(config)
         raise UsageError("enough")
 
-    monkeypatch.setattr(f"coec.{module}.open_depth", enough)
+    monkeypatch.setattr(f"{module}.open_depth", enough)
     assert coec(*arguments).status == 2
     assert asked == [DepthConfig()]
 

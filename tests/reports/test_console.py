@@ -104,9 +104,9 @@ SINKS = {
     PACKAGE / "reports" / "plain_text.py",
     PACKAGE / "reports" / "console.py",
     # Each of its formatters escapes the line that it makes.
-    PACKAGE / "adapters" / "system" / "logs.py",
+    PACKAGE / "io" / "logs.py",
     # It prints fixed texts of the repository, and only its developers run it.
-    PACKAGE / "schemas" / "export.py",
+    PACKAGE.parent / "coec_lab" / "experiments" / "schema_export.py",
 }
 """Where text may go to standard output and standard error."""
 

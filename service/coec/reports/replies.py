@@ -100,8 +100,8 @@ def _lost(pairs: Sequence[replies.PairStatus]) -> list[str]:
     for place in PLACES:
         by_cause: dict[str, dict[str, int]] = {}
         for pair in pairs:
-            for cause, count in sorted(_causes(pair)[place].items()):
-                by_cause.setdefault(cause, {})[pair.name] = count
+            for cause, lost in sorted(_causes(pair)[place].items()):
+                by_cause.setdefault(cause, {})[pair.name] = lost
         for cause, counts in sorted(by_cause.items()):
             most = sorted(counts, key=lambda name: (-counts[name], name))
             whole = f"{counts[most[0]]}" if len(set(counts.values())) == 1 else f"up to {counts[most[0]]}"
