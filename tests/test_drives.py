@@ -22,7 +22,8 @@ from coec.io.recordings.recording_source import parse_spec
 before = set(sys.modules)
 for _ in open_sim(parse_spec({TINY!r}).query).messages():
     pass
-print(*(sys.modules[name].__file__ for name in sys.modules if name.split(".")[0] in ("coec", "coec_lab") and name not in before))
+new = (name for name in sys.modules if name.split(".")[0] in ("coec", "coec_lab") and name not in before)
+print(*(sys.modules[name].__file__ for name in new))
 """
 
 

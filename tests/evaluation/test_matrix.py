@@ -31,7 +31,8 @@ def solved(
 ) -> SolvedWindow:
     rotation, translation = (math.hypot(*(value or 0.0 for value in part)) for part in (error[:3], error[3:]))
     return SolvedWindow(
-        pairs=10, start_deg=5.0, start_m=0.0, accepted=accepted, hit=matrix_statistics.is_hit(rotation, translation, dof),
+        pairs=10, start_deg=5.0, start_m=0.0, accepted=accepted,
+        hit=matrix_statistics.is_hit(rotation, translation, dof),
         rotation_deg=rotation, translation_m=translation, error=error, sigma=sigma, reasons=reasons, evaluations=100,
         failure=None,
     )  # fmt: skip

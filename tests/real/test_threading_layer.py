@@ -38,7 +38,8 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 @pytest.mark.fault("TBB is installed (libtbb12, a dependency of OpenCV and ROS)", "commands end; TBB is not used")
 @pytest.mark.usefixtures("tbb")
 def test_a_command_that_runs_parallel_kernels_ends(tmp_path: Path) -> None:
-    code = "import numba; from coec.geometry import mutual_information; from coec import cli; import sys; status = cli.main(); "
+    code = "import numba, sys; from coec.geometry import mutual_information; from coec.cli.main import main; "
+    code += "status = main(); "
     code += "print('layer', numba.threading_layer()); sys.exit(status)"
     drive = tmp_path / "drive.mcap"
     made = run("-m", "coec", "sim", "drive", "--output", drive, "--seconds", "8")

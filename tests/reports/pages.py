@@ -167,8 +167,8 @@ DETECTION = DetectionReport(
 
 
 OUTCOMES = [
-    SolveOutcome(Trial(np.eye(4), None, 1.0), np.eye(4), np.array([*error, 0.0, 0.0, 0.0]), float(np.linalg.norm(error)),
-            0.0, float(np.linalg.norm(error)) / HIT_RAD, bool(accepted))
+    SolveOutcome(Trial(np.eye(4), None, 1.0), np.eye(4), np.array([*error, 0.0, 0.0, 0.0]),
+            float(np.linalg.norm(error)), 0.0, float(np.linalg.norm(error)) / HIT_RAD, bool(accepted))
     for error, accepted in zip(
         np.radians(np.random.default_rng(2).normal(0.0, 0.4, (12, 3))), (True, False) * 6, strict=True
     )

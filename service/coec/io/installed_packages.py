@@ -92,7 +92,8 @@ def installed_packages(name: str) -> dict[str, Package]:
             metadata = distribution(requirement[0])
         except PackageNotFoundError as error:
             raise NotFoundError(
-                f"the package {requirement[0]} is needed but not installed: install coec with all of them (pip install coec)"
+                f"the package {requirement[0]} is needed but not installed: install coec with all of them "
+                "(pip install coec)"
             ) from error
         needs = list(_needs(metadata, requirement[1]))
         waiting += needs

@@ -222,8 +222,10 @@ def _verdict(report: CalibrationReport) -> VerdictBanner:
         rest = f" (and {count(more, 'reason')} more, below)" if more > 0 else ""
         advice = advice_of(report.verdict.reasons) or ("Take another window.",)
         return VerdictBanner("bad", "Refused:", f"{first}{rest}. Do not use this result.", advice)
-    return VerdictBanner("good", "Accepted.", f"The camera is {turn_and_shift(_solved(report))} from the recording’s own "
-                   f"calibration{_known_to(report)}.", USE)  # fmt: skip
+    sentence = (
+        f"The camera is {turn_and_shift(_solved(report))} from the recording’s own calibration{_known_to(report)}."
+    )
+    return VerdictBanner("good", "Accepted.", sentence, USE)
 
 
 def _solved(report: CalibrationResult) -> list[float]:

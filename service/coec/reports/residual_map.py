@@ -275,8 +275,8 @@ def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
     pixel_deg = degrees(pixel_rad(window.rig.camera))
     in_common = f"{number(right, 1, sign=True)} px right, {number(down, 1, sign=True)} px down"
     lines += [
-        f"{known} of {eligible} parts tell, from {pairs}. They lie {np.median(shifts.size_px[shifts.known]):.1f} px beside "
-        f"(median; a pixel is {pixel_deg:.3f}° on the axis).",
+        f"{known} of {eligible} parts tell, from {pairs}. They lie {np.median(shifts.size_px[shifts.known]):.1f} px "
+        f"beside (median; a pixel is {pixel_deg:.3f}° on the axis).",
         f"In common to all: {in_common}; half of them are within {spread:.1f} px of it.",
         "Arrows: where range edges would lie best, enlarged. Figures: how far that is, and of how many range edges. "
         "No colour: not told.",

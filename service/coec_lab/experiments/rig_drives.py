@@ -377,8 +377,8 @@ def _checks_of(drive: DisplacedRigDrive, camera: str, latest: Sequence[Seen]) ->
         yield RigLook(
             edge=rig.pair, mounts=mounts, pair_stamps_ns=observation.pair_stamps_ns, offset=_six(observation.offset),
             sigma=_six(observation.sigma), noise=_six(observation.noise), place=_six(observation.place),
-            dispersion=observation.dispersion, distance2=observation.distance2, flagged=observation.flagged, weak=observation.weak,
-            causes=tuple(cause.code for cause in observation.causes),
+            dispersion=observation.dispersion, distance2=observation.distance2, flagged=observation.flagged,
+            weak=observation.weak, causes=tuple(cause.code for cause in observation.causes),
         )  # fmt: skip
 
 

@@ -202,7 +202,7 @@ def _noise(u: float, v: float, salt: int) -> float:
 
 
 @njit(cache=True)
-def _noise_octave(u: float, v: float, wave_m: float, footprint_m: float, salt: int) -> float:
+def _octave(u: float, v: float, wave_m: float, footprint_m: float, salt: int) -> float:
     """Noise about 0 (-0.5 to 0.5) of one wavelength, faded where it cannot be resolved."""
     fade = 1.5 - 2.0 * footprint_m / wave_m
     if fade <= 0.0:
@@ -225,39 +225,39 @@ def _line(u: float, period_m: float, width_m: float, footprint_m: float) -> floa
 def _texture(kind: int, u: float, v: float, foot: float) -> float:
     """Factor on the colour of a surface at its coordinates u, v (m; v is the height on walls)."""
     if kind == ASPHALT:
-        return (1.0 + 0.5 * _noise_octave(u, v, 0.04, foot, SALTS[1]) + 0.3 * _noise_octave(u, v, 0.25, foot, SALTS[2])
-                + 0.3 * _noise_octave(u, v, 2.5, foot, SALTS[3]) + 0.2 * _noise_octave(u, v, 11.0, foot, SALTS[4]))  # fmt: skip
+        return (1.0 + 0.5 * _octave(u, v, 0.04, foot, SALTS[1]) + 0.3 * _octave(u, v, 0.25, foot, SALTS[2])
+                + 0.3 * _octave(u, v, 2.5, foot, SALTS[3]) + 0.2 * _octave(u, v, 11.0, foot, SALTS[4]))  # fmt: skip
     if kind == PAVING:
         joint = max(_line(u, 0.5, 0.02, foot), _line(v, 0.5, 0.02, foot))
         slab = _hash(np.int64(math.floor(u / 0.5)), np.int64(math.floor(v / 0.5)), 5) - 0.5
         fade = max(0.0, min(1.0, 1.5 - 2 * foot / 0.5))
-        return (1.0 - 0.5 * joint) * (1.0 + 0.22 * fade * slab + 0.3 * _noise_octave(u, v, 0.1, foot, SALTS[6])
-                                      + 0.25 * _noise_octave(u, v, 3.0, foot, SALTS[7]))  # fmt: skip
+        return (1.0 - 0.5 * joint) * (1.0 + 0.22 * fade * slab + 0.3 * _octave(u, v, 0.1, foot, SALTS[6])
+                                      + 0.25 * _octave(u, v, 3.0, foot, SALTS[7]))  # fmt: skip
     if kind == GRASS:
-        return (1.0 + 0.8 * _noise_octave(u, v, 0.07, foot, SALTS[8]) + 0.6 * _noise_octave(u, v, 0.4, foot, SALTS[9])
-                + 0.5 * _noise_octave(u, v, 2.0, foot, SALTS[10]) + 0.4 * _noise_octave(u, v, 9.0, foot, SALTS[11]))  # fmt: skip
+        return (1.0 + 0.8 * _octave(u, v, 0.07, foot, SALTS[8]) + 0.6 * _octave(u, v, 0.4, foot, SALTS[9])
+                + 0.5 * _octave(u, v, 2.0, foot, SALTS[10]) + 0.4 * _octave(u, v, 9.0, foot, SALTS[11]))  # fmt: skip
     if kind == BRICK:
         row = math.floor(v / 0.08)
         shifted = u + 0.12 * (row - 2 * math.floor(row / 2))
         joint = max(_line(v, 0.08, 0.012, foot), _line(shifted, 0.24, 0.012, foot))
         brick = _hash(np.int64(math.floor(shifted / 0.24)), np.int64(row), 12) - 0.5
         fade = max(0.0, min(1.0, 1.5 - 2 * foot / 0.1))
-        return (1.0 + 0.35 * joint) * (1.0 + 0.5 * fade * brick + 0.3 * _noise_octave(u, v, 1.7, foot, SALTS[13]))
+        return (1.0 + 0.35 * joint) * (1.0 + 0.5 * fade * brick + 0.3 * _octave(u, v, 1.7, foot, SALTS[13]))
     if kind in (PLASTER, CONCRETE):
-        return (1.0 + 0.15 * _noise_octave(u, v, 0.05, foot, SALTS[14]) + 0.12 * _noise_octave(u, v, 0.6, foot, SALTS[15])
-                + 0.22 * _noise_octave(u, 0.4 * v, 2.4, foot, SALTS[16]))  # fmt: skip
+        return (1.0 + 0.15 * _octave(u, v, 0.05, foot, SALTS[14]) + 0.12 * _octave(u, v, 0.6, foot, SALTS[15])
+                + 0.22 * _octave(u, 0.4 * v, 2.4, foot, SALTS[16]))  # fmt: skip
     if kind == FOLIAGE:
-        return 1.0 + 0.9 * _noise_octave(u, v, 0.12, foot, SALTS[17]) + 0.7 * _noise_octave(u, v, 0.5, foot, SALTS[18])
+        return 1.0 + 0.9 * _octave(u, v, 0.12, foot, SALTS[17]) + 0.7 * _octave(u, v, 0.5, foot, SALTS[18])
     if kind == BARK:
-        return 1.0 + 0.8 * _noise_octave(4 * u, v, 0.2, foot, SALTS[19])
+        return 1.0 + 0.8 * _octave(4 * u, v, 0.2, foot, SALTS[19])
     if kind == TILES:
         return (1.0 - 0.45 * max(_line(v, 0.3, 0.04, foot), 0.6 * _line(u, 0.22, 0.03, foot))) * (
-            1.0 + 0.3 * _noise_octave(u, v, 0.3, foot, SALTS[20]) + 0.3 * _noise_octave(u, v, 2.0, foot, SALTS[21])
+            1.0 + 0.3 * _octave(u, v, 0.3, foot, SALTS[20]) + 0.3 * _octave(u, v, 2.0, foot, SALTS[21])
         )
     if kind == MARKING:
-        worn = _noise_octave(u, v, 0.3, foot, SALTS[22]) + _noise_octave(u, v, 0.05, foot, SALTS[23])
+        worn = _octave(u, v, 0.3, foot, SALTS[22]) + _octave(u, v, 0.05, foot, SALTS[23])
         return 1.0 + 0.35 * worn
-    return 1.0 + 0.08 * _noise_octave(u, v, 0.6, foot, SALTS[24])
+    return 1.0 + 0.08 * _octave(u, v, 0.6, foot, SALTS[24])
 
 
 @njit(cache=True)

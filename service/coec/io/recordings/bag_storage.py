@@ -334,7 +334,8 @@ class FolderStorage:
         try:
             if zstandard.get_frame_parameters(data).content_size > MAX_UNPACKED_MESSAGE_BYTES:
                 raise SourceError(
-                    f"{self.path}: a message does not state that it unpacks to at most {MAX_UNPACKED_MESSAGE_BYTES} bytes"
+                    f"{self.path}: a message does not state that it unpacks to at most "
+                    f"{MAX_UNPACKED_MESSAGE_BYTES} bytes"
                 )
             unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
             return unpacker.decompress(data, max_output_size=MAX_UNPACKED_MESSAGE_BYTES)

@@ -63,7 +63,8 @@ class LidarRecording:
         ]
         if not near:
             raise SourceError(
-                f"{self.name}: no sweep of {self.rig.a} within {MAX_STAMP_DIFFERENCE_NS / 1e6:g} ms of one of {self.rig.b}"
+                f"{self.name}: no sweep of {self.rig.a} within {MAX_STAMP_DIFFERENCE_NS / 1e6:g} ms of one of "
+                f"{self.rig.b}"
             )
         selected = sorted({round(place) for place in np.linspace(0, len(near) - 1, count)})
         return [self._pair(*near[place]) for place in selected]

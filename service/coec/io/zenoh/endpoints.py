@@ -163,7 +163,8 @@ def read_settings(path: Path) -> zenoh.Config:
     brackets = text.count("{") + text.count("[")
     if len(data) > MAX_SETTINGS_BYTES or brackets > MAX_BRACKETS:
         raise ConfigError(
-            f"{path} is no configuration of Zenoh: it has more than {MAX_SETTINGS_BYTES} bytes, or {MAX_BRACKETS} brackets"
+            f"{path} is no configuration of Zenoh: it has more than {MAX_SETTINGS_BYTES} bytes, or {MAX_BRACKETS} "
+            "brackets"
         )
     try:
         return zenoh.Config.from_json5(text)

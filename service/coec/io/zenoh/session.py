@@ -100,8 +100,8 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
     doors = unguarded(settings)
     if doors and not config.insecure:
         raise ConfigError(
-            f"{settings_source(config)}: whoever reaches {', '.join(doors)} would be let in, to read, to send frames and to give "
-            "commands: listen on loopback, or on tls with enable_mtls and a root_ca_certificate; or set "
+            f"{settings_source(config)}: whoever reaches {', '.join(doors)} would be let in, to read, to send "
+            "frames and to give commands: listen on loopback, or on tls with enable_mtls and a root_ca_certificate; or set "
             "`zenoh.insecure: true`, and health will say so"
         )
     return settings
