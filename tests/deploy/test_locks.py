@@ -93,7 +93,9 @@ def test_what_was_installed_is_noted_for_each_lock(tmp_path: Path, argument: str
     shutil.copy2(REPOSITORY / "deploy" / "setup", tmp_path / "deploy")
     for lock in LOCKS:
         (tmp_path / lock.name).write_text("# nothing\n")
-    (tmp_path / "pyproject.toml").write_text("no project")
+    (tmp_path / "service" / "coec_lab").mkdir(parents=True)
+    for file in ("pyproject.toml", "service/coec_lab/pyproject.toml", "service/coec_lab/hatch_build.py"):
+        (tmp_path / file).write_text("no project")
     done = subprocess.run([tmp_path / "deploy" / "setup", argument], capture_output=True, text=True)
     assert "could not install coec" in done.stderr
     assert {path.name for path in (tmp_path / ".venv").glob("coec-*")} == {f"coec-{name}" for name in stamps}

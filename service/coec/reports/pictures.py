@@ -107,9 +107,9 @@ def write_comparison(
     one_scene = independent_samples is not None and saw_one_scene(independent_samples, len(window.pairs))
     if one_scene:
         why = (
-            f"No map of residuals: {len(window.pairs)} pairs that are worth {independent_samples:.1f} independent looks "
-            "show the same edges again and again, as those of a vehicle that stands do, and a part of the image would look "
-            "right or wrong by chance."
+            f"No map of residuals: {len(window.pairs)} pairs that are worth {independent_samples:.1f} independent "
+            "looks show the same edges again and again, as those of a vehicle that stands do, and a part of the image "
+            "would look right or wrong by chance."
         )
         return Comparison(tuple(files), (slid, Pictures((file_picture(files[-1]),)), Text((why,), quiet=True)), (why,))
     left = residual_map(window, T_after, compensated=compensated, name=caption.after)

@@ -101,8 +101,8 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
     if doors and not config.insecure:
         raise ConfigError(
             f"{settings_source(config)}: whoever reaches {', '.join(doors)} would be let in, to read, to send "
-            "frames and to give commands: listen on loopback, or on tls with enable_mtls and a root_ca_certificate; or set "
-            "`zenoh.insecure: true`, and health will say so"
+            "frames and to give commands: listen on loopback, or on tls with enable_mtls and a root_ca_certificate; "
+            "or set `zenoh.insecure: true`, and health will say so"
         )
     return settings
 
