@@ -133,10 +133,10 @@ def test_the_time_of_a_step_is_known_where_its_place_is(street: Window, monkeypa
 
 def test_the_table_has_a_row_for_each_knock_in_their_order() -> None:
     def one(name: str, **told: Any) -> MountStepTrial:
-        plain = {"accepted": False, "wrong": False, "moved": False, "off_s": None, "told_s": None, "holds": None}
+        plain = {"accepted": False, "wrong": False, "moved": False, "off_s": None, "interval_s": None, "holds": None}
         return MountStepTrial(name, **{**plain, "late": 0.5, **told})
 
-    told = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0, told_s=2.5, holds=True)]
+    told = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0, interval_s=2.5, holds=True)]
     told += [one("1 deg", accepted=True, wrong=True), one("1 deg, slowly", moved=True)]
     assert mount_steps.table(told) == (
         MountStepRow("none", 1, 1.0, 0.0, 0.0, None, None, None, None),
