@@ -14,7 +14,7 @@ import coec
 pytest.importorskip("embreex", reason="needs ray casting")
 
 WHERE = """
-from coec.simulation import scene, shading, render
+from coec_lab.simulation import scene, shading, render
 kernels = [value for module in (scene, shading, render) for value in vars(module).values() if hasattr(value, "stats")]
 print(*{kernel.stats.cache_path for kernel in kernels}, sep="\\n")
 """
