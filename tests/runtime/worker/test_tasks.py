@@ -21,7 +21,7 @@ from coec.service.worker.warm_up import late_kernels
 from coec.service.worker.tasks import Solver
 from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import Silence
-from coec.io.recordings.layouts import windows
+from coec.io.recordings import window_cutting as windows
 from coec.cli.convert import configuration_for
 from coec.config import CalibrationConfig, Config, DepthConfig, ObjectiveConfig, SearchConfig
 from coec.io.recordings.layouts import open_source
