@@ -5,6 +5,7 @@ checkpoints.
 from __future__ import annotations
 
 import copy
+import logging
 import time
 from pathlib import Path
 
