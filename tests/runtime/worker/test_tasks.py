@@ -21,13 +21,13 @@ from coec.service.worker.warm_up import late_kernels
 from coec.service.worker.tasks import Solver
 from coec.calibration.pipeline import calibrate
 from coec.calibration.ports import Silence
-from coec.io.recordings import window_cutting as windows
+from coec.io.recordings.window_cutting import load_window
 from coec.cli.convert import configuration_for
 from coec.config import CalibrationConfig, Config, DepthConfig, ObjectiveConfig, SearchConfig
 from coec.io.recordings.layouts import open_source
 
 source = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"
-window = windows.load(source, None, 25, lambda *_: None).window
+window = load_window(source, None, 25, lambda *_: None).window
 pair = configuration_for(open_source(source), window.T_camera_lidar_start, None)
 settings = dict(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=4.0))
 configuration = CalibrationConfig(**settings)
