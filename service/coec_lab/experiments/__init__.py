@@ -1,0 +1,1 @@
+"""Experiments on the estimator: starts, statistics, split halves, detection, profiles, and the paper's own."""

@@ -78,7 +78,7 @@ class MountStepTrial:
         moved: whether it was refused because the camera moved within it.
         off_s: how far the middle of the reported interval is from the time of the knock, s; None where no time was
             reported, or there was no step.
-        told_s: length of the reported interval, s; None likewise.
+        interval_s: length of the reported interval, s; None likewise.
         holds: whether the interval holds the knock; None likewise.
         late: share of the pairs after the knock.
     """

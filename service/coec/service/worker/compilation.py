@@ -1,10 +1,6 @@
 """The compilation of kernels in the worker: the kernels that checks and windows use and how many of them are there,
 its progress as the service follows it, and a clock that stands still meanwhile, because no job's time limit counts
-the time of compiling. A kernel is compiled once on a machine, within seconds on an idle core, and within minutes
-where other processes want the core. It counts once it can run, whether it was compiled or read from the cache.
-Those that are only called from other kernels do not count, because they come with these. Kernels are compiled for
-the types of their arguments, which differ only by the model of the lens. The worker sends `{"kind": "compiling",
-"done", "total"}` when it begins and at least at every further kernel, and `{"kind": "compiled"}` after each kernel.
+the time of compiling.
 
 A kernel is compiled once on a machine, within seconds on an idle core, and within minutes where other processes want
 the core. The worker sends `{"kind": "compiling", "done", "total"}` when it begins and at least at every further kernel,
