@@ -20,6 +20,7 @@ from coec.config import AuthorityConfig, Config, config_hash
 from coec.errors import CoecError, ConfigError, ExitCode, ModelError, UnavailableError, UsageError
 from coec.io import logs, system
 from coec.io.disk_writer import DiskWriter
+from coec.io.serialise import reasons_of
 from coec.io.system import ServiceManagerNotifier, ServiceThread, resident_bytes
 from coec.io.zenoh.bus import Answer, Bus, open_session
 from coec.io.zenoh.command_auth import CommandListener, credentials_of
@@ -37,7 +38,7 @@ from coec.service.api.metrics import LabelledHistogram, MetricsInput, TextFormat
 from coec.service.api.metrics_server import MetricsServer, pages
 from coec.service.api.pair_answers import PairAnswers, PendingPairAnswers, PendingPairCommands
 from coec.service.api.problems import RouterMonitor
-from coec.service.api.reply_builders import SerializedReply, budget_status_of, reasons_of, worker_status_of
+from coec.service.api.reply_builders import SerializedReply, budget_status_of, worker_status_of
 from coec.service.api.rig_answers import RigAnswers
 from coec.service.api.routes import VehicleRoutes
 from coec.service.api.uplink import Heartbeats, Uplink

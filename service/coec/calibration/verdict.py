@@ -147,7 +147,7 @@ def judge(
     if stop is not StopReason.TOLERANCE:
         reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
     if saw_one_scene(independent_samples, frames) and any(reason.code in UNCERTAIN for reason in reasons):
-        worth = f"{frames} frames are worth {independent_samples:.1f} independent ones"
-        text = f"{worth}: a window past other things would settle more"
+        count = f"{frames} frames are worth {independent_samples:.1f} independent ones"
+        text = f"{count}: a window past other things would settle more"
         reasons.append(Reason("motion", text))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

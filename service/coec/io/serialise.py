@@ -174,6 +174,11 @@ def _moved_within(moved: replies.MovedWithin) -> MovedWithin:
     )
 
 
+def reasons_of(reasons: tuple[Reason, ...]) -> tuple[replies.Reason, ...]:
+    """Reasons in their wire form."""
+    return tuple(replies.Reason(code=reason.code, text=reason.text) for reason in reasons)
+
+
 def metric_of(metric: Metric) -> replies.MetricReply:
     """A figure with its limit."""
     return replies.MetricReply(

@@ -22,7 +22,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle as Frame
 from matplotlib.patches import Rectangle as Patch
 from numpy.typing import NDArray
 
@@ -264,7 +263,7 @@ def _overview(axes: Axes, image_bgr: NDArray[np.uint8], regions: Sequence[Differ
         part = place.part
         for colour, line_width in (("black", 3.5), ("white", 1.5)):
             corner = (part.left - 0.5, part.top - 0.5)
-            axes.add_patch(Frame(corner, part.width, part.height, fill=False, ec=colour, lw=line_width))
+            axes.add_patch(Patch(corner, part.width, part.height, fill=False, ec=colour, lw=line_width))
         axes.text(
             part.left, part.top, name, size=11, weight="bold", va="bottom" if part.top > 0.1 * height else "top",
             bbox={"facecolor": "white", "edgecolor": "black", "pad": 2}, clip_on=True,

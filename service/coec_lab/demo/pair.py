@@ -36,9 +36,9 @@ from coec.reports.formatting import count
 from coec.reports.progress import COMPILING, COMPILING_S, CompilationProgress
 from coec.schemas.keys import Keys
 from coec_lab.demo import pair_drive, pair_report
-from coec_lab.demo.pair_client import QUERY_S, Observer, PairOutcome, Snapshot, outcome_of
+from coec_lab.demo.pair_client import Observer, PairOutcome, Snapshot, outcome_of
 from coec_lab.demo.pair_drive import NS_PER_S, Pace, PairVehicle
-from coec_lab.demo.service import Daemon, DemoError, free_endpoint, running
+from coec_lab.demo.service import QUERY_S, Daemon, DemoError, free_endpoint, running
 
 if TYPE_CHECKING:
     from coec_lab.simulation.drive import SimulatedDrive

@@ -15,16 +15,14 @@ from coec.calibration.types import Matrix4
 from coec.errors import NotFoundError, RemoteError
 from coec.geometry import se3
 from coec.io.recordings import window_cutting
-from coec.io.zenoh.query_client import query_all, query_one
+from coec.io.zenoh.query_client import query_all
 from coec.schemas import replies
 from coec.schemas.keys import Keys
 from coec.schemas.message import from_json
 from coec_lab.demo.pair_drive import NS_PER_S, Pace, at_rest
+from coec_lab.demo.service import QUERY_S, query_json
 
 ALARM: Final = "miscalibrated"
-
-QUERY_S = 10.0
-"""Timeout of one answer, on a machine that also renders the street."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +115,7 @@ class Observer:
 
     def events(self) -> tuple[replies.EvidenceEvent, ...]:
         """Incidents that the service has recorded."""
-        return from_json(replies.EvidenceReply, self._query(self.keys.evidence(self.pair))).events
+        return from_json(replies.EvidenceReply, query_json(self.session, self.keys.evidence(self.pair))).events
 
     def _catch_up(self, snapshot: Snapshot) -> None:
         """Adds alarms that began and ended between two polls, as on a busy machine; the service records them as
@@ -138,9 +136,9 @@ class Observer:
         self.alarms = max(self.alarms, len(events))
 
     def _query_all(self, drive_s: float) -> Snapshot:
-        status = from_json(replies.StatusReply, self._query(self.keys.status))
-        health = from_json(replies.HealthReply, self._query(self.keys.health(self.pair)))
-        extrinsic = from_json(replies.ExtrinsicReply, self._query(self.keys.extrinsic(self.pair)))
+        status = from_json(replies.StatusReply, query_json(self.session, self.keys.status))
+        health = from_json(replies.HealthReply, query_json(self.session, self.keys.health(self.pair)))
+        extrinsic = from_json(replies.ExtrinsicReply, query_json(self.session, self.keys.extrinsic(self.pair)))
         served = np.array(extrinsic.camera_from_lidar.matrix)
         truth = self.truth(drive_s)
         moment = Moment(
@@ -156,9 +154,6 @@ class Observer:
             error_deg=window_cutting.rotation_error_deg(served, truth),
         )
         return Snapshot(moment, status, health, extrinsic)
-
-    def _query(self, key: str) -> bytes:
-        return query_one(self.session, f"{key}?format=json", QUERY_S).payload
 
 
 def with_alarm(timeline: Sequence[Moment], drive_s: float) -> list[Moment]:

@@ -133,6 +133,15 @@ REST_S = 8.0
 POLL_S = 0.1
 
 
+def query_json(session: zenoh.Session, key: str) -> bytes:
+    """The JSON reply of the service at a key.
+
+    Raises:
+        CoecError: no reply in time, or one that refuses the query.
+    """
+    return query_one(session, f"{key}?format=json", QUERY_S).payload
+
+
 class RigService:
     """A running service, as a client sees it.
 
@@ -150,15 +159,17 @@ class RigService:
 
     def rig(self) -> RigReply:
         """State of the rig, as the service reports it."""
-        return from_json(RigReply, self._query(self._keys.rig))
+        return from_json(RigReply, query_json(self.session, self._keys.rig))
 
     def health(self) -> Mapping[str, HealthReply]:
         """Health of each pair."""
-        return {pair: from_json(HealthReply, self._query(self._keys.health(pair))) for pair in self.sensors_of}
+        return {
+            pair: from_json(HealthReply, query_json(self.session, self._keys.health(pair))) for pair in self.sensors_of
+        }
 
     def status(self) -> StatusReply:
         """Status of the service."""
-        return from_json(StatusReply, self._query(self._keys.status))
+        return from_json(StatusReply, query_json(self.session, self._keys.status))
 
     def until_ready(self) -> None:
         """Waits until the service runs and its worker is warm.
@@ -198,9 +209,6 @@ class RigService:
         if time.monotonic() > deadline_s:
             raise DemoError(f"the service {what} in time", self._daemon.log_tail())
         time.sleep(POLL_S)
-
-    def _query(self, key: str) -> bytes:
-        return query_one(self.session, f"{key}?format=json", QUERY_S).payload
 
 
 @contextmanager

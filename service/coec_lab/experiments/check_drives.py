@@ -274,13 +274,14 @@ def _judged(evidence: CheckInput, check: Check, pose: Matrix4, baseline: Baselin
     seen = judge_check(evidence, check, pose, baseline)
     faint = faintness(evidence.pairs, check, UNCOMMISSIONED if baseline is None else baseline.monitor)
     return Judged(
-        offset=_six(seen.offset), sigma=_six(seen.sigma), noise=_six(seen.noise), place=_six(seen.place),
-        dispersion=seen.dispersion, distance2=seen.distance2, flagged=seen.flagged, undecided=seen.undecided,
+        offset=vector6_of(seen.offset), sigma=vector6_of(seen.sigma), noise=vector6_of(seen.noise),
+        place=vector6_of(seen.place), dispersion=seen.dispersion, distance2=seen.distance2, flagged=seen.flagged, undecided=seen.undecided,
         faint=tuple(sorted(faint)),
         causes=tuple(cause.code for cause in seen.causes),
     )  # fmt: skip
 
 
-def _six(values: NDArray[np.float64]) -> Vector6:
+def vector6_of(values: NDArray[np.float64]) -> Vector6:
+    """(6,) as a document holds it."""
     rx, ry, rz, tx, ty, tz = (float(value) for value in values)
     return rx, ry, rz, tx, ty, tz

@@ -55,8 +55,7 @@ from coec.geometry.se3 import inverse
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import CachedGreys, GreyImages
 from coec.reports.difference_regions import evenly
-from coec.schemas.replies import Vector6
-from coec_lab.experiments.check_drives import CHECK_PAIRS
+from coec_lab.experiments.check_drives import CHECK_PAIRS, vector6_of
 from coec_lab.experiments.rig_evidence import SLICE_S, WINDOW
 from coec_lab.experiments.simulation_schemas import Mounts, RigDriveRow, RigLook, RigWindow
 from coec_lab.simulation.faults import SensorFault, StepFault
@@ -375,8 +374,9 @@ def _checks_of(drive: DisplacedRigDrive, camera: str, latest: Sequence[Seen]) ->
             continue
         observation = observe(rig, drive.served[rig.pair], _of(latest, camera, mounts))
         yield RigLook(
-            edge=rig.pair, mounts=mounts, pair_stamps_ns=observation.pair_stamps_ns, offset=_six(observation.offset),
-            sigma=_six(observation.sigma), noise=_six(observation.noise), place=_six(observation.place),
+            edge=rig.pair, mounts=mounts, pair_stamps_ns=observation.pair_stamps_ns,
+            offset=vector6_of(observation.offset), sigma=vector6_of(observation.sigma),
+            noise=vector6_of(observation.noise), place=vector6_of(observation.place),
             dispersion=observation.dispersion, distance2=observation.distance2, flagged=observation.flagged,
             weak=observation.weak, causes=tuple(cause.code for cause in observation.causes),
         )  # fmt: skip
@@ -411,8 +411,3 @@ def _joined(
 
 def _is_after(drive: DisplacedRigDrive, stamp_ns: int) -> bool:
     return stamp_ns - START_NS >= drive.at_s * 1e9
-
-
-def _six(values: NDArray[np.float64]) -> Vector6:
-    rx, ry, rz, tx, ty, tz = (float(value) for value in values)
-    return rx, ry, rz, tx, ty, tz

@@ -58,7 +58,9 @@ DISPLACED_SEED = 18_300_002
 LIDAR = "roof"
 """The LiDAR that is knocked."""
 
-KNOCK_RAD = radians(1.0)
+STEP_RAD = radians(1.0)
+"""Turn of a sensor that moves."""
+
 ALSO_RAD = radians(0.5)
 """Turn of one of its cameras in a second run, to see whether the extra move is noticed."""
 
@@ -77,7 +79,7 @@ def displaced_lidar_row(rig: SimulatedRig, rigs: int) -> KnockedRow:
         lasting, right = Lasting.of(rig, rng), off(rig.poses, BUILT, rng)
         before = _known(rig, right, lasting, rng)
         shaken = off(right, SHAKEN / np.sqrt(2.0), rng)  # both sensors of an edge together: `SHAKEN`
-        after = moved(shaken, (LIDAR,), KNOCK_RAD, rng)
+        after = moved(shaken, (LIDAR,), STEP_RAD, rng)
         measurements = _windows(rig, after, lasting, rng)
         with_before, without = (
             estimate_jointly(rig.graph, measurements, before),
@@ -142,7 +144,6 @@ def _windows(rig: SimulatedRig, poses: Poses, lasting: Lasting, rng: np.random.G
 AT_S, ALLOWED_S = 90.0, 60.0
 """About when sensors move, and how soon they must be named after that, s."""
 
-STEP_RAD = radians(1.0)
 SEED = 18_300_001
 """Any number from which nothing was learned."""
 

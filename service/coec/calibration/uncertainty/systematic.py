@@ -85,7 +85,7 @@ as wide as the error."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorResolution:
-    """The grain of one window.
+    """The angular resolution of the sensors in one window.
 
     Attributes:
         pixel_rad: the angle of a pixel on the optical axis.
@@ -104,7 +104,8 @@ class SensorResolution:
 
 
 def sensor_resolution(window: Window, T_camera_lidar: Matrix4, held_m: float) -> SensorResolution:
-    """The grain of a window whose camera is at `T_camera_lidar` (4, 4); a held centre is known to `held_m`."""
+    """The angular resolution of a window whose camera is at `T_camera_lidar` (4, 4); a held centre is known to
+    `held_m`."""
     velocity_mps, turn_radps = _rates(window, T_camera_lidar)
     return SensorResolution(
         pixel_rad=pixel_rad(window.rig.camera),
@@ -193,17 +194,21 @@ RIGHT, DOWN, FORWARD = np.eye(3)
 
 TERMS: MappingProxyType[str, Term] = MappingProxyType(
     {
-        "lens_across": lambda lines, grain: grain.lens_px * grain.pixel_rad * lines.perpendicular(RIGHT),
-        "lens_down": lambda lines, grain: grain.lens_px * grain.pixel_rad * lines.perpendicular(DOWN),
-        "lens_scale": lambda lines, grain: (
-            grain.lens_px * grain.pixel_rad * _of_mean_one(lines.perpendicular(-FORWARD))
+        "lens_across": lambda lines, resolution: resolution.lens_px * resolution.pixel_rad * lines.perpendicular(RIGHT),
+        "lens_down": lambda lines, resolution: resolution.lens_px * resolution.pixel_rad * lines.perpendicular(DOWN),
+        "lens_scale": lambda lines, resolution: (
+            resolution.lens_px * resolution.pixel_rad * _of_mean_one(lines.perpendicular(-FORWARD))
         ),
-        "near_edges_across": lambda lines, grain: EDGE_PX * grain.pixel_rad * lines.near * lines.perpendicular(RIGHT),
-        "near_edges_down": lambda lines, grain: EDGE_PX * grain.pixel_rad * lines.near * lines.perpendicular(DOWN),
-        "columns": lambda lines, grain: (
-            COLUMN_SHARE * grain.column_rad * lines.near * np.cross(lines.axis_of_sweep, lines.towards)
+        "near_edges_across": lambda lines, resolution: (
+            EDGE_PX * resolution.pixel_rad * lines.near * lines.perpendicular(RIGHT)
         ),
-        "stamps": lambda lines, grain: STAMP_S * _passing(lines, grain),
+        "near_edges_down": lambda lines, resolution: (
+            EDGE_PX * resolution.pixel_rad * lines.near * lines.perpendicular(DOWN)
+        ),
+        "columns": lambda lines, resolution: (
+            COLUMN_SHARE * resolution.column_rad * lines.near * np.cross(lines.axis_of_sweep, lines.towards)
+        ),
+        "stamps": lambda lines, resolution: STAMP_S * _passing(lines, resolution),
     }
 )
 """The terms by name, in a fixed order. The lens is displaced to the right, down and outwards (principal point and focal

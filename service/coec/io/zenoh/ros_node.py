@@ -27,7 +27,7 @@ from coec.io.ros.wire_format import SENSOR_DATA, STATIC_LISTENER, Dialect, Node,
 from coec.io.zenoh.bus import StreamInput, input_of
 from coec.schemas.keys import NODE, TF_STATIC, ros_name
 
-_topic_log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MAX_PUBLISHERS = 4096
 """Most publishers that are kept, 2 MB: twenty times those of a large vehicle."""
@@ -117,7 +117,7 @@ class RosTopicMonitor:
         try:
             self._take(str(sample.key_expr), there=sample.kind == zenoh.SampleKind.PUT)
         except Exception:
-            _topic_log.exception("a liveliness token could not be read")
+            _log.exception("a liveliness token could not be read")
 
     def _take(self, token: str, *, there: bool) -> None:
         publisher = self._read(token) if there else None
@@ -159,8 +159,6 @@ def has_subscribers(publisher: zenoh.Publisher) -> bool:
     # The stubs of eclipse-zenoh 1.10 declare a bool, but it is a `MatchingStatus` object, which is always truthy.
     return cast("zenoh.MatchingStatus", publisher.matching_status).matching
 
-
-_log = logging.getLogger(__name__)
 
 HEARTBEAT_S = 0.5
 """How soon a subscriber learns that it missed the last message of a latched topic; the value of rmw_zenoh."""

@@ -23,7 +23,7 @@ from coec.errors import CoecError, NotAcceptedError, NotFoundError
 from coec.io.exports.exported_extrinsic import ExportFrames
 from coec.io.exports.formats import FORMATS
 from coec.io.ros.messages import CAMERA_INFO
-from coec.io.serialise import result_of
+from coec.io.serialise import reasons_of, result_of
 from coec.io.zenoh.bus import Answer
 from coec.schemas import replies
 from coec.schemas.commands import COMMAND_NAMES
@@ -39,7 +39,6 @@ from coec.service.api.reply_builders import (
     extrinsic_of,
     health_of,
     pair_status_of,
-    reasons_of,
     with_problems,
 )
 from coec.service.discovery import info_topic_of

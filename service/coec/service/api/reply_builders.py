@@ -25,7 +25,7 @@ from coec.calibration.types import Decision, Estimate, Reason, Rig, Uncertainty
 from coec.config import CameraIntrinsics, PairConfig
 from coec.geometry import se3
 from coec.io.exports.exported_extrinsic import NOMINAL, ExportedExtrinsic, ExportFrames, ExtrinsicOrigin, between_frames
-from coec.io.serialise import degrees_or_null, intrinsics_of, number_or_null, result_of, transform_of
+from coec.io.serialise import degrees_or_null, intrinsics_of, number_or_null, reasons_of, result_of, transform_of
 from coec.io.zenoh.bus import JSON, MSGPACK, Answer
 from coec.schemas import replies
 from coec.schemas.keys import Format
@@ -288,11 +288,6 @@ def data_quality_of(report: StreamStatistics, losses: Mapping[tuple[str, str], i
         frozen_image=selection.frozen,
         point_times=report.timed_by,
     )
-
-
-def reasons_of(reasons: tuple[Reason, ...]) -> tuple[replies.Reason, ...]:
-    """Reasons in their wire form."""
-    return tuple(replies.Reason(code=reason.code, text=reason.text) for reason in reasons)
 
 
 def drops_of(losses: Mapping[tuple[str, str], int], unpaired: Mapping[str, int]) -> dict[str, dict[str, int]]:

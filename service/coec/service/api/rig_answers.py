@@ -16,13 +16,13 @@ from coec.calibration.rig.moved_sensors import Moved
 from coec.calibration.rig.rig_estimator import MoveRecord, VehicleRig, pairs_of
 from coec.calibration.types import Reason
 from coec.geometry import se3
-from coec.io.serialise import transform_of
+from coec.io.serialise import reasons_of, transform_of
 from coec.io.zenoh.bus import Answer
 from coec.schemas import rig_state
 from coec.schemas.keys import Format, Keys
 from coec.schemas.replies import Maybe6x6, Vector6
 from coec.service.api.problems import rig_problems
-from coec.service.api.reply_builders import SerializedReply, reasons_of
+from coec.service.api.reply_builders import SerializedReply
 from coec.service.engine.rig_estimator_thread import ONE_PAIR, LidarPairStatus, RigSnapshot
 
 

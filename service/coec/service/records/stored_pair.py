@@ -43,7 +43,7 @@ from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
 from coec.errors import CoecError, StateError
 from coec.geometry import se3
 from coec.io.rig_files import identity_sha256, is_same_rig, rig_identity
-from coec.io.serialise import estimate_of, result_of
+from coec.io.serialise import estimate_of, reasons_of, result_of
 from coec.schemas import replies
 from coec.schemas.message import Part
 from coec.schemas.replies import CalibrationResult
@@ -232,13 +232,13 @@ def pair_to_json(
         valid_from_ns=state.valid_from_ns,
         latest=result_of(state.latest, rig, vehicle) if state.latest else None,
         accepted=result_of(state.accepted, rig, vehicle) if state.accepted else None,
-        failures=_stored_reasons(state.failures),
+        failures=reasons_of(state.failures),
         completed_wall_ns=clocks.completed_wall_ns,
         health=state.health.value,
-        reasons=_stored_reasons(state.reasons),
+        reasons=reasons_of(state.reasons),
         unseen_from=None
         if state.unseen_from is None
-        else StoredHealth(state=state.unseen_from.state.value, reasons=_stored_reasons(state.unseen_from.reasons)),
+        else StoredHealth(state=state.unseen_from.state.value, reasons=reasons_of(state.unseen_from.reasons)),
         pending=None
         if state.pending is None
         else StoredCandidate(
@@ -267,10 +267,6 @@ def rows_of(pose: Matrix4) -> Rows:
     """A pose (4, 4) as it stands in the file."""
     a, b, c, d = ((row[0], row[1], row[2], row[3]) for row in pose.tolist())
     return a, b, c, d
-
-
-def _stored_reasons(reasons: tuple[Reason, ...]) -> tuple[replies.Reason, ...]:
-    return tuple(replies.Reason(code=reason.code, text=reason.text) for reason in reasons)
 
 
 LARGEST_CORRECTION = 1e9
