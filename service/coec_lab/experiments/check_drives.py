@@ -275,8 +275,8 @@ def _judged(evidence: CheckInput, check: Check, pose: Matrix4, baseline: Baselin
     faint = faintness(evidence.pairs, check, UNCOMMISSIONED if baseline is None else baseline.monitor)
     return Judged(
         offset=vector6_of(seen.offset), sigma=vector6_of(seen.sigma), noise=vector6_of(seen.noise),
-        place=vector6_of(seen.place), dispersion=seen.dispersion, distance2=seen.distance2, flagged=seen.flagged, undecided=seen.undecided,
-        faint=tuple(sorted(faint)),
+        place=vector6_of(seen.place), dispersion=seen.dispersion, distance2=seen.distance2,
+        flagged=seen.flagged, undecided=seen.undecided, faint=tuple(sorted(faint)),
         causes=tuple(cause.code for cause in seen.causes),
     )  # fmt: skip
 
