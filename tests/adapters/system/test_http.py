@@ -144,6 +144,8 @@ def test_slow_clients_keep_nobody_waiting(
     for client in slow:
         assert _ends(client)
         client.close()
+    # The client of /page has its answer before the server's thread drops its connection.
+    wait_until(lambda: server._connections == [], "the end of the last connection", PATIENCE_S)
     assert server._connections == []
 
 
