@@ -17,8 +17,7 @@ import pytest
 from campaign import stepping_clock
 from campaign.drives import Drive, Truth, part
 from campaign.figures import Figure, at_most, exactly, is_long, publish
-from campaign.test_never_blind import rate
-from campaign.watching import (
+from campaign.health_timeline import (
     MIB,
     PERIOD_S,
     Sample,
@@ -29,6 +28,7 @@ from campaign.watching import (
     transitions,
     watching,
 )
+from campaign.test_never_blind import rate
 from coec.io.storage import StateFile
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")

@@ -13,8 +13,7 @@ import pytest
 
 from campaign.drives import NS_PER_S, Drive, Truth, part
 from campaign.figures import Figure, at_most, exactly, is_long, publish
-from campaign.test_never_blind import rate
-from campaign.watching import (
+from campaign.health_timeline import (
     PERIOD_S,
     Sample,
     Transition,
@@ -24,6 +23,7 @@ from campaign.watching import (
     transitions,
     watching,
 )
+from campaign.test_never_blind import rate
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 pytestmark = pytest.mark.slow

@@ -17,7 +17,7 @@ import pytest
 
 from campaign.drives import Drive, Truth
 from campaign.figures import Figure, at_most, exactly, is_long, publish
-from campaign.watching import (
+from campaign.health_timeline import (
     PERIOD_S,
     Sample,
     ServiceEndedError,

@@ -10,8 +10,8 @@ import pytest
 
 from campaign.drives import Drive, Truth
 from campaign.figures import Figure, at_most, exactly, is_long, publish
+from campaign.health_timeline import WRONG_DEG, Transition, configured, most_per_minute, transitions, watching
 from campaign.test_never_blind import rate
-from campaign.watching import WRONG_DEG, Transition, configured, most_per_minute, transitions, watching
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 pytestmark = pytest.mark.slow

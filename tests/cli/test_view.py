@@ -17,7 +17,6 @@ import pytest
 
 pytest.importorskip("foxglove", reason="needs the optional extra `foxglove`")
 
-from adapters.foxglove.test_shown import places, projected
 from cli.conftest import SMALL, Coec, Outcome
 from cli.vehicle_on_screen import CANDIDATE, KEYS, PAIR, RIG, Sensors, Service, configuration, extrinsic, health
 from coec.calibration.frames.motion_compensation import compensate
@@ -38,6 +37,7 @@ from support.fake_worker import wait_until
 from support.readers import Viewer
 from support.scenes import BOARD_MOVED, BOARD_NOMINAL
 from support.simulated_drives import rendered_source
+from support.viewer import places, projected
 
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""

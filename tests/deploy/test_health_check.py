@@ -17,7 +17,7 @@ from coec.io.http_server import HttpResponse, HttpServer
 from coec.io.system import ServiceManagerNotifier
 from coec.service.api.metrics_server import pages
 from deploy.written import DEPLOY, compose, stages
-from runtime.api.test_metrics import a_busy_status, a_health
+from service.api.test_metrics import a_busy_status, a_health
 from support.router import free_port
 
 Record = Callable[[str, object], None]

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from adapters.mcap.test_windows import a_result, a_window
 from coec.io.mcap.window_writer import write_result
 from conftest import REPOSITORY
 from deploy.test_layout import panels_in, texts_in
 from support.readers import RecordingContents, read_recording
+from support.windows import a_result, a_window
 
 LAYOUT = REPOSITORY / "deploy" / "foxglove-window-layout.json"
 

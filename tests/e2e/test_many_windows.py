@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from adapters.mcap.test_windows import a_pair, a_window
 from coec.config import StateConfig
 from coec.service.recording.recorder import DigestReader
 from coec.service.recording.window_store import WindowStore
 from e2e.processes import Router, Service, service
 from soak.vehicle import configured
+from support.windows import a_pair, a_window
 
 WINDOWS, ASKED = 5000, 50
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.rig.test_objections import EDGE, RIG
+from calibration.rig.test_inconsistent_edges import EDGE, RIG
 from coec.calibration.rig.graph import RigGraph
 from coec.config import Config
 from coec.io.baseline_file import BASELINES, baseline_hash, load_baselines, save_baseline

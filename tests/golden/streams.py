@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from calibration.rig.test_objections import EDGE, RIG
+from calibration.rig.test_inconsistent_edges import EDGE, RIG
 from coec.calibration.frames.window import SliceClosed
 from coec.calibration.rig.rig_estimator import rig_alarms
 from coec.calibration.types import Matrix4
 from golden.reference import plain
-from runtime import test_pair_disturbed as pair_drive
-from runtime.edges.test_stream import KNOCKED_S, knocked
+from service import test_pair_disturbed as pair_drive
+from service.engine.test_lidar_pairs import KNOCKED_S, knocked
 from support.rigs import POSES, LidarBench, RigDrive, moved_poses
 from support.vehicles import BEGIN_S, DRIVE_END_S, OracleWorker, PairBench
 

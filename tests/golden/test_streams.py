@@ -9,8 +9,8 @@ import pytest
 
 from golden import streams
 from golden.reference import DATA, Tolerance, check_lines, write_lines
-from runtime import test_pair_disturbed as pair_drive
-from runtime.test_pair_disturbed import Clock, clock
+from service import test_pair_disturbed as pair_drive
+from service.test_pair_disturbed import Clock, clock
 from support.rigs import with_extra
 from support.vehicles import SlowWorker
 

@@ -35,7 +35,7 @@ from coec_lab.demo.rig_drive import (
 from coec_lab.simulation import parallel
 from coec_lab.simulation.journey import START_NS
 from coec_lab.simulation.rig_drive import RigDrive, RigDriveConfig
-from runtime.api.test_metrics import a_health
+from service.api.test_metrics import a_health
 from support.messages import moved_lidar_reply, reply_before_checks
 
 LIDAR, CAMERA = SCENARIO.acts

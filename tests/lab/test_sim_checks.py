@@ -13,7 +13,7 @@ from cli.conftest import Coec
 from coec_lab.experiments import check_drives
 from coec_lab.experiments.check_drives import CheckDrive
 from coec_lab.experiments.simulation_schemas import CheckedDrive
-from evaluation.test_check_statistics import driven, judged
+from lab.experiments.test_check_statistics import driven, judged
 
 
 def test_a_drive_that_has_a_result_is_not_checked_again(

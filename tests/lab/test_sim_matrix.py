@@ -12,7 +12,7 @@ from cli.conftest import Coec
 from coec_lab.experiments import matrix_drives
 from coec_lab.experiments.matrix_drives import MatrixDrive, Settings
 from coec_lab.experiments.simulation_schemas import MatrixRow
-from evaluation.test_matrix import row, solved, watch
+from lab.experiments.test_matrix import row, solved, watch
 
 PAIR = "street_wide_64_day_*_s1"
 

@@ -19,7 +19,7 @@ from coec.schemas.replies import (
     StreamStatus,
 )
 from coec.schemas.rig_state import RigReply
-from runtime.api.test_metrics import a_busy_status
+from service.api.test_metrics import a_busy_status
 from support.messages import joint_reply, moved_lidar_reply, reply_before_checks
 
 
