@@ -10,7 +10,7 @@ import pytest
 from coec.calibration.figures import FIGURES
 from coec.calibration.types import INTRINSICS_OFF, MOVED
 from coec.config import config_of
-from coec.config.loading import parse_yaml
+from coec.config.root import parse_yaml
 from coec.io.depth.model_cards import ModelCard
 from coec.io.recordings.manifest import ManifestDocument
 from conftest import REPOSITORY

@@ -14,8 +14,7 @@ from cli.conftest import Coec
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.errors import OutputError
 from coec.io import user_files
-from coec.io.recordings.layouts import open_source
-from coec.io.recordings.lidar_recordings import open_lidars
+from coec.io.recordings.layouts import open_lidars, open_source
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from coec.calibration.rig.lidar_sampling import LidarEdge
-    from coec.io.recordings.lidar_recordings import LidarRecording
+    from coec.io.recordings.layouts import LidarRecording
 
 
 def lidars(
@@ -40,7 +40,7 @@ def lidars(
     from coec.calibration.rig.lidar_registration import register
     from coec.geometry.se3 import difference
     from coec.io.nearest_neighbours import Trees
-    from coec.io.recordings.lidar_recordings import open_lidars
+    from coec.io.recordings.layouts import open_lidars
     from coec.reports import console
 
     search = Trees()

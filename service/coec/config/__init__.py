@@ -4,7 +4,6 @@
 `CalibrationConfig`, ...), so that each default exists once. Import from this package, not from its modules.
 """
 
-from coec.config.loading import MAX_YAML_BYTES, config_of, load_config, load_yaml, parse_yaml
 from coec.config.model import IDENTITY, FilePath, Matrix4x4, Name, describe
 from coec.config.pair import (
     AnyStreamConfig,
@@ -28,7 +27,7 @@ from coec.config.pair import (
     TopicName,
 )
 from coec.config.rig import LinkConfig
-from coec.config.root import Config, config_hash
+from coec.config.root import MAX_YAML_BYTES, Config, config_hash, config_of, load_config, load_yaml, parse_yaml
 from coec.config.service import (
     AuthorityConfig,
     BudgetConfig,

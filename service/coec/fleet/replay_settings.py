@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict
 from coec import __version__
 from coec.calibration.types import Window
 from coec.config import CalibrationConfig, DepthConfig
-from coec.config.loading import load_config
+from coec.config.root import load_config
 from coec.errors import ConfigError, UsageError, WindowError
 from coec.io.rig_files import rig_from_json, rig_to_json
 

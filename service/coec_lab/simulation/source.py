@@ -10,7 +10,7 @@ from coec.errors import SourceError, UsageError
 from coec_lab.simulation.faults import parse_fault, parse_sensor_fault
 
 if TYPE_CHECKING:
-    from coec.io.recordings.lidar_recordings import LidarRecording
+    from coec.io.recordings.layouts import LidarRecording
     from coec_lab.commands.rig_play import PlayedRig
     from coec_lab.simulation.drive import DriveConfig, SimulatedDrive
     from coec_lab.simulation.rig_drive import RigDrive, SimulatedRigPair
@@ -213,7 +213,7 @@ def open_lidars(query: dict[str, str], a: str, b: str) -> LidarRecording:
     from coec.calibration.rig.lidar_sampling import LidarRig
     from coec.calibration.types import EgoMotion, LidarFrame
     from coec.geometry.se3 import inverse
-    from coec.io.recordings.lidar_recordings import FrameStream, LidarRecording
+    from coec.io.recordings.layouts import FrameStream, LidarRecording
 
     drive = open_rig(query)
     if unknown := [name for name in (a, b) if name not in drive.lidars]:

@@ -216,7 +216,7 @@ def test_yaml_is_given_up_before_all_of_its_values_are_read(value: str, monkeypa
         one_more(scanner)
 
     monkeypatch.setattr(Scanner, "fetch_flow_entry", counted)
-    monkeypatch.setattr("coec.config.loading.MAX_YAML_VALUES", 1000)
+    monkeypatch.setattr("coec.config.root.MAX_YAML_VALUES", 1000)
     with pytest.raises(ConfigError, match="more than 1000 values"):
         parse_yaml("[" + f"{value}," * 10_000 + "]")
     assert 900 < len(read) < 1100
