@@ -120,18 +120,25 @@ class Daemon:
         self._insecure = _insecure(unguarded(settings))
         self._reach = Reach(settings)
         self._rules = self._rules_of(config.authority, None)
+        self._open_network(config, () if mode_of(settings) == "router" else connected_of(settings))
+        self._build_pairs(config, lock)
+
+    def _open_network(self, config: Config, endpoints: Sequence[str]) -> None:
+        """Opens the Zenoh session, and builds what uses it. `endpoints` are the routers that it connects to."""
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
         self._ros_side = RosSide(session, config)
         self._presence = SingletonGuard(session, config.zenoh, config.limits, self._keys, self._started_ns)
-        others = () if mode_of(settings) == "router" else connected_of(settings)
-        self._router = RouterMonitor([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
+        self._router = RouterMonitor([redacted(endpoint) for endpoint in endpoints], self._bus.reaches_somebody)
         self._metrics_server = MetricsServer(
             pages(self._metrics, lambda: self._status_reply, self._health, self._is_alive)
         )
         node = self._ros_side.node
         publishers = None if node is None else RosPublishers(session, node)
         self._ros_outputs = RosOutputs(publishers, config, self._worker)
+
+    def _build_pairs(self, config: Config, lock: FolderLock) -> None:
+        """Builds the pairs, what they share, and what answers queries about them."""
         store = StateStore(config.state.directory, config.vehicle)
         self._disk_writer = DiskWriter(config.state.directory)
         self._disk_writer.register(lock, self._folder)

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Literal
 
 import zenoh
@@ -49,6 +50,85 @@ class PairUpdate:
     lost: int = 0
 
 
+class _PairDocuments:
+    """The newest document of each key, put in one order from changes and from answers to queries."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        timeout_s: float,
+        on_update: Callable[[PairUpdate], None],
+        on_refused: Callable[[], None],
+    ) -> None:
+        self._session, self._timeout_s = session, timeout_s
+        self._on_update, self._on_refused = on_update, on_refused
+        self._known: set[str] = set()
+        self._answers: dict[str, tuple[object, zenoh.Timestamp | None]] = {}
+        self._order = threading.Lock()
+        self._cancelled = zenoh.CancellationToken()
+
+    def on_sample(self, sample: zenoh.Sample) -> bool:
+        """A change of a document. Returns whether it was delivered."""
+        with self._order:
+            self._answers.pop(str(sample.key_expr), None)
+            return self._deliver(sample)
+
+    def on_token(self, sample: zenoh.Sample) -> None:
+        """A pair appears, and is queried, or disappears."""
+        if not self.on_sample(sample):
+            return
+        of_pair = str(sample.key_expr).removesuffix("alive")
+        documents = (f"{of_pair}health", f"{of_pair}extrinsic")
+        if sample.kind == zenoh.SampleKind.PUT:
+            self.query(documents)
+        else:
+            with self._order:
+                self._known.difference_update(documents)
+
+    def query(self, keys: Iterable[str]) -> None:
+        """Queries the current documents; answers are delivered on Zenoh's threads."""
+        query_id = object()
+        for key in keys:
+            self._session.get(
+                key,
+                zenoh.handlers.Callback(partial(self._on_reply, query_id), indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,  # else Zenoh keeps all answers until the query ends
+                timeout=self._timeout_s,
+                cancellation_token=self._cancelled,
+            )
+
+    def cancel(self) -> None:
+        """Cancels the open queries."""
+        self._cancelled.cancel()
+
+    def _on_reply(self, query_id: object, reply: zenoh.Reply) -> None:
+        if reply.ok is None:
+            return
+        with self._order:
+            key, stamp = str(reply.ok.key_expr), reply.ok.timestamp
+            query_of, before = self._answers.get(key, (None, None))
+            # A change that was received meanwhile is as new as this answer, or newer. Of several answers to one query
+            # the latest counts.
+            if (key not in self._known or (query_of is query_id and is_later(stamp, before))) and self._deliver(
+                reply.ok
+            ):
+                self._answers[key] = (query_id, stamp)
+
+    def _deliver(self, sample: zenoh.Sample) -> bool:
+        key = str(sample.key_expr)
+        try:
+            if key not in self._known and len(self._known) >= MAX_KEYS:
+                raise DecodeError("too_many_keys", f"a vehicle with more than {MAX_KEYS} keys")
+            change = _update_in(sample)
+        except DecodeError:
+            self._on_refused()
+            return False
+        self._known.add(key)
+        self._on_update(change)
+        return True
+
+
 @contextmanager
 def subscribed(
     session: zenoh.Session,
@@ -58,78 +138,22 @@ def subscribed(
     on_update: Callable[[PairUpdate], None],
     on_refused: Callable[[], None],
 ) -> Iterator[None]:
-    """Inside the block, `take` is called for the current state of a pair (`*`: of each pair) and for every change, and
-    `refuse` for every document that cannot be read. Both are called on Zenoh's threads and must not wait. The block
-    begins before the answers about the current state are there; they come within `timeout_s` or not at all. A pair that
-    appears later is queried, too, because its first words may have been sent before it knew of this subscriber."""
-    known: set[str] = set()
-    answers: dict[str, tuple[object, zenoh.Timestamp | None]] = {}
-    order = threading.Lock()
-    cancelled = zenoh.CancellationToken()
-
-    def deliver(sample: zenoh.Sample) -> bool:
-        key = str(sample.key_expr)
-        try:
-            if key not in known and len(known) >= MAX_KEYS:
-                raise DecodeError("too_many_keys", f"a vehicle with more than {MAX_KEYS} keys")
-            change = _update_in(sample)
-        except DecodeError:
-            on_refused()
-            return False
-        known.add(key)
-        on_update(change)
-        return True
-
-    def on_sample(sample: zenoh.Sample) -> bool:
-        with order:
-            answers.pop(str(sample.key_expr), None)
-            return deliver(sample)
-
-    def request(requested: Iterable[str]) -> None:
-        query_id = object()
-
-        def answered(reply: zenoh.Reply) -> None:
-            if reply.ok is None:
-                return
-            with order:
-                key, stamp = str(reply.ok.key_expr), reply.ok.timestamp
-                query_of, before = answers.get(key, (None, None))
-                # A change that was heard meanwhile is as new as this answer, or newer. Of several answers to one query
-                # the latest counts.
-                if (key not in known or (query_of is query_id and is_later(stamp, before))) and deliver(reply.ok):
-                    answers[key] = (query_id, stamp)
-
-        for key in requested:
-            session.get(
-                key,
-                zenoh.handlers.Callback(answered, indirect=False),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,  # else Zenoh keeps all answers until the query ends
-                timeout=timeout_s,
-                cancellation_token=cancelled,
-            )
-
-    def on_token(sample: zenoh.Sample) -> None:
-        if not on_sample(sample):
-            return
-        of_pair = str(sample.key_expr).removesuffix("alive")
-        documents = (f"{of_pair}health", f"{of_pair}extrinsic")
-        if sample.kind == zenoh.SampleKind.PUT:
-            request(documents)
-        else:
-            with order:
-                known.difference_update(documents)
-
+    """Inside the block, `on_update` is called for the current state of a pair (`*`: of each pair) and for every change,
+    and `on_refused` for every document that cannot be read. Both are called on Zenoh's threads and must not wait. The
+    block begins before the answers about the current state are there; they come within `timeout_s` or not at all. A
+    pair that appears later is queried, too, because its first documents may have been sent before it knew of this
+    subscriber."""
     now = (keys.health(pair), keys.extrinsic(pair))
-    handler = zenoh.handlers.Callback(on_sample, indirect=False)
+    documents = _PairDocuments(session, timeout_s, on_update, on_refused)
+    handler = zenoh.handlers.Callback(documents.on_sample, indirect=False)
     with ExitStack() as stack:
         for key in now:
             stack.callback(session.declare_subscriber(key, handler).undeclare)
-        of_tokens = zenoh.handlers.Callback(on_token, indirect=False)
+        of_tokens = zenoh.handlers.Callback(documents.on_token, indirect=False)
         tokens = session.liveliness().declare_subscriber(keys.alive(pair), of_tokens, history=True)
         stack.callback(tokens.undeclare)
-        stack.callback(cancelled.cancel)
-        request(now)
+        stack.callback(documents.cancel)
+        documents.query(now)
         yield
 
 
