@@ -24,7 +24,7 @@ HEAD = """\
 One YAML file. `coec check-config --defaults` prints a template in which every key stands with its default,
 `coec check-config FILE` what a file comes to, and why it cannot be used (exit 78). Unknown keys are refused. Relative
 paths are relative to the file. What a running service takes without a restart is told in
-[operations](operations.md#what-a-reload-takes). Times without another unit in their name are seconds of the sensors.
+[operations](operations.md#reload). Times without another unit in their name are seconds of the sensors.
 
 A range is an interval: `[` and `]` belong to it, `(` and `)` do not. *needed* stands where there is no default.
 

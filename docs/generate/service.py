@@ -43,75 +43,75 @@ OPERATIONS = """\
 {written}
 ## Exit codes
 
-Container engines start a service again whatever its exit code (`restart: unless-stopped`), after pauses that grow to a
-minute. Code 78 ends alike each time: see to the log.
+Container engines restart a service after any exit code (`restart: unless-stopped`), with pauses that grow to a minute.
+Code 78 repeats until the cause is removed: check the log.
 
 {codes}
-## What may ail the service
+## Service problems
 
-Reasons in `health` and `status`, beside those of the calibration itself ([health](health.md)).
+Reasons in `health` and `status`, in addition to those of the calibration ([health](health.md)).
 
 {troubles}
-## What a reload takes
+## Reload
 
-`systemctl reload coec` (SIGHUP) reads the configuration again. A file that could not be started with is refused as a
-whole and changes nothing. These values hold from then on; all others wait for a restart. `coec query status` tells
-under `configuration` which were taken, which wait, or why the file was refused. The history of each pair whose values
-changed has an entry with the hashes before and after, and windows carry theirs (`settings_hash`).
+`systemctl reload coec` (SIGHUP) reads the configuration again. An invalid file is refused completely and changes
+nothing. The values below take effect; all others wait for a restart. `coec query status` shows under `configuration`
+which values were applied, which wait, or why the file was refused. The history of each pair whose values changed has an
+entry with the hashes before and after, and windows contain theirs (`settings_hash`).
 
 {reloaded}
-## What an update and a step back keep
+## Updates and downgrades
 
 Stop the service, replace the software, start it. Nothing in `state.directory` has to be converted: each version reads
-what the others wrote, part by part. A part that it cannot read starts anew, and nothing else does. `health` then gives
-the reason `state_other_version` with the parts and what follows, the loss counters `state_older` and `state_newer` of
-`storage` count them, the history has an entry, and the file is kept aside as `state.json.older` or `.newer`.
+what the others wrote, part by part. Only a part that it cannot read is reset. `health` then gives the reason
+`state_other_version` with the parts and the consequences, the loss counters `state_older` and `state_newer` of
+`storage` count them, the history has an entry, and the file is renamed to `state.json.older` or `.newer`.
 
 {kept}
-What an update or a step back loses never makes a pair `healthy`: it is `unknown` until it is checked again. A pair that
-was `suspect` or `miscalibrated` stays so; if the evidence for that is lost, only a window that agrees with the
-calibration, or a person, ends it. Keep a copy of `state.directory` before a step back over several versions.
+State that an update or a downgrade loses never makes a pair `healthy`: it is `unknown` until it is checked again. A
+pair that was `suspect` or `miscalibrated` stays so. If the evidence for that is lost, only a window that agrees with
+the calibration, or a command, ends it. Copy `state.directory` before a downgrade over several versions.
 """
 
 PRESERVED = (
     (
         "calibration, its provenance and uncertainty; candidate; `hold`; alarm counts (`state.json`)",
-        "kept; of states before 22 November 2026, 10:56 UTC, without the uncertainty",
-        "kept, to versions since 22 November 2026, 10:56 UTC; who holds since when and why: since 23 November",
+        "preserved; of states before 22 November 2026, 10:56 UTC, without the uncertainty",
+        "preserved, to versions since 22 November 2026, 10:56 UTC; sender, time, reason of `hold`: since 23 November",
     ),
     (
         "evidence of the monitor (`state.json`)",
-        "kept since 26 November 2026, 16:30 UTC; earlier evidence starts anew, but what it accused stays accused",
-        "kept",
+        "preserved since 26 November 2026, 16:30 UTC; earlier evidence is reset, but the states that it led to stay",
+        "preserved",
     ),
     (
         "history (`*.jsonl`)",
-        "kept and verified; an entry that cannot be read stays in its place",
-        "kept; to versions before this one, an entry that they cannot read is damage (`history_damaged`)",
+        "preserved and verified; an entry that cannot be read stays in its place",
+        "preserved; versions before this one report an entry that they cannot read as `history_damaged`",
     ),
     (
         "baselines (`rig.json`)",
-        "kept; not used if figures, network or settings have changed since (`baseline_mismatch`)",
-        "kept, to versions since 23 November 2026, 02:49 UTC",
+        "preserved; not used if figures, network or settings have changed since (`baseline_mismatch`)",
+        "preserved, to versions since 23 November 2026, 02:49 UTC",
     ),
-    ("poses of the rig, a move that is not over (`sensors.json`)", "kept", "kept"),
+    ("poses of the rig, an unresolved move (`sensors.json`)", "preserved", "preserved"),
     (
-        "nominal calibrations found on the bus (`nominal.json`)",
-        "kept",
-        "kept; to versions before this one, found again if the newer configuration had other keys",
+        "nominal calibrations discovered on the bus (`nominal.json`)",
+        "preserved",
+        "preserved; versions before this one discover them again if the newer configuration had other keys",
     ),
     (
         "windows, snippets, evidence of incidents, log of checks",
-        "kept; a check that cannot be read is left out",
-        "kept likewise; windows of an incident that cannot be read stay protected from this version on",
+        "preserved; a check that cannot be read is omitted",
+        "preserved likewise; windows of an incident that cannot be read stay protected from this version on",
     ),
     (
         "configuration",
-        "kept",
-        "take out keys that the earlier version does not know: it refuses the file (exit code 78)",
+        "preserved",
+        "remove keys that the earlier version does not know: it refuses the file (exit code 78)",
     ),
 )
-"""What is in the state directory; what an update keeps of it; what a step back keeps of it."""
+"""Content of the state directory; what an update preserves; what a downgrade preserves."""
 
 FIGURES_HEAD = """\
 # Figures
@@ -149,7 +149,7 @@ def operations_page() -> str:
             [(f"`{name}`", problem.meaning, problem.advice) for name, problem in PROBLEMS.items()],
         ),
         reloaded=table(("value", "holds"), [(f"`{place}`", when) for place, when in RELOADED.items()]),
-        kept=table(("what", "an update", "a step back"), PRESERVED),
+        kept=table(("what", "update", "downgrade"), PRESERVED),
     )
 
 
@@ -183,7 +183,7 @@ def health_page() -> str:
     states = "".join(f"- `{state.value}`: {STATES[state]}\n" for state in HealthState)
     events = "".join(f"- `{event.value}`: {meaning}\n" for event, meaning in MEANING.items())
     causes = "".join(
-        f"- `{cause.code}`: {cause.text} Then `{_state_of(cause).value}`. {cause.advice}\n"
+        f"- `{cause.code}` (`{_state_of(cause).value}`): {cause.text} {cause.advice}\n"
         for cause in (BENT_MOUNT, *(cause for cause in CAUSES.values() if cause is not BENT_MOUNT))
     )
     return (
@@ -191,31 +191,32 @@ def health_page() -> str:
         "Written by `python -m generate docs`; do not edit.\n\n"
         f"## States\n\n{states}\n"
         f"## Events\n\n{events}\n"
-        "## What follows\n\n"
-        "Rows: what happens. Columns: the state in which it happens. · means that nothing changes.\n\n"
+        "## Transitions\n\n"
+        "Rows: events. Columns: the state before the event. · means no change.\n\n"
         f"{markdown()}\n"
-        "## What the monitor needs\n\n"
-        "Evidence is the log-likelihood ratio of a mount that moved, at some past time and to some place, against one\n"
-        "that has not moved (`evidence` of a check, nats). A check counts by the share of its pairs that are new,\n"
-        f"between {sequential_tests.LEAST_STEP:+g} and {sequential_tests.MOST_STEP:+g}. One with faint edges may "
-        "make a mount suspect, but confirms nothing.\n\n"
-        "The threshold follows from how often a right mount may be accused. It is the logarithm of the number of\n"
-        f"tests, {change_detector.TESTS_PER_CHECK} at every check, that begin within "
-        "`monitor.hours_between_false_suspicions` for `suspect`, and\n"
-        "within `monitor.hours_between_false_alarms` for `miscalibrated`: "
-        f"{_LEVELS.suspect:.1f} and {_LEVELS.confirmed:.1f} with a check\n"
+        "## Thresholds of the monitor\n\n"
+        "The evidence (`evidence` of a check, nats) is the log-likelihood ratio of a mount that moved, at some past\n"
+        "time by some displacement, against one that has not moved. The weight of a check is the share of its frame\n"
+        "pairs that are new; its contribution is limited to "
+        f"{sequential_tests.LEAST_STEP:+g}…{sequential_tests.MOST_STEP:+g}. A check with faint edges can make a mount\n"
+        "suspect, but confirms no move.\n\n"
+        "The threshold follows from the false-alarm rate. It is the logarithm of the number of tests that begin\n"
+        "within `monitor.hours_between_false_suspicions` for `suspect`, and within\n"
+        "`monitor.hours_between_false_alarms` for `miscalibrated`. "
+        f"{change_detector.TESTS_PER_CHECK} tests begin at every check. With a check\n"
         f"every {_DEFAULT.period_s:g} s, {_DEFAULT.hours_between_false_suspicions:g} h and "
-        f"{_DEFAULT.hours_between_false_alarms:g} h. A mount is clear again below {_LEVELS.clear:.1f}; evidence never "
-        f"exceeds {_LEVELS.most:.1f}.\n\n"
-        f"From {change_detector.AT_ODDS_AT:g} flagged checks in a row (one with faint edges counts "
-        f"{change_detector.WEAK_SHARE:g}) that do not add up to a move, because\n"
-        "they put the mount elsewhere every time, the monitor is at odds with itself. It is also at odds if no\n"
-        "window has confirmed the served extrinsic yet and all checks together put the mount farther from it than\n"
-        f"the estimator is on other rigs (squared distance above {change_detector.ASTRAY2:.1f}).\n\n"
-        f"A cause in the data is believed from an evidence of {change_detector.BLIND_AT:g} checks on. Dirt is believed "
+        f"{_DEFAULT.hours_between_false_alarms:g} h the thresholds are "
+        f"{_LEVELS.suspect:.1f} and {_LEVELS.confirmed:.1f}. A mount is clear again below\n"
+        f"{_LEVELS.clear:.1f}; evidence is limited to {_LEVELS.most:.1f}.\n\n"
+        "The event `monitor_at_odds` occurs in two cases:\n\n"
+        f"- {change_detector.AT_ODDS_AT:g} or more flagged checks in a row (one with faint edges counts "
+        f"{change_detector.WEAK_SHARE:g}) disagree about the pose.\n"
+        "- No window has confirmed the served extrinsic yet, and the mean of all checks differs from it by more than\n"
+        f"  the estimator does on other rigs (squared distance above {change_detector.ASTRAY2:.1f}).\n\n"
+        f"A cause in the data is reported from an evidence of {change_detector.BLIND_AT:g} checks on. Dirt is reported "
         "after the same blocks of\n"
-        f"the image have shown no contrast for {sensor_faults.DIRTY_CHECKS:g} checks. Once its data could not be "
-        "judged, a pair stays `degraded`\n"
+        f"the image have shown no contrast for {sensor_faults.DIRTY_CHECKS:g} checks. After a time without usable data "
+        "a pair stays `degraded`\n"
         f"for {SETTLING_NS / 1e9:g} s of sensor time (`settling`), so that several poor stretches in a row count as "
         "one.\n\n"
         f"## Causes\n\n{causes}"

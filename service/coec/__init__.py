@@ -7,22 +7,22 @@
     if result.accepted:
         result.export("calibration.urdf", format="urdf", parent="lidar", child="camera")
 
-`coec.open` gives a `Recording`, `coec.calibrate` calibrates its windows, and a `Result` says where the camera is, how
-certain that is, and whether to use it. `coec.client.Vehicle` asks a running service. Every exception that coec raises
-on purpose is a `CoecError`.
+`coec.open` returns a `Recording`. `coec.calibrate` calibrates its windows. A `Result` contains the pose of the camera,
+its uncertainty and the verdict. `coec.client.Vehicle` queries a running service. Every exception that coec raises
+deliberately is a `CoecError`.
 
 Conventions: `T_camera_lidar` (4, 4) maps LiDAR coordinates (x forward, y left, z up) to camera coordinates (x right, y
 down, z forward), metres. Corrections and standard deviations are about and along the camera axes, rotations first.
 Stamps are integer nanoseconds. Angles are in radians, and in degrees where a name or a docstring says so.
 
-Stability: the public interface is what `coec.__all__` and `coec.client.__all__` name, with all attributes that have no
-underscore and whose docstring does not exclude them, and the models of `coec.schemas` that they return. Within a minor
-version (0.1.x) none of it is removed or changes its meaning; attributes and keyword arguments may be added. Before
-something is removed, it warns for at least one minor version (a `DeprecationWarning` that says what to use instead).
-There is no promise about other modules, texts of messages, and the last digits of a result: another version of coec,
-numba or the network may calculate differently, and `config_hash` or the version shows it.
+Stability: the public interface is the names in `coec.__all__` and `coec.client.__all__`, with all attributes that have
+no underscore and whose docstring does not exclude them, and the models of `coec.schemas` that they return. Within a
+minor version (0.1.x) nothing is removed or changes its meaning; attributes and keyword arguments may be added. A
+removal is announced at least one minor version before (a `DeprecationWarning` names the replacement). Other modules,
+texts of messages, and the last digits of a result may change: another version of coec, numba or the network may compute
+differently; `config_hash` or the version shows it.
 
-`import coec` costs milliseconds: the modules that calculate are imported when they are first used.
+`import coec` takes milliseconds: numerical modules are imported on first use.
 """
 
 import os

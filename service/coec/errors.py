@@ -29,16 +29,16 @@ class ExitCode(IntEnum):
 
 EXIT_CODE_MEANINGS: Mapping[ExitCode, str] = {
     ExitCode.SUCCESS: "success; of `calibrate`: accepted; of `doctor`: nothing failed; of `run`: stopped by a signal",
-    ExitCode.FAILED: "the work failed, or the verdict is negative; standard error says why. `run` and `router` never "
-    "end with it",
-    ExitCode.USAGE: "the command line does not fit",
-    ExitCode.FAULT: "a fault of coec itself; of `run`: a thread died, and health has said so",
-    ExitCode.UNAVAILABLE: "what a start needs is taken or away, and may be there later: a port, space on the disk of "
-    "the state directory, its lock, the vehicle's place on the network",
+    ExitCode.FAILED: "failure, or a negative verdict; standard error gives the reason. `run` and `router` never end "
+    "with it",
+    ExitCode.USAGE: "wrong usage of the command line",
+    ExitCode.FAULT: "internal error of coec; of `run`: a thread died, and health reported it",
+    ExitCode.UNAVAILABLE: "temporarily unavailable: a port, disk space, the lock of the state directory or the vehicle "
+    "name is in use or missing; retry later",
     ExitCode.CONFIGURATION: "the configuration, or a file that it names, cannot be used: no permission, no depth "
-    "network, no certificate. Only a person can cure it",
-    ExitCode.INTERRUPTED: "Ctrl-C; `evaluate` prints and writes what was finished by then",
-    ExitCode.BROKEN_PIPE: "whoever read the output has gone",
+    "network, no certificate. A restart does not help",
+    ExitCode.INTERRUPTED: "Ctrl-C; `evaluate` prints and writes the finished part",
+    ExitCode.BROKEN_PIPE: "the reader of the output closed the pipe",
 }
 """Every exit status with its meaning."""
 

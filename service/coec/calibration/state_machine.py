@@ -35,11 +35,11 @@ class HealthState(StrEnum):
 
 STATES: Mapping[HealthState, str] = MappingProxyType(
     {
-        HealthState.UNKNOWN: "what is served has not been checked",
-        HealthState.HEALTHY: "what is served has been checked and agrees with the data",
-        HealthState.SUSPECT: "something speaks against what is served; a window is being recorded to decide",
-        HealthState.MISCALIBRATED: "what is served is wrong",
-        HealthState.DEGRADED: "the data, or the service, do not allow a judgement",
+        HealthState.UNKNOWN: "the served extrinsic has not been checked",
+        HealthState.HEALTHY: "the served extrinsic has been checked and agrees with the data",
+        HealthState.SUSPECT: "there is evidence against the served extrinsic; a window is being recorded to decide",
+        HealthState.MISCALIBRATED: "the served extrinsic is wrong",
+        HealthState.DEGRADED: "the data or the service do not allow a judgement",
         HealthState.STALE: "nothing has been checked for longer than `stale_after_s`",
     }
 )
@@ -69,25 +69,24 @@ class HealthEvent(StrEnum):
 
 MEANING: Mapping[HealthEvent, str] = MappingProxyType(
     {
-        HealthEvent.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
+        HealthEvent.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with the served extrinsic",
         HealthEvent.CONFIRMED_EARLIER: "an accepted window is served, or agrees, but its data are older than three "
         "periods",
-        HealthEvent.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
+        HealthEvent.CONTRADICTED: "an accepted window contradicts the served extrinsic, and may not be applied",
         HealthEvent.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
-        HealthEvent.REFUSED_ELSEWHERE: "a window was refused, but it, or its end, shows a pose other than what is "
-        "served",
-        HealthEvent.CLEAR: "a check acquits an extrinsic that a window has confirmed",
-        HealthEvent.NO_OBJECTION: "a check acquits an extrinsic that no window has confirmed",
-        HealthEvent.SUSPECTED: "the monitor suspects that the mount has moved, or checks accuse it and none acquits it "
-        "for three periods",
-        HealthEvent.MOUNT_MOVED: "the monitor is certain that the mount has moved",
-        HealthEvent.AT_ODDS: "checks accuse the mount, but do not add up to a move",
+        HealthEvent.REFUSED_ELSEWHERE: "a window was refused, but its pose, or the pose at its end, is not the "
+        "served one",
+        HealthEvent.CLEAR: "a check validates an extrinsic that a window has confirmed",
+        HealthEvent.NO_OBJECTION: "a check validates an extrinsic that no window has confirmed",
+        HealthEvent.SUSPECTED: "the monitor suspects that the mount has moved, or checks contradict the extrinsic and "
+        "none validates it for three periods",
+        HealthEvent.MOUNT_MOVED: "the monitor confirms that the mount has moved",
+        HealthEvent.AT_ODDS: "checks contradict the extrinsic, but do not agree on a move",
         HealthEvent.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
-        HealthEvent.NOT_ACQUITTED: "three periods passed in which checks were completed, and none acquits the "
-        "extrinsic",
+        HealthEvent.NOT_ACQUITTED: "checks were completed for three periods, and none validates the extrinsic",
         HealthEvent.OVERDUE: "no check has been completed for three periods of the monitor",
         HealthEvent.AGED: "no check has been completed for `stale_after_s`",
-        HealthEvent.REPLACED: "a person replaced the extrinsic (apply, rollback, reset)",
+        HealthEvent.REPLACED: "a command replaced the extrinsic (apply, rollback, reset)",
         HealthEvent.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing has been checked in the new "
         "time",
         HealthEvent.RESTARTED: "the service was started again: nothing has been checked since",

@@ -22,25 +22,25 @@ from coec.io.zenoh.endpoints import redacted
 from coec.io.zenoh.session import check_certificates, settings_of, settings_source
 
 RELOADED: Mapping[str, str] = {
-    "log.*": "at once in the service; its worker logs as it was started until the next start",
-    "authority.*": "with the next command; the files of the certificate are read again with every reload",
-    "metrics.*": "at once; if the new address is not available, nobody listens, and status says so",
-    "uplink.*": "with the next word and the next answer",
+    "log.*": "at once in the service; in the worker after a restart",
+    "authority.*": "with the next command; every reload reads the certificate files again",
+    "metrics.*": "at once; if the new address is not available, metrics are not served, and status reports it",
+    "uplink.*": "with the next heartbeat and the next answer",
     "budget.cores": "with the next check",
-    "stale_after_s": "with the next look at the clocks, within a second",
+    "stale_after_s": "within a second",
     "state.max_bytes": "with the next window",
     "state.max_protected_bytes": "with the next window",
     "state.max_age_days": "with the next window",
     "state.min_free_bytes": "with the next window",
-    "pairs.*.window.*": "with the next slice; the open one ends as it began",
+    "pairs.*.window.*": "with the next slice; the open one keeps its values",
     "pairs.*.calibration.objective.*": "with the next check and the next window",
     "pairs.*.calibration.search.*": "with the next check and the next window",
     "pairs.*.calibration.verdict.*": "with the next check and the next window",
     "pairs.*.calibration.time_offset.*": "with the next check and the next window",
     "pairs.*.calibration.motion_compensation": "with the next check and the next window",
-    "pairs.*.monitor.hours_between_*": "with the next answer that is judged",
-    "pairs.*.policy.*": "with the next answer that is judged",
-    "pairs.*.tracker.*": "with the next answer that is judged",
+    "pairs.*.monitor.hours_between_*": "with the next result",
+    "pairs.*.policy.*": "with the next result",
+    "pairs.*.tracker.*": "with the next result",
 }
 """Patterns of the places whose values are taken over, and when. All others wait for a restart."""
 

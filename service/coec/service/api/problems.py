@@ -25,7 +25,7 @@ from coec.service.ingest.intake import Arrivals
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What a trouble means, and what to do about it."""
+    """What a problem means, and what to do about it."""
 
     meaning: str
     advice: str
@@ -33,178 +33,182 @@ class Problem:
 
 PROBLEMS: Mapping[str, Problem] = {
     "no_router": Problem(
-        "There is no router: no frames come in, and nobody is answered.",
-        "Start it, or check the network; `coec doctor` says how far a connection gets. The service connects by itself.",
+        "No connection to a Zenoh router: no frames are received and no queries are answered.",
+        "Start the router, or check the network; `coec doctor` tests the connection step by step. The service "
+        "reconnects by itself.",
     ),
     "two_senders": Problem(
-        "Two publishers send on one topic or key at the same time. Nobody knows whose frames are the sensor's, so that "
-        "all are refused until only one has sent for 64 messages; nothing is checked or calibrated meanwhile.",
-        "End one of the two, or name the topic of the one that is meant; `coec doctor` lists topics and nodes. If the "
-        "other is of another vehicle, give each vehicle keys of its own.",
+        "Two publishers send on one topic or key at the same time. The service cannot determine which is the sensor, "
+        "so all frames are refused until only one has sent for 64 messages. Meanwhile nothing is checked or "
+        "calibrated.",
+        "Stop one of the two, or configure the topic of the right one; `coec doctor` lists topics and nodes. If the "
+        "other belongs to another vehicle, configure separate keys for each vehicle.",
     ),
     "foreign_frames": Problem(
-        "Frames with another frame id or image size come beside those of the sensor; they are refused and counted.",
-        "Find the program that sends them on this topic or key (another sensor, another vehicle), and end it.",
+        "Frames with another frame id or image size arrive on the key of the sensor; they are refused and counted.",
+        "Find and stop the program that publishes them on this topic or key (another sensor, another vehicle).",
     ),
     "sender_clock": Problem(
-        "Messages of a stream have no stamp; the time at which they were sent replaces the sensor's.",
-        "Have the driver stamp its messages by the clock of the sensors.",
+        "Messages of a stream have no stamp; the time of sending replaces the sensor's stamp.",
+        "Configure the driver to stamp its messages by the clock of the sensors.",
     ),
     "inconsistent_rig": Problem(
-        "The pairs of the vehicle do not agree where its sensors are; `coec query rig` shows what does not fit.",
-        "Nothing while windows come: a pair whose window is from before a move fits again with its next one. If it "
-        "stays, check what a pair has of its own (intrinsics, clocks, masks), and `links`.",
+        "The pairs of the vehicle are inconsistent about the poses of its sensors; `coec query rig` shows the "
+        "residuals.",
+        "Nothing while windows are recorded: a pair whose window is from before a move becomes consistent with its "
+        "next one. If the reason stays, check the settings of the pair (intrinsics, clocks, masks), and `links`.",
     ),
     "sensor_suspected": Problem(
-        "The pairs of the vehicle do not agree where its sensors are, and one of this pair may have moved; `coec query "
-        "rig` says by how much, and how likely that is.",
-        "Nothing: the next looks name the sensor, or lead to `inconsistent_rig`, or show that all fits.",
+        "The pairs of the vehicle are inconsistent about the poses of its sensors, and a sensor of this pair may have "
+        "moved; `coec query rig` gives the displacement and its probability.",
+        "Nothing: the next checks identify the sensor, lead to `inconsistent_rig`, or show that all pairs are "
+        "consistent.",
     ),
     "sensor_moved": Problem(
         "A sensor of the pair moved (see `coec query rig`), and the pair still serves the calibration from before.",
-        "Nothing while windows come: one correction puts all its pairs right. If it stays, `health` says what the "
-        "windows of the pair lack, or the pair is held or waits for `apply`.",
+        "Nothing while windows are recorded: one correction updates all its pairs. If the reason stays, `health` lists "
+        "what the windows of the pair lack, or the pair is held or waits for `apply`.",
     ),
     "one_pair": Problem(
-        "About `rig`: the vehicle has one pair, which cannot tell its camera from its LiDAR.",
-        "Nothing: `health` of the pair says whether either moved. A second camera on that LiDAR would tell them apart.",
+        "About `rig`: the vehicle has one pair, which cannot distinguish its camera from its LiDAR.",
+        "Nothing: `health` of the pair reports whether either moved. A second camera with that LiDAR would distinguish "
+        "them.",
     ),
     "no_rig": Problem(
-        "About `rig`: its pairs are not put together, because the vehicle has more sensors than that can handle.",
-        "Nothing: every pair is calibrated by itself. Leave out pairs that are of no use, to have the others together.",
+        "About `rig`: there is no joint estimate, because the vehicle has more sensors than it supports.",
+        "Nothing: every pair is calibrated by itself. Remove unneeded pairs to get a joint estimate of the others.",
     ),
     "lidars_not_installed": Problem(
-        "There are several LiDARs, and the package that measures their poses to one another is not installed.",
-        "Install the extra `lidars`, or set `lidar_edges.period_s: 0`; all else goes on without it.",
+        "There are several LiDARs, and the package that measures their relative poses is not installed.",
+        "Install the extra `lidars`, or set `lidar_edges.period_s: 0`; everything else works without it.",
     ),
     "rig_state_damaged": Problem(
-        "About `rig`: something that was known of it before the restart cannot be read; it is kept aside, and learnt "
-        "anew.",
-        "Nothing after an update of the software, else check the disk of `state.directory`. Only its pairs report a "
-        "sensor that was knocked meanwhile.",
+        "About `rig`: a part of the stored state cannot be read. It is quarantined and estimated again.",
+        "Nothing after an update of the software, else check the disk of `state.directory`. A sensor that moved during "
+        "the restart is reported by its pairs alone.",
     ),
     "insecure": Problem(
-        "The service listens where anyone is let in without a certificate.",
-        "Listen on loopback or on TLS with client certificates, and take `zenoh.insecure` out.",
+        "The service accepts connections without a certificate.",
+        "Listen on loopback or on TLS with client certificates, and remove `zenoh.insecure`.",
     ),
     "http_unavailable": Problem(
         "Metrics are not served over HTTP: the address is not available.",
-        "Free the port or name another in `metrics.http`, and reload.",
+        "Free the port or configure another in `metrics.http`, and reload.",
     ),
     "http_insecure": Problem(
         "Other computers can read the metrics over HTTP.",
-        "Listen on loopback, and take `metrics.insecure` out.",
+        "Listen on loopback, and remove `metrics.insecure`.",
     ),
     "worker_failed": Problem(
-        "The process that infers and solves has ended and is being replaced.",
-        "Nothing if it happens once; if it goes on, check its memory (`worker.max_memory_bytes`) and the log.",
+        "The worker process (inference and search) has ended and is being replaced.",
+        "Nothing if it happens once; if it repeats, check its memory (`worker.max_memory_bytes`) and the log.",
     ),
     "compiling_kernels": Problem(
-        "The worker compiles its kernels, once on a machine and after an update; the text says how many are there. The "
-        "extrinsic is served and windows are recorded meanwhile; checks and solves begin afterwards.",
+        "The worker compiles its kernels, once on a machine and after an update; the text gives the progress. "
+        "Meanwhile the extrinsic is served and windows are recorded; checks and solves start afterwards.",
         "Nothing: it takes a minute, and longer on a busy machine. `coec warmup` compiles the kernels beforehand.",
     ),
     "recording_failed": Problem(
-        "The last window could not be written; the next one is tried.",
-        "Check the disk of `state.directory`: room, owner, errors.",
+        "The last window could not be written; the service will try the next one.",
+        "Check the disk of `state.directory`: free space, owner, errors.",
     ),
     "recording_stuck": Problem(
         "The disk does not answer: no window can be written.",
         "Check the disk of `state.directory`; `coec doctor` measures it.",
     ),
     "disk_slow": Problem(
-        "The disk takes longer than a command may wait: acknowledgements say that the command is not durable yet.",
-        "Check what else writes to the disk of `state.directory`; `coec doctor` measures it.",
+        "The disk takes longer than a command may wait: acknowledgements report the command as not yet durable.",
+        "Check for other programs that write to the disk of `state.directory`; `coec doctor` measures it.",
     ),
     "disk_failing": Problem(
-        "The disk refuses what is to be remembered; it is kept in memory and tried again.",
+        "Writing state to the disk fails; the state is kept in memory and the write is repeated.",
         "Check the disk of `state.directory`: errors, owner, mount.",
     ),
     "disk_read_only": Problem(
-        "The state directory is mounted read-only: nothing is remembered over a restart.",
-        "Mount it for writing; nothing has to be restarted.",
+        "The state directory is mounted read-only: no state survives a restart.",
+        "Mount it for writing; no restart is needed.",
     ),
     "disk_full": Problem(
-        "The disk of the state directory is full: what is to be remembered waits in memory.",
-        "Make room; nothing has to be restarted.",
+        "The disk of the state directory is full: the state waits in memory.",
+        "Free space on the disk; no restart is needed.",
     ),
     "state_damaged": Problem(
-        "What was remembered, or a part of it, cannot be used and is kept aside; the text says what is lost and what "
-        "is served.",
+        "The stored state, or a part of it, cannot be used and is quarantined; the text names what is lost and what is "
+        "served.",
         "Restore the file from a backup, or calibrate if the nominal calibration is served; check the disk.",
     ),
     "state_other_version": Problem(
-        "Another version of the software wrote parts of the state in a form that this one cannot read. Only these "
-        "parts start anew; the text names them, and the file is kept aside.",
-        "Nothing, unless the text says that the nominal calibration is served: then calibrate, or return to the "
+        "Another version of the software wrote parts of the state in a format that this one cannot read. Only these "
+        "parts are reset; the text names them, and the file is quarantined.",
+        "Nothing, unless the text reports that the nominal calibration is served: then calibrate, or return to the "
         "version that wrote the file.",
     ),
     "history_damaged": Problem(
-        "The chain of the history is broken; what there was is kept aside.",
-        "Find out who may write the state directory, and check the disk.",
+        "The hash chain of the history is broken; the old history is quarantined.",
+        "Find out who can write to the state directory, and check the disk.",
     ),
     "baseline_damaged": Problem(
-        "The baseline of the rig cannot be read; limits are those of the configuration.",
+        "The baseline of the rig cannot be read; the limits of the configuration apply.",
         "Commission the rig again, or restore the file.",
     ),
     "baseline_mismatch": Problem(
         "The baseline of the rig was learned with another rig, network or configuration, and is not used.",
-        "Commission the rig again, or go back to what it was learned with.",
+        "Commission the rig again, or return to the rig, network and configuration of the baseline.",
     ),
     "monitor_blind": Problem(
-        "Check after check comes to nothing.",
-        "Read the reason: it names what fails; check frames and network.",
+        "Several checks in a row failed.",
+        "Read the reason, which names the failure; check frames and network.",
     ),
     "windows_in_vain": Problem(
-        "Window after window comes to nothing.",
-        "Read the reason: it names what fails; check frames and network.",
+        "Several windows in a row failed.",
+        "Read the reason, which names the failure; check frames and network.",
     ),
     "overdue_worker": Problem(
-        "No check has been completed for three periods: the worker has not answered.",
+        "No check has been completed for three periods: the worker has not replied.",
         "Nothing while it starts or compiles kernels; else check its load and the log.",
     ),
     "overdue_depth": Problem(
-        "No check has been completed for three periods: no depth comes.",
-        "Check the depth network, or the depth maps that come with the frames.",
+        "No check has been completed for three periods: depth is missing.",
+        "Check the depth network, or the depth maps of the frames.",
     ),
     "overdue_pairing": Problem(
-        "No check has been completed for three periods: frames come, but make no pairs.",
-        "Check the clocks of camera and LiDAR: `coec doctor` says how far they are apart.",
+        "No check has been completed for three periods: frames arrive, but images and sweeps do not match in time.",
+        "Check the clocks of camera and LiDAR: `coec doctor` measures their difference.",
     ),
     "overdue_data": Problem(
-        "No check has been completed for three periods: frames do not come, are refused, or are too few.",
-        "Check the sensors, their keys and the router's rules: `coec doctor` listens for frames.",
+        "No check has been completed for three periods: frames are missing, refused, or too few.",
+        "Check the sensors, their keys and the access rules of the router: `coec doctor` listens for frames.",
     ),
     "overdue_budget": Problem(
-        "No check has been completed for three periods: the processor budget does not suffice.",
-        "Raise `budget.cores` to what `status` says under `budget.wanted`, or lengthen `monitor.period_s` and "
+        "No check has been completed for three periods: the processor budget is too small.",
+        "Raise `budget.cores` to the value of `budget.wanted` in `status`, or lengthen `monitor.period_s` and "
         "`window.slice_s`.",
     ),
     "service_stuck": Problem(
-        "What is known of the pair is not renewed: a disk or a thread is stuck.",
-        "The service manager restarts the service if it stays so; check the disk.",
+        "The state of the pair is not updated: a disk or a thread is blocked.",
+        "The service manager restarts the service if this lasts; check the disk.",
     ),
     "thread_died": Problem(
         "A thread of the service has died; the service ends with exit code 70.",
-        "The service manager starts it again; report the traceback in the log.",
+        "The service manager restarts it; report the traceback in the log.",
     ),
     "tokens_hidden": Problem(
-        "The router hides the liveliness tokens of this vehicle: a second daemon could serve it unseen.",
-        "Let its rules allow the service `liveliness_token` and `liveliness_query`, as `deploy/router.json5` does.",
+        "The router hides the liveliness tokens of this vehicle: a second daemon would not be detected.",
+        "Allow the service `liveliness_token` and `liveliness_query` in its rules, as `deploy/router.json5` does.",
     ),
     "two_daemons": Problem(
         "Another daemon serves the vehicle; this one ends with exit code 75.",
-        "End one of the two, or give them different vehicles.",
+        "Stop one of the two, or give them different vehicle names.",
     ),
     "rival_unproven": Problem(
-        "A program holds the liveliness token of another daemon of this vehicle, but no daemon answers for it; the "
+        "A program holds the liveliness token of another daemon of this vehicle, but no daemon answers for it. The "
         "token is ignored, and the calibration is served as before.",
-        "Find the program and end it. Let the router's rules allow tokens below `coec/@v1/<vehicle>` to the service "
-        "alone, as `deploy/router.json5` does.",
+        "Find and stop the program. Restrict tokens below `coec/@v1/<vehicle>` to the service in the router's rules, "
+        "as `deploy/router.json5` does.",
     ),
     "no_look_yet": Problem(
-        "The service has not looked yet for what the configuration leaves out.",
-        "Nothing; it looks four times a second.",
+        "Discovery has not yet searched for the settings that the configuration omits.",
+        "Nothing; it searches four times a second.",
     ),
     "no_image": Problem(
         "A pair waits for its first image, which gives the camera's frame and the size of its images.",
@@ -216,50 +220,51 @@ PROBLEMS: Mapping[str, Problem] = {
     ),
     "no_motion": Problem(
         "A pair waits for its first ego-motion, which gives the frame of the velocities.",
-        "Check its topic, set `ego.T_lidar_ego`, or take `ego` out.",
+        "Check its topic, set `ego.T_lidar_ego`, or remove `ego`.",
     ),
     "no_frame_id": Problem(
-        "The headers of a stream name no frame.",
-        "Set the frame that the text names, or have the driver say it.",
+        "The headers of a stream contain no frame id.",
+        "Set the frame that the text names, or configure the driver to send it.",
     ),
     "no_camera_info": Problem(
         "A pair waits for the `CameraInfo` that gives the intrinsics.",
-        "Have the driver publish it, name its topic in `camera.info_topic`, or set `camera.intrinsics`.",
+        "Configure the driver to publish it, set its topic in `camera.info_topic`, or set `camera.intrinsics`.",
     ),
     "camera_info_refused": Problem(
-        "The `CameraInfo` cannot be used: it is not in CDR, uncalibrated, or of a lens that is not known here.",
+        "The `CameraInfo` cannot be used: it is not in CDR, uncalibrated, or of an unsupported camera model.",
         "Calibrate the camera, or set `camera.intrinsics`.",
     ),
     "camera_info_size": Problem(
         "The `CameraInfo` is for images of another size.",
-        "Have the driver say its binning and region of interest, or set `camera.intrinsics`.",
+        "Configure the driver to send its binning and region of interest, or set `camera.intrinsics`.",
     ),
     "tf_static": Problem(
         "`/tf_static` does not connect two frames of a pair.",
-        "Publish the joint that is missing (robot_state_publisher does so from a URDF), or set what the text names.",
+        "Publish the missing joint (robot_state_publisher does so from a URDF), or set what the text names.",
     ),
     "tf_static_no_tree": Problem(
-        "`/tf_static` contradicts itself on the way between two frames: a frame with two parents, or a loop.",
-        "Have one publisher per frame; the text names the frames.",
+        "`/tf_static` is not a tree between two frames: a frame with two parents, or a loop.",
+        "Use one publisher per frame; the text names the frames.",
     ),
     "being_built": Problem(
-        "Everything that the configuration leaves out is found, and the pair is being built.",
+        "Discovery is complete, and the pair is being created.",
         "Nothing; it takes a second.",
     ),
     "cannot_be_built": Problem(
-        "What was found does not make a rig: a mask of another size, for instance.",
-        "Correct what the text says; the service tries again when something on the bus changes.",
+        "The discovered calibration is invalid, for example a mask of another size.",
+        "Correct what the text names; the service retries when something on the bus changes.",
     ),
     "nominal_changed": Problem(
-        "`/tf_static` or `CameraInfo` now differ from when the pair was built; its nominal calibration stays.",
+        "`/tf_static` or `CameraInfo` differ from those with which the pair was created; its nominal calibration "
+        "stays.",
         "If the new one is right: stop the service, remove `nominal.json` from `state.directory`, start it.",
     ),
     "held": Problem(
-        "A person holds the extrinsic as it is; its text says who, since when and why. The service itself is well.",
+        "An operator holds the extrinsic; the text gives who, since when and why. The service itself works.",
         "`coec query command/hold --release` releases it.",
     ),
 }
-"""Troubles by the code of the reason."""
+"""Problems by the code of the reason."""
 
 
 SILENT_S = 5.0
