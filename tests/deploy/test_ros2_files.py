@@ -71,7 +71,7 @@ def test_the_page_names_topics_and_types_as_they_are_published() -> None:
         "camera_info": (keys.camera_info_topic("PAIR"), messages.CAMERA_INFO),
         "overlay": (keys.overlay_topic("PAIR"), messages.COMPRESSED_IMAGE),
     }
-    told = {row[0].strip("`"): (row[1].strip("`"), row[2].strip("`")) for row in rows("What it says")}
+    told = {row[0].strip("`"): (row[1].strip("`"), row[2].strip("`")) for row in rows("Published topics")}
     assert {name: (topic.replace("<pair>", "PAIR"), kind) for name, (topic, kind) in told.items()} == published
 
 
