@@ -46,7 +46,7 @@ All take {common}.
 
 {errors}
 Refusals of a command have codes of their own in its acknowledgement, and a router's refusal is silence
-([security](security.md#what-reads-as-denied-and-what-does-not)).
+([security](security.md#denied-queries)).
 """
 
 SCHEMAS = """\
