@@ -42,7 +42,8 @@ hypothesis.settings.load_profile("coec")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--faults FILE``: write the table of faults and promises at the end of the run (``tests/faults.py``).
+    """``--faults FILE``: write the table of faults and promises (``tests/faults.py``): `tests/faults.json`, which is
+    committed, or a page such as `build/faults.md`.
     ``--write-golden``: replace the golden decisions (``tests/golden``)."""
     parser.addoption("--faults", type=Path, metavar="FILE", help="write the table of faults and promises")
     parser.addoption("--write-golden", action="store_true", help="replace the golden decisions by today's")
