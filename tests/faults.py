@@ -15,6 +15,7 @@ from __future__ import annotations
 import ast
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -265,13 +266,14 @@ CHOSEN: Mapping[str, tuple[Chosen, ...]] = {
 """The rows of the page, by section."""
 
 
-def marked_rows(tests: Path = TESTS) -> list[Row]:
+@cache
+def marked_rows(tests: Path = TESTS) -> tuple[Row, ...]:
     """All rows that the tests below a folder are marked with, by file and then by line.
 
     Raises:
         ValueError: a mark whose two texts are not written out at the mark itself.
     """
-    return [row for path in sorted(tests.rglob("test_*.py")) for row in _rows_of(path, tests)]
+    return tuple(row for path in sorted(tests.rglob("test_*.py")) for row in _rows_of(path, tests))
 
 
 def _rows_of(path: Path, tests: Path) -> Iterator[Row]:
