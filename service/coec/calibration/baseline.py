@@ -127,20 +127,18 @@ FLOOR = np.array([radians(0.02)] * 3 + [0.004] * 3)
 
 PRIOR_SPREAD_ROTATION = np.array([radians(0.08), radians(0.07), radians(0.15), np.nan, np.nan, np.nan])
 PRIOR_SPREAD_POSE = np.array([radians(0.20), radians(0.10), radians(0.25), 0.02, 0.04, 0.04])
-"""Spread of a check of a single pair over three and over six degrees of freedom, on the worst of the 64-beam recordings
-tried (rad, m)."""
+"""Spread of a check of a single pair over three and over six degrees of freedom (rad, m). See docs/measured.md."""
 
 UNCOMMISSIONED_BIAS = np.array([radians(0.12)] * 3 + [0.03] * 3)
-"""Standard deviation of the estimator's unknown bias on a rig (rad, m): on the recordings tried the edges differ from
-the vendor's calibration by up to 0.28° and 2 cm."""
+"""Standard deviation of the estimator's unknown bias on a rig that was not commissioned (rad, m). See
+docs/measured.md."""
 
 STREET = np.array([radians(0.04)] * 3 + [0.01] * 3)
-"""Standard deviation of the pose from street to street (rad, m): disjoint halves of the recordings tried agree within
-0.05° over rotations."""
+"""Standard deviation of the pose from street to street (rad, m). See docs/measured.md."""
 
 PIXEL_SHARE = 0.3
-"""Share of a pixel by which pixels alone may displace the local optimum, whatever the scenes of a commissioning show:
-edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
+"""Share of a pixel by which pixels alone may displace the local optimum, whatever the scenes of a commissioning show.
+See docs/measured.md."""
 
 FIGURES = "edges-insist"
 """Names the figures for which limits are learned; part of the hash that says what a baseline is valid for. It changes

@@ -181,7 +181,7 @@ SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
 MAX_BIAS_RAD = radians(1.0)
-"""A larger bias about an axis means a wrong reference: on the recordings tried the bias was up to 0.28°."""
+"""A larger bias about an axis means a wrong reference. See docs/measured.md."""
 
 LAYOUT_SHARE = 0.25
 """A lost pose counts as keeping at least this share of the edges of right checks: the layout of a street fits anywhere,

@@ -84,9 +84,8 @@ POLISHED_BASINS = 5
 second place."""
 
 POLISHED_ALIKE = 3
-"""At most this many polishes, that of the start included, may end in one basin: further ones come to the same end. On
-eight windows of nine, half of them simulated, the score of the settled pose differs by 0.1 % at most; with two, another
-basin won on the ninth."""
+"""At most this many polishes, that of the start included, may end in one basin: further ones come to the same end. See
+docs/measured.md."""
 
 PLAUSIBLE = 0.5
 """A basin, or the neighbourhood of the start, is polished if it has at least this share of the best rank. A polish adds
@@ -97,18 +96,16 @@ NEIGHBOURHOOD_RAD = radians(5.0)
 
 SETTLED_POSES = 2
 """How many poses of the best basin are settled. One is not enough: with six degrees of freedom, blurred edges can lead
-it astray (to 0.5° and 8 cm in one window of 24 of a simulated fisheye of 700 px)."""
+it astray. See docs/measured.md."""
 
 LEADING_DEPTH_POINTS = 150_000
 """Points of the window's clouds, in view or not, that the depth witness of a fusion uses until its basin is known. Few
 are enough because its hill is degrees wide."""
 
 SEEN_DEPTH_POINTS = 100_000
-"""Points in view that the depth witness uses at the end, unless at least half as many are in view already. The counts
-of a histogram scatter by their square root; that scatter in a thousand cells puts ripples on the hill, and where little
-is near the edges alone do not hold its top. Measured on eight windows of four simulated drives with six degrees of
-freedom and starts 20° and 0.3 m away: root mean square 0.08° and 1.0 cm on the worst axes instead of 0.10° and 1.6
-cm."""
+"""Points in view that the depth cue uses at the end, unless at least half as many are in view already. The counts of a
+histogram scatter by their square root; that scatter in a thousand cells puts ripples on the hill, and where little is
+near the edges alone do not hold its top. See docs/measured.md."""
 
 TELLING = 2.0
 """More points are spent on the depth witness only if it stands out by at least this many standard deviations. Below

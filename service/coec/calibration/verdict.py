@@ -38,9 +38,7 @@ UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
 
 
 SAME_SCENE = 0.5
-"""A window saw one scene if its independent looks are fewer than this share of its frames. Measured shares: seven
-tenths and more on a drive through streets, a fifth to a third in slow traffic and on motorways, a tenth to a quarter
-with a standing vehicle."""
+"""A window saw one scene if its independent samples are fewer than this share of its frames. See docs/measured.md."""
 
 
 def saw_one_scene(independent_samples: float, frames: int) -> bool:
@@ -95,8 +93,7 @@ def repetition_metric(
     the vehicle is not known to drive.
 
     For a standing vehicle, what stands still in its images is the whole scene. For a driving one, what stands still are
-    the lines along its road, and any two of those fit each other. On 25 simulated drives, most of them along motorways,
-    such lines bring wrong poses up to 13.7; right poses that are accepted are at 29 and more.
+    the lines along its road, and any two of those fit each other. See docs/measured.md.
     """
     if independent_samples is None or not drives(pairs):
         return ()

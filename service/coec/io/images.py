@@ -489,10 +489,8 @@ class Inspector:
 
     Sharpness is the mean squared difference between neighbours, over both directions, divided by twice the variance of
     the grey values, on the image at half size: 0 for a uniform image, 1 for white noise. It does not change with
-    brightness or contrast, falls with blur, and varies with the scene by a factor of about five. On real exposures
-    (KITTI-360, KITTI, a garage, a raw 180° fisheye with its black rim) it is 0.011 to 0.057 as recorded, and 0.002 to
-    0.0055 after a Gaussian blur of 4 px, which removes the finest edges. At an eighth of the size the two ranges
-    overlap (0.07 to 0.21 against 0.02 to 0.07), which is why the image is not reduced further.
+    brightness or contrast, falls with blur, and varies with the scene by a factor of about five. The image is not
+    reduced further, because at an eighth of the size sharp and blurred exposures overlap. See docs/measured.md.
     """
 
     def __init__(self, limits: LimitsConfig) -> None:

@@ -165,12 +165,11 @@ stays at 254 MB, with one at 248 MB, without a difference in processor time or i
 
 LARGE_ALLOCATION_BYTES = 2**20
 """Arrays from this size on get separate maps. By default this limit rises up to 32 MiB as memory is freed, which leaves
-holes between the maps of a window: a solve takes 450 MB then, and 370 MB with a fixed limit, in the same time."""
+holes between the maps of a window. See docs/measured.md."""
 
 FRAME_ALLOCATION_BYTES = 8 * 2**20
 """Larger than the frames that sensors send repeatedly (clouds of 2 MB, raw images of 6 MB), so that these get memory
-that was just freed. If it were mapped anew each time, the system would clear every page first: copying a cloud of 2 MB
-then takes 0.8 ms instead of 0.2 ms."""
+that was just freed. If it were mapped anew each time, the system would clear every page first. See docs/measured.md."""
 
 RETAINED_HEAP_BYTES = 32 * 2**20
 """Free memory that may stay at the end of the heap until `give_back`."""

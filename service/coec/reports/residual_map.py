@@ -62,8 +62,7 @@ hundred shifts are no more than a few dozen independent ones."""
 
 CLEARER = 1.0
 """Standard deviations by which the best shift must lie above every shift that is not next to it; otherwise there are
-two candidates. On five simulated drives, 0 and 0.4 degrees off the truth, 185 of 368 cells tell, 9 % of them wrong by
-2 px or more; with 2 instead it is 101 cells, and 5 %."""
+two candidates. See docs/measured.md."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

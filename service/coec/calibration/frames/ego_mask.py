@@ -39,23 +39,21 @@ Measured: 4 between consecutive frames of slow traffic and in a room, 18 and mor
 
 MOVED_LEVELS, MIN_MOVED_SHARE = 10.0, 0.4
 """Standard deviation from which a cell saw the world move, and the least share of such cells, of those that are not
-black; with fewer the scene itself stood still. Measured shares: 1.0 on a drive, 0.65 with a third of the image sky,
-0.31 in slow traffic."""
+black; with fewer the scene itself stood still. See docs/measured.md."""
 
 CHANCE = 1e-4
 """Probability that a cell of a moving scene passes for a fixed edge if its gradients are normally distributed."""
 
 MIN_STEADINESS = 2.0
 """Least mean gradient of a fixed edge over its standard deviation. It is needed because with many frames roofs and
-kerbs of a straight road, which are alike but not the same, pass the test of chance; they are below 1.2 on recorded
-drives, a body is above 3."""
+kerbs of a straight road, which are alike but not the same, pass the test of chance. See docs/measured.md."""
 
 MIN_GRADIENT_LEVELS = 3.0
 """Least gradient of an edge, grey levels per cell. Less is shading, on which nothing could be aligned anyway."""
 
 MIN_PRESENCE, MIN_AXIS_AGREEMENT = 0.8, 0.9
 """An outline shows in at least this share of the frames, and the mean of its axes (unit vectors of twice the angle) is
-at least so long. Measured on ten frames of a drive: 0.2 % of the world's cells are such, scattered."""
+at least so long. See docs/measured.md."""
 
 MIN_BOUND_AGREEMENT = 0.8
 """Least length of the mean of the axes around still cells. It may be lower because whole groups are judged there, and
@@ -65,12 +63,11 @@ STILL_SHARE = 0.2
 """A cell whose standard deviation is below this share of the median of those that moved is still."""
 
 BLACK_LEVELS = 24.0
-"""Mean grey value outside the image circle, glow of the lens included (measured on a 180° fisheye: 2 to 22)."""
+"""Mean grey value outside the image circle, glow of the lens included. See docs/measured.md."""
 
 ENCLOSED_SHARE = 0.35
 """Still cells show no world if at least this share of their outline is fixed. It is a share because the outline of a
-dark spot is lost before dark trees; the outline of a sky moves with the roofs. Measured with painted dirt: 70 % of it
-is found, 45 % at 0.6; on clean drives at most 0.7 % of the image is taken with five frames, nothing with ten."""
+dark spot is lost before dark trees; the outline of a sky moves with the roofs. See docs/measured.md."""
 
 MIN_CELLS = 6
 """Smaller groups of fixed edges are ignored: two cells across are chance, or not worth a hole in the mask."""

@@ -45,8 +45,8 @@ from coec.config import MonitorConfig
 
 ROTATIONS = TestedAxes(three([radians(2.5)] * 3), (three([radians(0.3)] * 3), three([radians(2.0)] * 3)))
 TRANSLATIONS = TestedAxes((0.1, 0.1, 0.1), ((0.03, 0.03, 0.03), (0.1, 0.1, 0.1)))
-"""The reach of bad checks (1.8 to 2.5° and 6 to 8 cm or more, on simulated drives through tunnels, open roads and
-nights), and the moves that are looked for: the creep of a mount, and a knock (rad, m)."""
+"""For rotations (rad) and translations (m): the reach of bad checks, and the moves that are looked for, the creep of a
+mount and a step. See docs/measured.md."""
 
 TESTS_PER_CHECK = len(ROTATIONS.moves) + len(TRANSLATIONS.moves)
 """Number of hypotheses that begin at every check; each of them may accuse."""
@@ -60,8 +60,7 @@ checks."""
 
 DOUBTFUL_CHECKS = 2.0
 """This many clear checks after a faint one count as faint too, because what made it faint, such as a guard rail along a
-highway, did not end with it. Of 25 checks of simulated highways with 64 beams six were clear; four of these stood alone
-between faint ones and were as far off as they. By day in streets, garages and rooms one check in thirty is faint."""
+highway, did not end with it. See docs/measured.md."""
 
 WEAK_SHARE = 0.5
 """A flagged check with faint edges counts half as much as another towards checks being at odds with each other."""
@@ -84,8 +83,7 @@ ACQUITTAL_PERIODS = 3
 
 LEARNED2 = chi2_quantile(0.97, AXES)
 """Squared distance, in standard deviations, from where the mount has been so far, beyond which a check does not acquit,
-even if its optimum is no farther off than on rigs about which nothing is known. Of clear checks of right mounts on 80
-rendered drives 2 % lie beyond, never three in a row; of mounts 10 cm off, nearly all (docs/measured.md)."""
+even if its optimum is no farther off than on rigs about which nothing is known. See docs/measured.md."""
 
 CONTRADICTION2 = chi2_quantile(1.0 - 1e-4, AXES)
 """Squared distance, in standard deviations of their difference, beyond which two checks of one place contradict each

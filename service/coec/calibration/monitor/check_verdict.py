@@ -75,12 +75,7 @@ from coec.geometry.edges.alignment import EdgeFrames, alignment_of_each, frame_a
 
 REFERENCE_CONTRAST, POWER = 20.0, 1.5
 """Contrast from which checks scatter as those of a street do, and the power of its inverse by which others scatter
-more. Learned on 212 checks of right mounts on 74 simulated drives (streets, rain, low sun, garages, rooms, highways,
-nights, tunnels, open roads; five lenses of 56 to 190°, 32 and 64 beams). Offsets at a contrast of 4 to 6, 6 to 8, 8 to
-10, 10 to 13, 13 to 17, 17 to 25 and more are 2.6, 2.4, 2.0, 1.0, 0.7, 0.4 and 0.4 standard deviations of a street
-(rms), and with this factor 0.3, 0.4, 0.6, 0.4, 0.5, 0.4 and 0.4. The error that checks of a drive share grows as their
-own errors do. Given the contrast, the number of independent looks tells nothing more, and the number of range edges
-little."""
+more. The error that checks of a drive share grows as their own errors do. See docs/measured.md."""
 
 
 def dispersion(contrast: float) -> float:
@@ -103,9 +98,8 @@ extrinsic (a share, because its grid is coarser than the peak), and exceed the s
 this factor."""
 
 GAIN, FRAMES_AGREE = 0.01, 0.6
-"""For any check: the share that a hypothesis must gain at the local optimum, and the share of pairs that must gain. On
-real drives with the right clock and ego-motion every hypothesis loses 2 %; with a wrong sign or a factor of three 2 to
-7 % can be gained."""
+"""For any check: the share that a hypothesis must gain at the local optimum, and the share of pairs that must gain. See
+docs/measured.md."""
 
 FINE_PIXEL_RAD = radians(0.15)
 """Size of pixel up to which these gains hold; with coarser pixels the edges vary more from one pose to the next."""
@@ -209,30 +203,24 @@ MIN_PAIRS = 4
 TELLING_CONTRAST = 9.0
 """A check accuses only if its optimum stands out from other poses by this many standard deviations. Below that, checks
 scatter more than three times as far as those of a street (see `dispersion`): where a street is good to 0.08°, half a
-degree is then only two standard deviations. Of 419 checks with clear edges, of right mounts on 168 simulated drives,
-five were below, four of them on highways; three of these five insisted on an optimum that was too far off, and two of
-the 414 others."""
+degree is then only two standard deviations. See docs/measured.md."""
 
 LOST_SHARE = 0.5
 """Share of the significance at the optimum: if the expected pose has less, scatter explains that in no scene."""
 
 MIN_EDGES_IN_VIEW = 150.0
 """With fewer range edges in view per pair a check's edges count as faint, however well they fit: a guard rail and a
-lane marking then decide, the same in every pair. On simulated drives, all checks of right mounts that ended more than
-0.6° off and were clear by the other figures had 5 to 130; those that ended right had 150 and more, except some on
-highways."""
+lane marking then decide, the same in every pair. See docs/measured.md."""
 
 MIN_INDEPENDENT_SAMPLES = 2.0
-"""If the pairs of a moving vehicle are worth fewer independent looks, the edges of a check count as faint. Frames that
-say the same although the vehicle has moved on, as between the guard rails of a highway, are all wrong if one is, and so
-is the next check. Checks of simulated highways with 64 beams are at 1.2 to 1.9 of 6 and put right mounts 3 to 10 cm
-beside; 95 % of others are above 2.2, and within 2 cm."""
+"""If the pairs of a moving vehicle are worth fewer independent samples, the edges of a check count as faint. Frames
+that say the same although the vehicle has moved on, as between the guard rails of a highway, are all wrong if one is,
+and so is the next check. See docs/measured.md."""
 
 
 MOST_SCATTER = 5.0
 """Pairs of a check that scatter by more than this many times what they should, on an axis of rotation, do not show one
-pose, as while the mount swings. Of 120 checks of right mounts on 24 rendered drives one does, and of 239 of a rig of
-0.2° a pixel that stops and goes 12; of 20 checks of mounts that swing by 0.8 to 1.5°, 13 do (docs/measured.md)."""
+pose, as while the mount swings. See docs/measured.md."""
 
 
 class Opinion(StrEnum):
@@ -258,8 +246,7 @@ UNCOMMISSIONED = MonitorLimits(
     max_farthest2_pose=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0 / POSE_DOF, 1),
     min_edges_per_pair=4.0,
 )
-"""Limits of an uncommissioned rig. `min_edges_per_pair`: at the right pose edges are at 10 to 24 on every recording
-tried."""
+"""Limits of an uncommissioned rig. See docs/measured.md."""
 
 
 @on_one_thread()

@@ -35,8 +35,7 @@ TEXTURED_GRADIENT = 2.0
 DIRTY_RATIO, DIRTY_SHARE = 0.4, 0.012
 """A block looks dirty if its sharpest exposure has less than the first share of the gradient that it had when the rig
 was commissioned. A lens is dirty if more than the second share of the textured blocks look dirty, the same ones in
-`DIRTY_CHECKS` checks running. Another street makes 6 % of them look dirty for 5 s, and less than 0.6 % for 20 s; dirt
-stays where it is."""
+`DIRTY_CHECKS` checks running. See docs/measured.md."""
 
 DIRTY_CHECKS = 3.5
 """Independent checks after which a block is dirty, overlaps not counted: 20 s at the usual pace."""
@@ -53,9 +52,7 @@ STOOD_M, STOOD_RAD = 0.2, 0.01
 
 CHANGED = 0.5
 """Two pictures are of different places if the median change of their textured cells exceeds this share of the local
-contrast. Simulated vehicles that stand are at 0.01 to 0.12 by day, 0.35 by night, 0.28 among people in a room; those
-that drive through streets and garages at 8 m/s are at 0.6 to 0.9, on highways and open roads at 0.1 to 0.4, which tells
-nothing. In the recorded garage, which stands, it is 0.07 to 0.15 (docs/measured.md)."""
+contrast. See docs/measured.md."""
 
 CHANGED_CONTRAST, CHANGED_CELLS = 4.0, 50
 """Least difference between neighbouring cells of a textured one, grey values, and the least number of these."""

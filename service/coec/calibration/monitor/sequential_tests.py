@@ -50,26 +50,22 @@ from dataclasses import dataclass, replace
 from math import exp, fsum, lgamma, log, pi, radians
 
 FREEDOM = 4.0
-"""Degrees of freedom of the Student distribution of good checks: its tails are heavier than normal. Chosen: of 261
-coordinates of good checks on three simulated drives one was farther off than four standard deviations; by this
-distribution 4 would be."""
+"""Degrees of freedom of the Student distribution of good checks: its tails are heavier than normal. See
+docs/measured.md."""
 
 BAD_SHARE, BAD_AFTER_BAD, BAD_SHARE_WEAK = 0.01, 0.5, 0.8
 """Share of checks that are bad although no cause was found in their data: after a good check, after a bad one, and of
-checks with faint edges. Chosen to be on the safe side: of 87 checks of simulated drives without poor stretches none was
-bad; within tunnels, open roads and nights 14 of 56 with clear edges were, and some 57 of 63 with faint ones."""
+checks with faint edges. See docs/measured.md."""
 
 SAME_AGAIN, SAME_AGAIN_WEAK = 0.03, 0.2
-"""Share of bad checks that lie where the check before them lay, with clear and with faint edges. Chosen: with clear
-edges none was seen to. A smaller share makes three checks certain sooner; with a larger one a scene that stays the same
-accuses later."""
+"""Share of bad checks that lie where the check before them lay, with clear and with faint edges. A smaller share makes
+three checks certain sooner; with a larger one a scene that stays the same accuses later. See docs/measured.md."""
 
 FARTHER = 0.03
 """Share of its offset by which a check is less certain: far from the pose the local optimum is found less exactly."""
 
 WEAK_TIMES = 10.0
-"""Factor on the standard deviation of a check with faint edges: by night on simulated drives the best of them, 6 of 63,
-lie 0.3 to 0.7° off the mount."""
+"""Factor on the standard deviation of a check with faint edges. See docs/measured.md."""
 
 AXES = 3
 """Axes of rotation, and of translation."""
@@ -185,13 +181,10 @@ LEAST_STEP, MOST_STEP = -5.0, 6.0
 
 PLACE_TIMES = 1.5
 """Factor on the standard deviation of places for the place where a right mount is: a move is what no place explains,
-and of thousands of places in a hundred hours the farthest counts. Chosen between 1, with which most places four
-standard deviations off accuse, and 2, with which it takes half a minute to tell a move of a degree from a place. Places
-of simulated drives were within 1.3 standard deviations in 95 of 100."""
+and of thousands of places in a hundred hours the farthest counts. See docs/measured.md."""
 
 SCATTER = 0.7
-"""Standard deviation of the places of a right mount, in standard deviations of `place`. On the axis on which 111 places
-of simulated drives scatter most their rms is 0.6."""
+"""Standard deviation of the places of a right mount, in standard deviations of `place`. See docs/measured.md."""
 
 STAY = 120.0
 """Checks at one place, at most: ten minutes at one every five seconds. Longer tests have seen several places, and the

@@ -32,9 +32,8 @@ camera."""
 
 COARSEST_BLUR_RAD = radians(0.6)
 """Least blur of the coarsest level, an angle about the optical axis and so the same for any lens. Levels double, so the
-blur is below twice that. With a wider blur the layout of a scene hides the true pose (measured: in a garage the true
-pose comes 80th of the cover at 1.9° and first to tenth at 0.9°); with a narrower one the cover of the global stage has
-to be finer."""
+blur is below twice that. With a wider blur the layout of a scene hides the true pose; with a narrower one the cover of
+the global stage has to be finer. See docs/measured.md."""
 
 RANKED_POINTS = 60_000
 """Most range edges of the window that rank basins: bounds the time for a window of many frames."""

@@ -39,8 +39,7 @@ from coec.geometry.projection import project
 
 COLUMNS, ROWS = 8, 2
 """Sectors of the image, across and down. There are more than degrees of freedom, so that their scatter can be
-distinguished from the pose; each is several degrees wide, so that an object lies in one. 4 x 4, 4 x 2 with near and far
-apart, and 16 x 1 give the same standard deviations within a tenth (two simulated drives of 32 beams, 16 windows)."""
+distinguished from the pose; each is several degrees wide, so that an object lies in one. See docs/measured.md."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +89,7 @@ def sectors(uv_px: NDArray[np.float64]) -> NDArray[np.int64]:
 GUARD_OVERLAP = 0.5
 """If a frame sees less than this share of the most points that it could see, its MI is reduced in proportion. Plain MI
 grows when points leave the view (METHOD, section 3), so a pose that sees less than half of what it could is penalised.
-At the true pose of every recording tried the share is above 0.7, so the guard does not act near the optimum."""
+See docs/measured.md."""
 
 QUANTILE_SAMPLES = 65_536
 """Number of values of a frame from which its bin edges are computed. The rank of an edge is then known to 0.2 % (the
@@ -284,7 +283,7 @@ def distances(xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4) -> Points:
     The paper uses the range from the LiDAR. Neither distance changes with a rotation of the camera, so either can be
     frozen for a search. But depth is measured from the camera. If the camera sits a metre ahead of the LiDAR, the range
     of the ground before the vehicle is another function of depth than the range of the walls beside it, and the optimum
-    moves to make up for that: by 0.12° in pitch on a simulated drive with exact depth.
+    moves to make up for that. See docs/measured.md.
     """
     camera_m = se3.inverse(T_camera_lidar)[:3, 3].astype(np.float32)
     return Points(xyz_m, lengths(xyz_m - camera_m).astype(np.float32))

@@ -39,8 +39,7 @@ ANSWERS = 2
 """How many answers in a row name a sensor."""
 
 LIKELY_AT = 0.5
-"""Probability from which a window confirms that a camera moved beside its LiDAR. If only the LiDAR was knocked and the
-looks at the camera were bent, windows of drawn rigs give 0.01 to 0.1."""
+"""Probability from which a window confirms that a camera moved beside its LiDAR. See docs/measured.md."""
 
 CALM_AT = 0.5
 """Probability that nobody moved, from which looks that grow old count as looks at a right rig."""
@@ -61,8 +60,8 @@ STEPPED2 = chi2_quantile(0.999, 6)
 """Squared distance in standard deviations from which an edge counts as stepped: one in a thousand does so by chance."""
 
 POOREST = 3.0
-"""A poor street displaces all looks by up to so many standard deviations of usual streets: looks at right mounts with
-the faintest contrast lie 2.6 of them off (`monitor.dispersion`)."""
+"""A poor street displaces all observations by up to so many standard deviations of usual streets
+(`monitor.dispersion`). See docs/measured.md."""
 
 EVERY_S = 4.0
 """Least time between two answers to who moved: one takes 0.03 to 0.1 s of a core, and looks come faster than they

@@ -542,12 +542,12 @@ def _volume(covariance: Array) -> Array:
 
 
 PLACE = np.array([radians(0.02)] * 3 + [0.004] * 3)
-"""Standard deviation by which the pose between two LiDARs differs from street to street, beyond what a look claims
-(rad, m): within simulated drives (seeds 41000 to 41005) looks scattered by 0.01 to 0.03° and 1 to 4 mm."""
+"""Standard deviation by which the pose between two LiDARs differs from street to street, beyond what a registration
+claims (rad, m). See docs/measured.md."""
 
 BIAS = np.array([radians(0.03)] * 3 + [0.006] * 3)
 """Standard deviation of the error that is the same on every street: errors of angle and range that belong to the two
-sensors (rad, m). The means of these drives were off by 0.01 to 0.04° and 1 to 6 mm."""
+sensors (rad, m). See docs/measured.md."""
 
 DETERMINED_SHARE = 0.3
 """A look determines a direction if its standard deviation there is below this share of what is known before it: below

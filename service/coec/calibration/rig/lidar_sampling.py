@@ -126,8 +126,7 @@ class LidarEdge:
 
 
 PAIRS = 2
-"""Pairs of sweeps of one look. On simulated streets a single pair sometimes has too few points in common, and five say
-no more than two, because what two leave open the surroundings do not show."""
+"""Pairs of sweeps of one registration. See docs/measured.md."""
 
 SPACING_NS = 2 * NS_PER_S
 """Time between these pairs: some ten metres further on other surfaces are in view, and a mount is hardly ever hit in

@@ -77,8 +77,8 @@ END, END_CHARTED, END_POSES = 2, 64, 8
 few frames on a chart, around which the fine band is searched; and number of poses proposed from that."""
 
 MISFIT = 0.4
-"""Frames at an end do not fit the solved pose if they score less than this share of the median frame there. Four
-degrees off, as far as the reach, frames of a simulated street keep a seventh."""
+"""Frames at an end do not fit the solved pose if they score less than this share of the median frame there. See
+docs/measured.md."""
 
 NEAR_BLURS, NEAR_POSES = 2.5, 300
 """Radius about the solved pose that the fine band covers, in its blurs, and number of poses of that cover, 0.6 blurs
@@ -108,15 +108,12 @@ MIN_FRAMES = 4
 """With fewer frames there is no early and late."""
 
 MIN_SUPPORT = 5.0
-"""Least mean score, on either side at the pose of that side, of the frames that say anything. At a right pose it is 6
-to 20 on every recording tried by day; on an open road and at night it is 1 to 4 at the best of all poses. Over all
-frames of a drive that was in a tunnel or at night for a third of the time it would be 3 to 5, and knocks of 1 to 3
-degrees would be missed."""
+"""Least mean score, on either side at the pose of that side, of the frames that say anything. See docs/measured.md."""
 
 MIN_LIKENESS = 0.6
 """Least likeness of the losses of both sides. If the camera moved from T₁ to T₂, early frames lose as large a share of
 their score at T₂ as late frames lose at T₁. A change of the scene does not have that property: in a tunnel the lines
-along the way fit many poses. Of simulated knocks of 0.5 to 3° in 17 windows 98 % are above this."""
+along the way fit many poses. See docs/measured.md."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -356,8 +353,7 @@ def _part(frames: EdgeFrames, begin: int, end: int) -> EdgeFrames:
 
 
 MAY_BE = 4.0
-"""The change may be wherever the sum is at most this far below its highest value. Of 58 knocks of 0.5 to 3 degrees in
-five simulated drives one lies outside the interval, and intervals are 1.7 s long on average (at 0 four lie outside)."""
+"""The change may be wherever the sum is at most this far below its highest value. See docs/measured.md."""
 
 AT_ONCE = 36
 """Most pairs whose edges are found at a time: 120 MB of edge maps of 2 megapixels."""

@@ -77,14 +77,12 @@ ROUNDS = (
 )
 """The steps of each round begin at the width of its blur and end at that of the next. Each round chooses its poses by
 its own chart, which is how the true pose is found: on a coarse chart hundreds of layouts that happen to fit may rank
-above it (in a simulated street with six degrees of freedom it was the 855th of the first round, and first to eleventh
-by the fine chart)."""
+above it. See docs/measured.md."""
 
 SHIFTED_POSES, SHIFT_M = 4, 0.25
 """If translation is searched, each of this many best poses is shifted by this distance either way along each axis, and
 the six shifted poses climb again. This is needed because poses of one rotation do not count as apart, so their
-translation was chosen on the coarse chart, which hardly shows it (one start of 24, half a metre away, had ended 36 cm
-off)."""
+translation was chosen on the coarse chart, which hardly shows it. See docs/measured.md."""
 
 SHIFTED = _Round(6 * SHIFTED_POSES, 0.0, FINE, thinned=False, points=4_000, step_rad=radians(0.15), halvings=1)
 """How the shifted poses climb: as in the last round, with as many edges as it takes to see a quarter of a metre."""

@@ -395,9 +395,8 @@ def _scores(level: AssumedEdges, deviations: NDArray[np.float64]) -> NDArray[np.
 
 
 CENTRE_EVEN = 1.5
-"""Certainty (`landscape.certainty`) at which a centre is as likely wrong as right: three standard deviations. Windows
-of a standing vehicle in rooms and garages put a right centre 3 to 5 cm aside, by two standard deviations, which is a
-certainty of 1."""
+"""Certainty (`landscape.certainty`) at which a centre is as likely wrong as right: three standard deviations. See
+docs/measured.md."""
 
 LEAST_CERTAINTY = 1e-6
 """Below this certainty a centre that is decimetres off would be known only to kilometres, so it counts as
@@ -463,10 +462,9 @@ UNSEEN = COLUMNS * ROWS
 
 LEAST_PX = 0.4
 """A different lens matters only if it moves the sharpest edges by this much, root mean square, beyond what the pose can
-do: corners of a target are found to a tenth of a pixel, and blur displaces edges by as much. In 48 windows of twelve
-simulated drives through the assumed lens it was less, or not certain; in all 16 of four drives through another lens it
-was more, and certain. It is also the error that edges by themselves leave in a lens: a lens that moves them by as much
-is half believed (`beside_a_turn`)."""
+do: corners of a target are found to a tenth of a pixel, and blur displaces edges by as much. It is also the error that
+edges by themselves leave in a lens: a lens that moves them by as much is half believed (`beside_a_turn`). See
+docs/measured.md."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -79,8 +79,7 @@ def require_fit(camera: Camera, fit: DoubleSphereFit, max_sigma_deg: float) -> N
 LENS_PX = 0.05
 """Error that a target-based calibration of a lens leaves in its principal point, and in its scale at the rim. It is
 half of the 0.1 px to which a corner is found, because its pictures hold a few independent corners near every place of
-the image. On simulated drives, whose lens is exact, twice as much made the claimed σ along the optical axis 3.6 times
-as wide as the error."""
+the image. See docs/measured.md."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +154,7 @@ edge to the brighter side by about that much, and which side is nearer depends o
 
 COLUMN_SHARE = 0.05
 """The same for range edges, in columns. On either side they lie half a column inside the near thing on average. An
-error is left if more left sides than right ones are in view; it was up to a fifth of that half on simulated drives."""
+error is left if more left sides than right ones are in view. See docs/measured.md."""
 
 STAMP_S = 1e-3 / sqrt(12.0)
 """Standard deviation of stamps that are rounded to the millisecond, s."""

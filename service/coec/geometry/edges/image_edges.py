@@ -4,8 +4,7 @@ It is the gradient magnitude, reduced along the axis of the LiDAR, clipped, and 
 hedge does not outweigh a house). Of that, the maps are the bands of a Laplacian pyramid (Burt, Adelson 1983): each
 level blurred by two pixels, minus the next level. What is wider than a level's blur is the layout of the scene, with
 many edges below the horizon and few above, which fits many wrong poses. Without the layout the true pose stands at
-least twice as far from the others (measured: 12 against 4.3 standard deviations on a suburban street, 7.5 against 3.9
-in a garage, 4.9 against 1.8 on one raw fisheye frame, where the layout preferred a wrong pose).
+least twice as far from the others. See docs/measured.md.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ CLIP_SHARE = 0.95
 UPRIGHT_SHARE = math.sqrt(0.5)
 """Share of a gradient along the axis of the LiDAR that counts: half of its energy. Range jumps are found along scan
 lines, so that the edges that cause them cross those lines. The share is not smaller, because slanting roofs and kerbs
-determine pitch, roll and height (without them, roll scatters by a third more on simulated drives), and slow traffic
-under a bridge shows mostly such edges."""
+determine pitch, roll and height, and slow traffic under a bridge shows mostly such edges. See docs/measured.md."""
 
 SAMPLES = 25_000
 """Pixels of an image from which the quantile of `CLIP_SHARE` (without flat ones) and the mean gradient are taken."""
@@ -62,10 +60,9 @@ BLUR_SIGMA_PX = 2.0
 """Blur of each level, in pixels of that level: 2, 4, 8 ... pixels of the image."""
 
 SHARP_SIGMA_PX = 0.6
-"""Blur of the sharpest map. Structure beside an edge draws a blurred edge towards itself, above all the road below a
-kerb. In simulated drives through a fisheye of 4.4 px per degree, the optimum is off in pitch by 0.3 to 0.5 degrees at a
-blur of 2 px, by 0.15 to 0.2 on its band, by 0.05 to 0.09 at 0.6 px, and by up to 0.07 on that band. Structure narrower
-than 2 px alone has even less bias, but several maxima if edges are few. A blur below 0.6 px only aliases."""
+"""Blur of the sharpest map, px. Structure beside an edge draws a blurred edge towards itself, above all the road below
+a kerb. Structure narrower than 2 px alone has even less bias, but several maxima if edges are few. A blur below 0.6 px
+only aliases. See docs/measured.md."""
 
 
 def _gaussian(sigma_px: float) -> NDArray[np.float32]:

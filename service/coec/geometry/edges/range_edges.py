@@ -54,9 +54,8 @@ the stronger echo even with a small part of the beam."""
 
 WIDE_RAD = math.radians(0.25)
 """Beams farther apart than this do not tell where between them a silhouette passes. Either a return is missing, or the
-sensor has few columns and gathers light over the whole column, so that near surfaces grow by half a column. (For an OS1
-of 1024 columns, 0.35° apart, with the edges half a column farther out, other poses fit its garage nearly as well as the
-true one.)"""
+sensor has few columns and gathers light over the whole column, so that near surfaces grow by half a column. See
+docs/measured.md."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

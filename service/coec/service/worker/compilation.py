@@ -28,8 +28,8 @@ CODE = "compiling_kernels"
 """Code of the reason that the worker has no answer because it compiles kernels."""
 
 STALLED_S = 600.0
-"""A worker that reports no progress of the compilation for so long is replaced, s. The longest step, the generation of
-one kernel's machine code, takes 2 s of an idle core; with ten processes of higher priority beside it, a minute."""
+"""A worker that reports no progress of the compilation for so long is replaced, s. The longest step is the generation
+of one kernel's machine code. See docs/measured.md."""
 
 LINE_S = 15.0
 """Time between two lines of the log about the progress, s."""
