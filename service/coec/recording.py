@@ -17,7 +17,7 @@ from typing import Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration import pipeline, ports
+from coec.calibration import pipeline
 from coec.calibration import types as calibration
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.uncertainty.systematic import require_fit
@@ -104,7 +104,7 @@ class Solution:
     offset: TimeOffset | None
 
 
-def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: ports.Progress) -> Solution:
+def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibration.Progress) -> Solution:
     """Calibrates a loaded window.
 
     Args:
@@ -147,12 +147,12 @@ def perturbation_of(perturb: str | Sequence[float]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True)
 class CallbackProgress:
-    """`calibration.ports.Progress` that calls a function; None: no function."""
+    """`calibration.types.Progress` that calls a function; None: no function."""
 
     callback: Progress | None
 
     def step(self, stage: str, done: int, total: int) -> None:
-        """See `calibration.ports.Progress`."""
+        """See `calibration.types.Progress`."""
         if self.callback is not None:
             self.callback(stage, done, total)
 
@@ -446,7 +446,7 @@ class Description:
         seconds: from the first camera frame to the last.
         camera, lidar, motion: number of frames, rate (Hz, of the median interval) and longest gap (s) of each stream.
             `motion` is None where the recording has no ego-motion; its sweeps are then not compensated.
-        camera_model: one of `pinhole, radtan, rational, kannala_brandt, mei, eucm, double_sphere`.
+        camera_model: name of the lens model, as in `dataset.yaml`.
         intrinsics: its parameters by name, with `width` and `height`; pixels where they have a unit.
         camera_frame, lidar_frame: names of the coordinate frames.
     """

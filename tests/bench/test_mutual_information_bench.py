@@ -16,10 +16,10 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import DoubleSphere, build
-from coec.geometry.culling import BUNDLE
+from coec.geometry.cameras import build
+from coec.geometry.cameras.double_sphere import DoubleSphere
 from coec.geometry.mutual_information import BinnedFrames, mutual_information
-from coec.geometry.projection import moved
+from coec.geometry.projection import BUNDLE, moved
 from coec_lab.bench.reference_kernels import by_numpy, by_scalar_loop
 
 POINTS, BINS, SIZE = 114_000, 32, 512

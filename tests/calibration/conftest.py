@@ -8,8 +8,7 @@ import pytest
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.objective.edges import EdgeCue, build_edges
-from coec.calibration.ports import DepthModel
-from coec.calibration.types import Window
+from coec.calibration.types import DepthModel, Window
 from coec.config import DepthConfig, LimitsConfig, PairingConfig
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import GreyImages

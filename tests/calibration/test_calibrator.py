@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration import pipeline
+from coec.calibration.objective.edges import independent_samples_at
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, Silence
-from coec.calibration.types import CameraFrame, Decision, DepthMap, Estimate, StopReason, Window
-from coec.calibration.uncertainty.scatter import independent_samples_at
+from coec.calibration.types import CameraFrame, Decision, DepthMap, DepthModel, Estimate, Silence, StopReason, Window
+from coec.calibration.uncertainty import covariance
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
@@ -169,7 +168,9 @@ def test_frames_that_are_one_look_claim_less_of_where_the_camera_is(
     config = CalibrationConfig(search=SearchConfig(dof=6))
     several = solve(sharp_street, stereo, config).sigma
     monkeypatch.setattr(
-        pipeline, "independent_samples_at", lambda edges, pose: replace(independent_samples_at(edges, pose), count=1.0)
+        covariance,
+        "independent_samples_at",
+        lambda edges, pose: replace(independent_samples_at(edges, pose), count=1.0),
     )
     one = solve(sharp_street, stereo, config).sigma
     assert (one >= several).all()

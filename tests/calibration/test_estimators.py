@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.calibration.ports import Silence
 from coec.calibration.solver import WindowData, depth_features, runner_up
-from coec.calibration.types import CameraFrame, DepthMap, Metric, Window
+from coec.calibration.types import CameraFrame, DepthMap, Metric, Silence, Window
 from coec.config import LimitsConfig
 from coec.geometry.points import lengths
 from coec.io.images import GreyImages

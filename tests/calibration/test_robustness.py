@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, ImageReader, Silence
-from coec.calibration.types import Decision, Estimate, Window
+from coec.calibration.types import Decision, DepthModel, Estimate, ImageReader, Silence, Window
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.objective.derivatives import Curvature
+from coec.calibration.objective.edges import IndependentSamples
+from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
 from coec.calibration.types import (
@@ -21,7 +22,6 @@ from coec.calibration.types import (
     Window,
 )
 from coec.calibration.uncertainty.nuisance_parameters import CLOCKS_FREE, LENS_FREE, RelaxedAssumption
-from coec.calibration.uncertainty.scatter import IndependentSamples
 from coec.calibration.verdict import (
     change_metric,
     counted_once,

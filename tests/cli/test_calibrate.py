@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.calibration.ports import DepthModel
+from coec.calibration.types import DepthModel
 from coec.config import DepthConfig, LimitsConfig, VerdictConfig
 from coec.errors import OutputError, UsageError
 from coec.io import user_files

@@ -10,8 +10,7 @@ import pytest
 
 from cli.conftest import SMALL, Coec
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import Silence
-from coec.calibration.types import FramePair
+from coec.calibration.types import FramePair, Silence
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig, WindowConfig
 from coec.errors import SourceError
 from coec.geometry import se3

@@ -10,9 +10,16 @@ from numpy.typing import NDArray
 
 from coec.geometry import se3
 from coec.geometry.cameras import build, in_image
-from coec.geometry.culling import BUNDLE, Bundles, azimuth_order, bundle, half_field_of_view_rad, within_cone
 from coec.geometry.mutual_information import BinnedFrames, joint_histograms
-from coec.geometry.projection import project
+from coec.geometry.projection import (
+    BUNDLE,
+    Bundles,
+    azimuth_order,
+    bundle,
+    half_field_of_view_rad,
+    project,
+    within_cone,
+)
 
 CAMERA = build("pinhole", width=200, height=160, fx=90.0, fy=90.0, cx=99.5, cy=79.5)
 HALF_VIEW_RAD, SHIFT_M = np.arctan(np.hypot(100.0, 80.0) / 90.0), 1.2

@@ -11,7 +11,7 @@ import numpy as np
 
 import coec
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import Silence
+from coec.calibration.types import Silence
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.geometry import se3
 from coec.io.depth.depth_maps import open_depth

@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import Silence
+from coec.calibration.types import Silence
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig
 from coec.fleet.jobs import Job, empty_row, lost_row
 from coec.io.depth.depth_maps import open_depth

@@ -11,6 +11,7 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.objective.landscape import Landscape
 from coec.calibration.objective.mutual_information import Cells, PointsInView
 from coec.calibration.types import (
     CameraFrame,
@@ -23,7 +24,6 @@ from coec.calibration.types import (
     Rig,
     Window,
 )
-from coec.calibration.uncertainty.scatter import Landscape
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build, scaled
 from coec.geometry.edges.alignment import EdgeFrames

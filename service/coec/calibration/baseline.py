@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.monitor.sensor_faults import SceneBaseline
-from coec.calibration.search.prior import of_both
 from coec.calibration.types import Matrix4, Rig
 from coec.config import CalibrationConfig, VerdictConfig, config_hash
 from coec.errors import CalibrationError
@@ -216,7 +215,7 @@ class MonitorLimits:
 def pixel_floor(camera: Camera) -> NDArray[np.float64]:
     """(6,) standard deviation that the pixels of a camera cause in any check, however many pairs it has (rad, m)."""
     off_rad = PIXEL_SHARE * pixel_rad(camera)
-    return of_both(off_rad)
+    return se3.axis_steps(off_rad)
 
 
 def street_sigma(camera: Camera) -> NDArray[np.float64]:

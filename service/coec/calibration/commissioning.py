@@ -39,9 +39,19 @@ from coec.calibration.monitor.check_edges import POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, Opinion, edges_per_pair, opinion
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence, Step, Steps, run_to_end
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import Estimate, Matrix4, Window
+from coec.calibration.types import (
+    DepthModel,
+    Estimate,
+    ImageReader,
+    Matrix4,
+    Progress,
+    Silence,
+    Step,
+    Steps,
+    Window,
+    run_to_end,
+)
 from coec.config import CalibrationConfig, VerdictConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import nan, radians
+from math import log1p, nan, radians
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
-from coec.calibration.objective.edges import EdgeCue, build_edges
+from coec.calibration.objective.edges import EdgeCue, build_edges, independent_samples_at
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
     Divisible,
@@ -26,14 +26,20 @@ from coec.calibration.objective.mutual_information import (
     distance_and_depth,
     distances,
 )
-from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins
 from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
-from coec.calibration.search.prior import log_prior
-from coec.calibration.types import CameraFrame, DepthMap, Matrix4, Metric, StopReason, Window
-from coec.calibration.uncertainty.modes import Rivals
-from coec.calibration.uncertainty.scatter import independent_samples_at
-from coec.config import CalibrationConfig
+from coec.calibration.types import (
+    CameraFrame,
+    DepthMap,
+    DepthModel,
+    ImageReader,
+    Matrix4,
+    Metric,
+    Progress,
+    StopReason,
+    Window,
+)
+from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import halved
@@ -200,6 +206,15 @@ def _masked(data: WindowData) -> WindowData:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Rivals:
+    """Poses under one objective: the best (4, 4), and `others` (4, 4) that might be the true one."""
+
+    objective: Divisible
+    best: Matrix4
+    others: tuple[Matrix4, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class EstimatorResult:
     """What an estimator found.
 
@@ -244,81 +259,159 @@ def by_intensity(data: WindowData, config: CalibrationConfig) -> EstimatorResult
 
 
 def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
-    """Edges and depth: finds every basin of the edge witness within reach, ranks them by both witnesses, and polishes
-    the best on both."""
-    window, progress = data.window, data.progress
-    start = window.T_camera_lidar_start
+    """Edges and depth: finds every basin of the edge cue within reach, ranks them by both cues, polishes the best on
+    both, chooses one by its posterior, and settles its summit on the sharpest edges."""
+    window, start = data.window, data.window.T_camera_lidar_start
     reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
     # Edges first: depth may be inferred meanwhile.
     edges = build_edges(window.pairs, data.points, data.greys(), window.rig)
     features = depth_features(data, start, LEADING_DEPTH_POINTS)
     depth = build_mutual_information(features, window.rig, start, reach, config.objective)
     basins = find_basins(edges, start, reach)
-    progress.step("basins", 1, 1)
+    data.progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
-    ranked = sorted(_with_ranks(fusion, [basin.T_camera_lidar for basin in basins]), key=lambda item: -item[0])
-    to_rank = near(config.search, fusion.ranking[-1])
-    of_start = basin_next_to(edges, start, SearchBox(NEIGHBOURHOOD_RAD, reach.translation_m))
-    least = PLAUSIBLE * max((rank for rank, _ in ranked), default=0.0)
-    plausible = [basin for rank, basin in ranked[:POLISHED_BASINS] if rank >= least]
-    ends, others = [], [basin for _, basin in ranked[len(plausible) :]]
+    ranked = rank_basins(fusion, [basin.T_camera_lidar for basin in basins])
+    polished = polish_basins(fusion, ranked, config.search, data.progress)
+    selected = choose_basin(fusion, polished, window, config)
+    return settle_basin(fusion, selected, polished.evaluations, data, config)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RankedPose:
+    """A pose (4, 4) and how far it stands out to both cues, standard deviations."""
+
+    rank: float
+    T_camera_lidar: Matrix4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RankedBasins:
+    """The basins of a window by how far they stand out.
+
+    Attributes:
+        plausible: poses (4, 4) of the basins to polish, best first.
+        implausible: those of all other basins.
+        start_is_plausible: whether the neighbourhood of the start is to be polished as well.
+    """
+
+    plausible: tuple[Matrix4, ...]
+    implausible: tuple[Matrix4, ...]
+    start_is_plausible: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PolishedBasins:
+    """Where the polishes of the plausible basins ended.
+
+    Attributes:
+        ends: in the order of the polishes.
+        implausible: poses (4, 4) of the basins that were not polished.
+        evaluations: number of evaluations of the objectives.
+    """
+
+    ends: tuple[RankedPose, ...]
+    implausible: tuple[Matrix4, ...]
+    evaluations: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SelectedBasin:
+    """The basin of the answer.
+
+    Attributes:
+        summits: poses (4, 4) of the polishes that ended in it, highest rank first.
+        metrics: how far it stands out.
+    """
+
+    summits: tuple[Matrix4, ...]
+    metrics: tuple[Metric, ...]
+
+
+def rank_basins(fusion: Fusion, basins: Sequence[Matrix4]) -> RankedBasins:
+    """The basins (4, 4) by both cues, and whether the neighbourhood of the start compares with them. It is polished
+    wherever the charts rank it."""
+    ranked = sorted(_with_ranks(fusion, basins), key=lambda basin: -basin.rank)
+    least = PLAUSIBLE * max((basin.rank for basin in ranked), default=0.0)
+    plausible = tuple(basin.T_camera_lidar for basin in ranked[:POLISHED_BASINS] if basin.rank >= least)
+    implausible = tuple(basin.T_camera_lidar for basin in ranked[len(plausible) :])
+    of_start = basin_next_to(fusion.edges, fusion.start, SearchBox(NEIGHBOURHOOD_RAD, fusion.reach.translation_m))
     if fusion.rank(of_start) >= least:
-        # The neighbourhood of the start is polished wherever the charts rank it.
-        ends.append(polish_in_turn(fusion.ranking, start, to_rank, progress))
-    else:
-        others.append(of_start)
-    for basin in plausible:
-        there = sum(not _differ(end.T_camera_lidar, basin) for end in ends)
-        if there < POLISHED_ALIKE:
+        return RankedBasins(plausible, implausible, start_is_plausible=True)
+    return RankedBasins(plausible, (*implausible, of_start), start_is_plausible=False)
+
+
+def polish_basins(fusion: Fusion, ranked: RankedBasins, config: SearchConfig, progress: Progress) -> PolishedBasins:
+    """The maxima of the fused objective next to the start and to the plausible basins."""
+    to_rank = near(config, fusion.ranking[-1])
+    ends = []
+    if ranked.start_is_plausible:
+        ends.append(polish_in_turn(fusion.ranking, fusion.start, to_rank, progress))
+    for basin in ranked.plausible:
+        alike = sum(not _differ(end.T_camera_lidar, basin) for end in ends)
+        if alike < POLISHED_ALIKE:
             # The coarser bands led the first polish of a basin. They would lead the others to the same end.
-            bands = fusion.ranking[-1:] if there else fusion.ranking
+            bands = fusion.ranking[-1:] if alike else fusion.ranking
             ends.append(polish_in_turn(bands, basin, to_rank, progress))
-    polished = _with_ranks(fusion, [end.T_camera_lidar for end in ends])
+    with_ranks = _with_ranks(fusion, [end.T_camera_lidar for end in ends])
+    return PolishedBasins(tuple(with_ranks), ranked.implausible, sum(end.evaluations for end in ends))
 
-    _, highest = max(polished, key=lambda end: end[0])
-    independent = independent_samples_at(edges.sharp, highest).count / len(window.pairs)
 
-    def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:
-        rank, pose = end
+def choose_basin(fusion: Fusion, polished: PolishedBasins, window: Window, config: CalibrationConfig) -> SelectedBasin:
+    """The basin of the most probable end that lies within the reach, or of the most probable one if none does."""
+    highest = max(polished.ends, key=lambda end: end.rank)
+    independent = independent_samples_at(fusion.edges.sharp, highest.T_camera_lidar).count / len(window.pairs)
+
+    def preferred(end: RankedPose) -> tuple[bool, float]:
         # Half the square of a rank is, in nats, what the window says against chance, if its frames are independent:
         # ten frames of one view fit a wrong pose ten times. A maximum outside of the reach is a rival, but the answer
         # has to lie inside.
-        log_posterior = 0.5 * independent * rank**2 + log_prior(pose, start, window.start_known_to_rad)
-        return not at_rim(pose, start, reach), log_posterior
+        prior = log_prior(end.T_camera_lidar, fusion.start, window.start_known_to_rad)
+        return not at_rim(end.T_camera_lidar, fusion.start, fusion.reach), 0.5 * independent * end.rank**2 + prior
 
-    _, pose = max(polished, key=preferred)
+    pose = max(polished.ends, key=preferred).T_camera_lidar
     contrast = fusion.edge_contrast(pose)
-    others += [end for _, end in polished]
+    others = (*polished.implausible, *(end.T_camera_lidar for end in polished.ends))
     rival = _best_rival(fusion, [other for other in others if _differ(other, pose)], pose)
     limits = config.verdict
     metrics = (
-        Metric("range_edges", len(edges.sharp.weight), least_range_edges(config), at_least=True),
+        Metric("range_edges", len(fusion.edges.sharp.weight), least_range_edges(config), at_least=True),
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
         Metric("runner_up", runner_up(contrast, rival), limits.max_runner_up, at_least=False),
     )
-    alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
-    finest = fusion.settling[-1]
-    if fusion.depth_contrast(alike[0][1]) >= TELLING:
-        finest = finest.with_depth(_denser(data, depth, alike[0][1], config))
-    last = (fusion.settling[0], finest)
-    settled = [polish_in_turn(last, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
+    alike = sorted((end for end in polished.ends if not _differ(end.T_camera_lidar, pose)), key=lambda end: -end.rank)
+    return SelectedBasin(tuple(end.T_camera_lidar for end in alike), metrics)
+
+
+def settle_basin(
+    fusion: Fusion, selected: SelectedBasin, evaluations: int, data: WindowData, config: CalibrationConfig
+) -> EstimatorResult:
+    """The highest summit of the chosen basin on the sharpest edges. `evaluations` were made before and are included in
+    the result."""
+    highest, *lower = selected.summits
+    leading, finest = fusion.settling
+    if fusion.depth_contrast(highest) >= TELLING:
+        finest = finest.with_depth(_denser(data, fusion.depth, highest, config))
+    settled = [
+        polish_in_turn((leading, finest), summit, config.search, data.progress)
+        for summit in selected.summits[:SETTLED_POSES]
+    ]
     best = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
-    final = replace(best, evaluations=sum(end.evaluations for end in (*ends, *settled)))
-    if at_rim(final.T_camera_lidar, start, reach):
-        final = replace(final, stop_reason=StopReason.AT_BOUND)
+    search = replace(best, evaluations=evaluations + sum(end.evaluations for end in settled))
+    if at_rim(best.T_camera_lidar, fusion.start, fusion.reach):
+        search = replace(search, stop_reason=StopReason.AT_BOUND)
     others = [end.T_camera_lidar for end in settled if end is not best]
-    if not _differ(start, best.T_camera_lidar):
+    if not _differ(fusion.start, best.T_camera_lidar):
         # A window that cannot tell the start from the pose found says nothing.
-        others.append(start)
-    summits = (
+        others.append(fusion.start)
+    rivals = (
         Rivals(finest, best.T_camera_lidar, tuple(others)),
-        Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
+        Rivals(fusion.ranking[-1], highest, tuple(lower)),
     )
-    return EstimatorResult(finest, final, metrics, summits, edges)
+    return EstimatorResult(finest, search, selected.metrics, rivals, fusion.edges)
 
 
-def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[tuple[float, Matrix4]]:
-    return list(zip(fusion.ranks(poses), poses, strict=True))
+def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[RankedPose]:
+    return [RankedPose(rank, pose) for rank, pose in zip(fusion.ranks(poses), poses, strict=True)]
 
 
 def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> list[float]:
@@ -334,6 +427,21 @@ def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> lis
         if any(fusion.edge_contrast(se3.perturb(pose, share * difference)) < contrast for share in BETWEEN):
             return [contrast]
     return []
+
+
+def log_prior(T_camera_lidar: Matrix4, start: Matrix4, known_to_rad: float) -> float:
+    """Log prior of a pose (4, 4) relative to that of the start (4, 4), which is known to `known_to_rad`: nats, 0 at the
+    start and negative elsewhere.
+
+    A calibrated mount seldom moves, and seldom far. The prior is a density of the angle θ between the pose and the
+    start, per volume of rotations. It falls like Cauchy's in three dimensions (Student's with one degree of freedom,
+    the longest tails of the family): p(θ) ∝ (1 + θ² / s²)⁻². Its scale s is the error that creep, temperature and a
+    workshop leave. A displacement has no typical size, so the tails are long: 3° are 7 nats less likely than 0°, 25°
+    are 16. The evidence of a street outweighs that several times over; that of a tunnel, where some pose among a
+    hundred thousand always fits by chance, does not.
+    """
+    turned = se3.rotation_angle_rad(T_camera_lidar @ se3.inverse(start)) / known_to_rad
+    return -2.0 * log1p(turned * turned)
 
 
 def least_range_edges(config: CalibrationConfig) -> float:
@@ -355,6 +463,17 @@ def runner_up(contrast: float, rivals: Sequence[float]) -> float:
 
 
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
+
+
+def solve(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
+    """What the estimator of the configured objective finds in a window.
+
+    Raises:
+        CalibrationError: the window has no pairs, a frame has no usable depth, or no point can come into view.
+    """
+    if not data.window.pairs:
+        raise CalibrationError("the window holds no pairs of a camera frame and a sweep: check the stamps of both")
+    return ESTIMATORS[config.objective.kind](data, config)
 
 
 def depth_features(data: WindowData, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:

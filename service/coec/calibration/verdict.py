@@ -19,13 +19,32 @@ from numpy.typing import NDArray
 
 from coec.calibration.figures import FIGURES
 from coec.calibration.frames.window import drives
-from coec.calibration.objective.derivatives import Curvature
+from coec.calibration.objective.edges import IndependentSamples
+from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, FramePair, Metric, Reason, StopReason, Verdict
-from coec.calibration.uncertainty.nuisance_parameters import LENS_FREE, RelaxedAssumption
-from coec.calibration.uncertainty.scatter import IndependentSamples
+from coec.calibration.types import (
+    INTRINSICS_OFF,
+    MOVED,
+    Decision,
+    FramePair,
+    Metric,
+    MovedWithin,
+    Reason,
+    StopReason,
+    Verdict,
+    Window,
+)
+from coec.calibration.uncertainty.covariance import AssessedOptimum
+from coec.calibration.uncertainty.nuisance_parameters import (
+    CLOCKS_FREE,
+    HELD_FREE,
+    LENS,
+    LENS_FREE,
+    RelaxedAssumption,
+)
 from coec.config import VerdictConfig
+from coec.geometry import se3
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 """Places of rotation and translation in ξ = [rx ry rz tx ty tz]."""
@@ -39,6 +58,10 @@ UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
 
 SAME_SCENE = 0.5
 """A window saw one scene if its independent samples are fewer than this share of its frames. See docs/measured.md."""
+
+
+_CONTRADICTED = {HELD_FREE: "with the held centre", CLOCKS_FREE: "with the clocks"}
+"""With what a window disagrees if relaxing this assumption turns the camera."""
 
 
 def saw_one_scene(independent_samples: float, frames: int) -> bool:
@@ -113,6 +136,66 @@ def intrinsics_metric(relaxed: Sequence[RelaxedAssumption], limits: VerdictConfi
         for one in relaxed
         if one.name == LENS_FREE
     )
+
+
+def optimum_metrics(
+    of_objective: tuple[Metric, ...],
+    evaluation: Evaluation,
+    optimum: AssessedOptimum,
+    change: ChangePoint | None,
+    pairs: Sequence[FramePair],
+    limits: VerdictConfig,
+) -> tuple[Metric, ...]:
+    """All metrics of an optimum: those of its objective, of its shape, of its edges, and of a change within the window.
+    `evaluation` is that of the objective at the optimum."""
+    return (
+        *counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)),
+        *shape_metrics(evaluation, optimum.curvature, optimum.sigma, limits),
+        *repetition_metric(optimum.independent, pairs, limits),
+        *intrinsics_metric(optimum.relaxed, limits),
+        *change_metric(change, limits),
+    )
+
+
+def reason_details(
+    relaxed: Sequence[RelaxedAssumption], moved: MovedWithin | None, window: Window
+) -> Mapping[str, str]:
+    """By the name of a metric, what its failure means in this window."""
+    return {
+        "sigma_deg": _contradictions_text(relaxed),
+        INTRINSICS_OFF: _lens_text(relaxed, window),
+        MOVED: "" if moved is None else _move_text(moved, window),
+    }
+
+
+def _contradictions_text(relaxed: Sequence[RelaxedAssumption]) -> str:
+    """Which assumptions the window contradicts, and by how much the camera turns without each."""
+    turns = [
+        f"{_CONTRADICTED[one.name]} set free, it turns by {degrees(float(np.linalg.norm(one.shift[:3]))):.1f}°"
+        for one in relaxed
+        if one.contradicts and one.name in _CONTRADICTED
+    ]
+    return f" ({'; '.join(turns)})" if turns else ""
+
+
+def _lens_text(relaxed: Sequence[RelaxedAssumption], window: Window) -> str:
+    lens = [one.deviation[LENS] for one in relaxed if one.name == LENS_FREE]
+    if not lens:
+        return ""
+    (right, down, longer), camera = lens[0].tolist(), window.rig.camera
+    return (
+        f", a focal length {100.0 * longer:+.1f} % and a principal point {right * camera.fx:+.1f} px across and "
+        f"{down * camera.fy:+.1f} px down from it"
+    )
+
+
+def _move_text(moved: MovedWithin, window: Window) -> str:
+    """By how much and when the camera moved."""
+    turn_deg = degrees(se3.rotation_angle_rad(moved.T_after @ se3.inverse(moved.T_before)))
+    before_s, after_s = (
+        (stamp_ns - window.pairs[0].stamp_ns) / 1e9 for stamp_ns in (moved.last_before_ns, moved.first_after_ns)
+    )
+    return f", by {turn_deg:.1f}° between {before_s:.1f} and {after_s:.1f} s after its first pair"
 
 
 def _newton_step(curvature: Curvature, axes: slice) -> float:

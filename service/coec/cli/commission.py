@@ -15,8 +15,7 @@ from coec.errors import UsageError
 
 if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
-    from coec.calibration.ports import DepthModel, ImageReader
-    from coec.calibration.types import Window
+    from coec.calibration.types import DepthModel, ImageReader, Window
     from coec.config import CalibrationConfig
     from coec.reports.progress import StageTimes
 

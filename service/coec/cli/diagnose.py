@@ -176,8 +176,7 @@ def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosi
     import numpy as np
 
     from coec.calibration.pipeline import calibrate
-    from coec.calibration.ports import Silence
-    from coec.calibration.types import Decision
+    from coec.calibration.types import Decision, Silence
     from coec.geometry import se3
     from coec.reports import diagnosis
 

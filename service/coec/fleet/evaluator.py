@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.types import DepthModel, Silence
 from coec.config import DepthConfig, LimitsConfig
 from coec.errors import CoecError, SourceError
 from coec.fleet.jobs import Job, empty_row, failed_row, fetched_window, sha256_of

@@ -19,8 +19,17 @@ from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera
 from coec.geometry.compiler import PRANGE, njit, prange, prefetch
-from coec.geometry.culling import BUNDLE, NEVER_OUT, Bundles
-from coec.geometry.projection import NOT_IN_IMAGE, UNSURE, Certainty, certain_pixels, exact_pixel, filter_of
+from coec.geometry.projection import (
+    BUNDLE,
+    NEVER_OUT,
+    NOT_IN_IMAGE,
+    UNSURE,
+    Bundles,
+    Certainty,
+    certain_pixels,
+    exact_pixel,
+    filter_of,
+)
 
 TASK = 32 * BUNDLE
 """Points per parallel task: small enough to balance two to sixteen threads over a handful of frames, and large enough

@@ -214,3 +214,14 @@ def is_rigid(transform: Array, tolerance: float = 1e-6) -> bool:
         return False
     orthonormal = bool(np.abs(rotation.T @ rotation - np.eye(3)).max() <= tolerance)
     return orthonormal and float(np.linalg.det(rotation)) > 0.0
+
+
+METRES_PER_RADIAN = 7.0
+"""A shift of this many metres moves things that far away by as much as a turn of one radian. It is the range, in
+metres, of the edges that tell translation: a car or a post on the near side of a street. Difference steps, search steps
+and the conversion of a pixel of rotation into translation all use it. See docs/measured.md."""
+
+
+def axis_steps(rotation_rad: float, metres_per_radian: float = METRES_PER_RADIAN) -> Array:
+    """(6,) steps about and along the axes rx ry rz tx ty tz, rad and m: the rotation, and the shift worth as much."""
+    return np.array([rotation_rad] * 3 + [rotation_rad * metres_per_radian] * 3)

@@ -12,7 +12,7 @@ from coec.errors import SourceError
 
 
 class Tree:
-    """A `calibration.ports.Neighbourhood`."""
+    """A `calibration.types.Neighbourhood`."""
 
     def __init__(self, points_m: NDArray[np.float64]) -> None:
         import small_gicp
@@ -33,7 +33,7 @@ def installed() -> bool:
 
 
 class Trees:
-    """A `calibration.ports.NeighbourSearch`.
+    """A `calibration.types.NeighbourSearch`.
 
     Raises:
         SourceError: the optional extra is not installed; says what to install.

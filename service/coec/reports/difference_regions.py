@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.ports import ImageReader
-from coec.calibration.types import FramePair, Matrix4, Rig, Window
+from coec.calibration.types import FramePair, ImageReader, Matrix4, Rig, Window
 from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, in_image
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales, Rectangle

@@ -27,8 +27,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.ports import ImageReader
-from coec.calibration.types import FramePair, Matrix4, Rig, Window
+from coec.calibration.types import FramePair, ImageReader, Matrix4, Rig, Window
 from coec.config import LimitsConfig
 from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, pixel_rad

@@ -19,9 +19,8 @@ from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.objective.mutual_information import MutualInformation, SearchBox
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import box_of, maximise
-from coec.calibration.types import Matrix4, Window
+from coec.calibration.types import Matrix4, Silence, Window
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
 from coec.geometry import se3
 from coec.geometry.mutual_information import mutual_information

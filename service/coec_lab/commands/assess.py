@@ -12,9 +12,8 @@ import typer
 from coec.cli.options import Frames, Json, Source
 
 if TYPE_CHECKING:
-    from coec.calibration.ports import DepthModel
     from coec.calibration.solver import WindowData
-    from coec.calibration.types import Window
+    from coec.calibration.types import DepthModel, Window
     from coec.schemas.replies import Vector3
     from coec_lab.experiments.depth_quality import DepthQuality
     from coec_lab.experiments.evaluation_schema import Maybe3, ModelAssessment
@@ -39,8 +38,8 @@ def assess(
     as_json: Json = False,
 ) -> int:
     """Compare a depth network with the LiDAR of a calibrated recording: exit 1 if it is of no use there."""
-    from coec.calibration.ports import Silence
     from coec.calibration.solver import prepare_window_data
+    from coec.calibration.types import Silence
     from coec.calibration_options import SolverOptions, configuration_of
     from coec.config import LimitsConfig, WindowConfig
     from coec.io import user_files as files

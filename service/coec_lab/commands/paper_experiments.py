@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from coec.calibration.ports import Silence
 from coec.calibration.solver import depth_features, prepare_window_data
+from coec.calibration.types import Silence
 from coec.calibration_options import SolverOptions, configuration_of
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import SourceError

@@ -27,9 +27,8 @@ from coec.calibration.monitor.check_verdict import (
     judge_check,
 )
 from coec.calibration.monitor.sensor_faults import scene_baseline
-from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import CameraFrame, FramePair, Matrix4, Rig, Window
+from coec.calibration.types import CameraFrame, DepthModel, FramePair, ImageReader, Matrix4, Rig, Silence, Window
 from coec.config import CalibrationConfig, LimitsConfig, PairingConfig
 from coec.errors import CoecError
 from coec.geometry import se3

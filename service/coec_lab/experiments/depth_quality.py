@@ -15,16 +15,15 @@ from math import degrees, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.derivatives import measure_curvature
+from coec.calibration.objective.landscape import measure_curvature
 from coec.calibration.objective.mutual_information import (
     SearchBox,
     build_mutual_information,
     distance_and_depth,
 )
-from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import maximise
 from coec.calibration.solver import WindowData
-from coec.calibration.types import DepthMap, Matrix4, Rig
+from coec.calibration.types import DepthMap, Matrix4, Rig, Silence
 from coec.config import CalibrationConfig, ObjectiveConfig
 from coec.geometry import se3
 from coec.geometry.cameras import in_image

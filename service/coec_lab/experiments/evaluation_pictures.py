@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from math import degrees
 from pathlib import Path
 
-from coec.calibration.ports import Silence
 from coec.calibration.solver import prepare_window_data
+from coec.calibration.types import Silence
 from coec.io import user_files
 from coec.io.recordings import window_cutting
 from coec.reports import pictures

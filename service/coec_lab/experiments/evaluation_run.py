@@ -11,8 +11,7 @@ from pydantic import ValidationError
 from rich.progress import Progress as Bars
 
 from coec import calibration_options
-from coec.calibration.ports import DepthModel
-from coec.calibration.types import Matrix4, Window
+from coec.calibration.types import DepthModel, Matrix4, Window
 from coec.calibration_options import Progress, SolverOptions, checked
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
 from coec.errors import CalibrationError, UsageError

@@ -26,9 +26,8 @@ from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorStat
 from coec.calibration.monitor.check import check_at, gather
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, judge_check
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import Decision, FramePair, Matrix4, Window
+from coec.calibration.types import Decision, DepthModel, FramePair, ImageReader, Matrix4, Silence, Window
 from coec.config import CalibrationConfig, LimitsConfig, MonitorConfig, PairingConfig, WindowConfig
 from coec.errors import CoecError, SourceError
 from coec.geometry import se3

@@ -17,9 +17,18 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, ImageReader, Silence
-from coec.calibration.search.prior import MOUNT_RAD
-from coec.calibration.types import MOVED, Decision, Estimate, FramePair, Matrix4, Window
+from coec.calibration.types import (
+    MOUNT_RAD,
+    MOVED,
+    Decision,
+    DepthModel,
+    Estimate,
+    FramePair,
+    ImageReader,
+    Matrix4,
+    Silence,
+    Window,
+)
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 
 from coec.calibration.baseline import PaperLimits
-from coec.calibration.objective.derivatives import measure_curvature
+from coec.calibration.objective.landscape import measure_curvature
 from coec.calibration.objective.mutual_information import Features, SearchBox, build_mutual_information
-from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import box_of
 from coec.calibration.solver import depth_features, prepare_window_data
-from coec.calibration.types import Matrix4, Rig
+from coec.calibration.types import Matrix4, Rig, Silence
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
 from coec.geometry.points import random_direction

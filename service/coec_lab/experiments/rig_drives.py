@@ -24,10 +24,8 @@ from coec.calibration.monitor.check_edges import OUTLINE_RAD, REACH_RAD, Prepare
 from coec.calibration.monitor.check_verdict import judge_check
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.rig.edge_observations import EdgeObservation, observation_of_window
 from coec.calibration.rig.graph import Edge, RigGraph, Sensor, SensorKind
-from coec.calibration.search.prior import MOUNT_RAD
 from coec.calibration.solver import prepare_window_data
 from coec.calibration.state import (
     CalibrationStatus,
@@ -38,7 +36,18 @@ from coec.calibration.state import (
     urgent_window_since,
 )
 from coec.calibration.tracker import Measurement
-from coec.calibration.types import Decision, FramePair, LidarFrame, Matrix4, Rig, Uncertainty, Window
+from coec.calibration.types import (
+    MOUNT_RAD,
+    Decision,
+    DepthModel,
+    FramePair,
+    LidarFrame,
+    Matrix4,
+    Rig,
+    Silence,
+    Uncertainty,
+    Window,
+)
 from coec.config import (
     CalibrationConfig,
     DepthConfig,

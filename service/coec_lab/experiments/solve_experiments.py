@@ -17,9 +17,8 @@ from rich.progress import Progress
 from coec.calibration.commissioning import FAR_RAD
 from coec.calibration.monitor.check import gather
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import Matrix4, Window
+from coec.calibration.types import DepthModel, ImageReader, Matrix4, Silence, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.errors import CalibrationError, DecodeError, SourceError
 from coec.geometry import se3

@@ -17,9 +17,8 @@ from coec.calibration.baseline import PRIOR_SPREAD_POSE, Baseline, distance2_qua
 from coec.calibration.commissioning import commission, learn_accuracy, learned
 from coec.calibration.monitor.check import CheckInput, gather
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, diagnose, observe
-from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import Decision, Estimate, Metric, Rig, Verdict, Window
+from coec.calibration.types import Decision, DepthModel, Estimate, ImageReader, Metric, Rig, Silence, Verdict, Window
 from coec.config import CalibrationConfig, LimitsConfig, SearchConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3

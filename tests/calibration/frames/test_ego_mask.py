@@ -9,9 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import GRID_WIDTH, MIN_FRAMES, DeadRegions, lit_pixels
-from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import Window
+from coec.calibration.types import DepthModel, Silence, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.io.images import GreyImages
 from coec.io.recordings import window_cutting

@@ -32,8 +32,7 @@ from coec.calibration.monitor.sensor_faults import (
     Cause,
 )
 from coec.calibration.monitor.sequential_tests import LOOSE_AT
-from coec.calibration.ports import DepthModel
-from coec.calibration.types import Window
+from coec.calibration.types import DepthModel, Window
 from coec.config import CalibrationConfig, LimitsConfig, MonitorConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3

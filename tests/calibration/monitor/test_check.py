@@ -21,11 +21,10 @@ from coec.calibration.monitor.check_verdict import (
     opinion,
     over_limits,
 )
-from coec.calibration.objective.derivatives import axis_derivatives, measure_curvature
+from coec.calibration.objective.landscape import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
-from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import Matrix4, Window
+from coec.calibration.types import DepthModel, Matrix4, Silence, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
 from coec.io.images import GreyImages

@@ -10,9 +10,8 @@ import pytest
 from coec.calibration.monitor.check import check_at, gather, join, seen_part
 from coec.calibration.monitor.check_edges import OUTLINE_RAD, REACH_RAD, outline, prepare_images, prepare_sweep, union
 from coec.calibration.monitor.check_verdict import diagnose, observe
-from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.solver import WindowData, prepare_window_data
-from coec.calibration.types import CameraFrame, DepthMap, Window
+from coec.calibration.types import CameraFrame, DepthMap, DepthModel, Silence, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import Rectangle

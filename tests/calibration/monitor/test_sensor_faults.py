@@ -36,9 +36,8 @@ from coec.calibration.monitor.sensor_faults import (
     dirty_blocks,
     scene_baseline,
 )
-from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import LidarFrame, Window
+from coec.calibration.types import DepthModel, LidarFrame, Silence, Window
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, MonitorConfig
 from coec.geometry import se3
 from coec.io.depth.depth_maps import CachedDepth, open_depth

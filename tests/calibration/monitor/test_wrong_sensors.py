@@ -14,10 +14,9 @@ from coec.calibration import state as lifecycle
 from coec.calibration.frames.window import CheckSampler, stands
 from coec.calibration.monitor.change_detector import MonitorState
 from coec.calibration.monitor.check_verdict import observe
-from coec.calibration.ports import DepthModel
 from coec.calibration.state import CalibrationStatus, PairState, Provenance
 from coec.calibration.state_machine import HealthState
-from coec.calibration.types import FramePair, Matrix4, Rig, Window
+from coec.calibration.types import DepthModel, FramePair, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.geometry import se3
 from coec.io.images import GreyImages

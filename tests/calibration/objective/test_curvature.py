@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.objective.derivatives import measure_curvature
+from coec.calibration.objective.landscape import measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.geometry import se3
 

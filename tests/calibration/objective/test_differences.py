@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.derivatives import across, along
+from coec.calibration.objective.landscape import across, along
 
 LINEAR = np.array([[1.0, -2.0, 0.5], [0.0, 3.0, -1.0]])
 """Of two frames, along three axes."""

@@ -18,19 +18,20 @@ from coec.calibration.objective.mutual_information import (
     distance_and_depth,
 )
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.search.global_search import sample_reach
-from coec.calibration.search.prior import MOUNT_RAD
 from coec.calibration.solver import SAME_BASIN_RAD
 from coec.calibration.types import (
+    MOUNT_RAD,
     CameraFrame,
     Decision,
     DepthMap,
+    DepthModel,
     EncodedImage,
     Estimate,
     FramePair,
     ImageFormat,
     Matrix4,
+    Silence,
     Window,
 )
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig

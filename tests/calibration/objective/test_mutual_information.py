@@ -12,8 +12,7 @@ from coec.calibration.objective.mutual_information import (
     distance_and_depth,
     distances,
 )
-from coec.calibration.ports import DepthModel
-from coec.calibration.types import DepthMap, Window
+from coec.calibration.types import DepthMap, DepthModel, Window
 from coec.config import ObjectiveConfig
 from coec.geometry import se3
 

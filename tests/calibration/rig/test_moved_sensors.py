@@ -10,7 +10,7 @@ import pytest
 from coec.calibration.baseline import normal_quantile
 from coec.calibration.rig.edge_observations import EdgeSteps
 from coec.calibration.rig.moved_sensors import M_PER_RAD, SCALES, movers, patterns, who_moved
-from coec.calibration.search.prior import MOUNT_RAD
+from coec.calibration.types import MOUNT_RAD
 from coec.geometry import se3
 from support.rigs import POSES, graph
 

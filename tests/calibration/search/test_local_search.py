@@ -9,9 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.objective.mutual_information import Evaluation
-from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import NEAR, FixedCentre, SearchResult, maximise, near, polish, polish_in_turn
-from coec.calibration.types import Matrix4, StopReason
+from coec.calibration.types import Matrix4, Silence, StopReason
 from coec.config import SearchConfig
 from coec.geometry import se3
 

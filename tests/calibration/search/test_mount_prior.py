@@ -5,7 +5,8 @@ from math import pi
 import numpy as np
 import pytest
 
-from coec.calibration.search.prior import MOUNT_RAD, log_prior
+from coec.calibration.solver import log_prior
+from coec.calibration.types import MOUNT_RAD
 from coec.geometry import se3
 
 START = se3.perturb(np.eye(4), np.array([0.4, -1.1, 0.2, 0.3, -0.1, 0.05]))

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.objective.derivatives import Curvature
+from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.search.local_search import FixedCentre, SearchResult, unobservable, without
-from coec.calibration.types import Estimate, Matrix4, StopReason, Window
+from coec.calibration.types import DepthModel, Estimate, Matrix4, Silence, StopReason, Window
 from coec.config import CalibrationConfig, LimitsConfig, SearchConfig, VerdictConfig
 from coec.geometry import se3
 from coec.io.images import GreyImages

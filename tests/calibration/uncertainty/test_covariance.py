@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from coec.calibration.objective.landscape import scatter
 from coec.calibration.uncertainty.covariance import measure_noise
-from coec.calibration.uncertainty.scatter import scatter
 from support.scenes import Array, landscape, paraboloids
 
 FRAMES, SECTORS = 20, 16

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from calibration.conftest import window_of
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.objective.edges import EdgeCue, build_edges
+from coec.calibration.objective.edges import EdgeCue, build_edges, effective_sample_size, independent_samples_at
 from coec.calibration.types import Window
-from coec.calibration.uncertainty.scatter import effective_sample_size, independent_samples_at
 from coec.config import LimitsConfig
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
 from coec.io.images import GreyImages

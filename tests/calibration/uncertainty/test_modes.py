@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from coec.calibration.objective.mutual_information import Cells, Evaluation
-from coec.calibration.uncertainty.modes import Rivals, with_modes
+from coec.calibration.solver import Rivals
+from coec.calibration.uncertainty.covariance import with_modes
 from coec.geometry import se3
 from support.scenes import NO_SIGHT_LINES, Array
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coec.calibration.uncertainty.modes import mode_next_to_prior
+from coec.calibration.uncertainty.covariance import mode_next_to_prior
 from coec.geometry import se3
 from support.scenes import (
     IDENTITY_POSE,

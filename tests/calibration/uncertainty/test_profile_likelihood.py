@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coec.calibration.objective.mutual_information import Cells, Evaluation
-from coec.calibration.uncertainty.modes import translation_profile
+from coec.calibration.uncertainty.covariance import translation_profile
 from coec.config import CalibrationConfig
 from coec.geometry import se3
 from support.scenes import Array

@@ -7,8 +7,7 @@ import pytest
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.calibration.ports import DepthModel
-from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
+from coec.calibration.types import CameraFrame, DepthModel, EncodedImage, ImageFormat
 from coec.config import DepthConfig, LimitsConfig
 from coec.io.depth.depth_maps import open_depth
 from coec.io.depth.model_cards import CARDS, find_card

@@ -20,7 +20,7 @@ from numba.core.dispatcher import Dispatcher
 from coec.service.worker.warm_up import late_kernels
 from coec.service.worker.tasks import Solver
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import Silence
+from coec.calibration.types import Silence
 from coec.io.recordings.window_cutting import load_window
 from coec.cli.convert import configuration_for
 from coec.config import CalibrationConfig, Config, DepthConfig, ObjectiveConfig, SearchConfig

@@ -21,12 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate, sensor_twist
-from coec.calibration.objective.derivatives import FrameScores, across, along
 from coec.calibration.objective.edges import EdgeCue, build_edges
-from coec.calibration.ports import ImageReader
+from coec.calibration.objective.landscape import FrameScores, across, along
 from coec.calibration.search.local_search import Box, maximum_in
-from coec.calibration.search.prior import of_both
-from coec.calibration.types import Matrix4, Window
+from coec.calibration.types import ImageReader, Matrix4, Window
 from coec.config import CalibrationConfig, TimeOffsetConfig
 from coec.geometry import se3
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
@@ -43,7 +41,7 @@ FITTED = (0, 1, 2, OFFSET)
 SHIFTS = (3, 4, 5)
 """Places of the camera's position, which is not fitted."""
 
-STEPS = np.array([*of_both(radians(0.3)), 0.01])
+STEPS = np.array([*se3.axis_steps(radians(0.3)), 0.01])
 """Difference steps, radians, metres and seconds: each moves edges by about the blur of the sharpest edges."""
 
 PROFILE_STEP_S = 0.02

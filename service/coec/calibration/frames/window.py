@@ -30,8 +30,7 @@ from math import ceil, cos, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.ports import ImageInspector, ImageReducer
-from coec.calibration.types import FramePair, ImageQuality, LidarFrame, Matrix4, Rig
+from coec.calibration.types import FramePair, ImageInspector, ImageQuality, ImageReducer, LidarFrame, Matrix4, Rig
 from coec.config import MonitorConfig, WindowConfig
 from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, in_image, project_point

@@ -40,14 +40,12 @@ from coec.calibration.monitor.check_edges import (
     search_local_optima,
 )
 from coec.calibration.monitor.sensor_faults import SceneFacts
-from coec.calibration.objective.derivatives import axis_derivatives
+from coec.calibration.objective.landscape import Landscape, axis_derivatives, certainty
 from coec.calibration.objective.mutual_information import Features, SearchBox, build_mutual_information
-from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import polish
 from coec.calibration.solver import WindowData, depth_features
-from coec.calibration.types import FramePair, Matrix4, Rig
+from coec.calibration.types import FramePair, Matrix4, Rig, Silence
 from coec.calibration.uncertainty.covariance import measure_noise
-from coec.calibration.uncertainty.scatter import Landscape, certainty
 from coec.config import CalibrationConfig
 from coec.geometry import se3
 from coec.geometry.cameras import in_image

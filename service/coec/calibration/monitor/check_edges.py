@@ -41,8 +41,7 @@ from coec.calibration.monitor.sensor_faults import (
     SweepFacts,
 )
 from coec.calibration.objective.mutual_information import COLUMNS, ROWS, Cells, PointsInView, sectors
-from coec.calibration.search.local_search import Box, maximum_in
-from coec.calibration.search.prior import POLISH_METRES_PER_RADIAN, of_both
+from coec.calibration.search.local_search import POLISH_METRES_PER_RADIAN, Box, maximum_in
 from coec.calibration.types import FramePair, LidarFrame, Matrix4, Rig
 from coec.errors import CalibrationError
 from coec.geometry import se3
@@ -470,7 +469,7 @@ def search_local_optima(edges: ProjectedEdges, pose: Matrix4) -> LocalOptima:
     """The neighbourhood of a pose (4, 4)."""
     pose = np.ascontiguousarray(pose)
     coarsest, finest, sharp = edges.bands[-1], edges.bands[0], edges.sharp
-    settled = of_both(finest.blur_rad, POLISH_METRES_PER_RADIAN)
+    settled = se3.axis_steps(finest.blur_rad, POLISH_METRES_PER_RADIAN)
     near = _ascend(sharp.frames, pose, settled[:ROTATION_DOF], TOLERANCE)
     fair = HOPELESS_SHARE * float(smooth_significances(finest.frames, near.pose[None])[0])
     cover = _cover(pose, coarsest.blur_rad)
@@ -516,7 +515,7 @@ def _pose_of(edges: ProjectedEdges, rotation: _End) -> Matrix4:
     """The optimum over six degrees of freedom next to the one over three, climbed to directly or by way of the finest
     band."""
     finest = edges.bands[0]
-    settled = of_both(finest.blur_rad, POLISH_METRES_PER_RADIAN)
+    settled = se3.axis_steps(finest.blur_rad, POLISH_METRES_PER_RADIAN)
     near = _ascend(edges.sharp.frames, rotation.pose, settled, TOLERANCE)
     led = _ascend(finest.frames, rotation.pose, settled, LEADING_TOLERANCE)
     if float(np.abs(se3.difference(led.pose, near.pose) / settled).max()) < SAME:
@@ -530,7 +529,10 @@ def _led(bands: tuple[ProjectedLevel, ...], pose: Matrix4) -> _End:
     end = _End(pose, 0.0)
     for band in reversed(bands):
         end = _ascend(
-            band.frames, end.pose, of_both(band.blur_rad, POLISH_METRES_PER_RADIAN)[:ROTATION_DOF], LEADING_TOLERANCE
+            band.frames,
+            end.pose,
+            se3.axis_steps(band.blur_rad, POLISH_METRES_PER_RADIAN)[:ROTATION_DOF],
+            LEADING_TOLERANCE,
         )
     return end
 

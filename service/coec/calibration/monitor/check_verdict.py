@@ -63,9 +63,8 @@ from coec.calibration.monitor.sensor_faults import (
     data_causes,
     dirty_blocks,
 )
-from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import EgoMotion, FramePair, Matrix4, Metric, Rig, Window
+from coec.calibration.types import DepthModel, EgoMotion, FramePair, ImageReader, Matrix4, Metric, Rig, Silence, Window
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3

@@ -1,4 +1,5 @@
-"""The second witness: range edges of the sweeps laid on edges of the images, at several scales."""
+"""The second witness: range edges of the sweeps laid on edges of the images, at several scales; and how many
+independent frames those of a window are worth."""
 
 from __future__ import annotations
 
@@ -15,12 +16,12 @@ from coec.calibration.objective.mutual_information import Evaluation, SearchBox
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, pixel_rad, scaled
-from coec.geometry.culling import half_field_of_view_rad, within_cone
-from coec.geometry.edges.alignment import Alignment, EdgeFrames, alignments, frame_alignment
+from coec.geometry.edges.alignment import Alignment, EdgeFrames, alignments, frame_alignment, strengths_on_each_map
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
 from coec.geometry.points import thinned
+from coec.geometry.projection import half_field_of_view_rad, within_cone
 
 BANDS = 3
 """Bands of about 0.8, 0.4 and 0.2 degrees: the coarsest feels a pose 0.9 degrees away, the finest is sharp enough to
@@ -213,3 +214,53 @@ def _coarsest_level(camera: Camera) -> int:
 def _blur_rad(camera: Camera, level: int) -> float:
     """Blur of a level, an angle about the optical axis."""
     return 2.0**level * BLUR_SIGMA_PX * pixel_rad(camera)
+
+
+EXCHANGED_POINTS = 20_000
+"""Most range edges that change partners: with F images that is the work of F evaluations, of which a search takes
+hundreds."""
+
+
+@dataclass(frozen=True, slots=True)
+class IndependentSamples:
+    """How many independent frames F frames are worth at one pose.
+
+    The lane markings, guard rails and horizon of a straight motorway lie on the same pixels in every image, and the
+    range edges of its sweeps among the same beams. Frames that agree on such things count as one sample, however many
+    they are. To find them, sweeps and images change partners: passing things fit only in their own frame, still ones in
+    every frame.
+
+    Attributes:
+        count: 1 to F.
+        significance: of the edges, with what frames have in common counted once: z·√(count / F), because z grows with
+            the root of the independent part; standard deviations.
+    """
+
+    count: float
+    significance: float
+
+
+def independent_samples_at(edges: EdgeFrames, T_camera_lidar: Matrix4) -> IndependentSamples:
+    """How many independent frames put the camera at `T_camera_lidar` (4, 4), and how significantly."""
+    some = edges.of_points(thinned(len(edges.weight), EXCHANGED_POINTS))
+    count = effective_sample_size(strengths_on_each_map(some, T_camera_lidar))
+    whole = frame_alignment(edges, T_camera_lidar).significance
+    return IndependentSamples(count, whole * math.sqrt(count / len(edges.maps)))
+
+
+def effective_sample_size(agreement: NDArray[np.float64]) -> float:
+    """The number of independent samples of F frames, from how well each sweep (rows) agrees with each image (columns),
+    (F, F). It is F over the design effect (Kish 1965) of as many repetitions,
+
+        F / (1 + (F - 1)·ρ),  ρ = mean agreement with other frames / mean agreement with the own one,
+
+    where ρ is the intraclass correlation, 0 to 1. Neither the order of the frames nor repeating all of them changes it.
+    Frames that do not agree with themselves count as one sample.
+    """
+    frames = len(agreement)
+    own = math.fsum(np.diag(agreement).tolist())
+    if own <= 0.0 or frames == 1:
+        return 1.0
+    others = (math.fsum(agreement.ravel().tolist()) - own) / (frames - 1)
+    alike = min(max(others / own, 0.0), 1.0)
+    return frames / (1.0 + (frames - 1) * alike)

@@ -27,7 +27,6 @@ from coec.calibration.objective.mutual_information import (
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import in_image
-from coec.geometry.culling import half_field_of_view_rad
 from coec.geometry.edges.alignment import (
     LEAST_SQUARE,
     Alignment,
@@ -39,7 +38,7 @@ from coec.geometry.edges.alignment import (
 )
 from coec.geometry.edges.charts import charted_significances
 from coec.geometry.edges.image_edges import VOID
-from coec.geometry.projection import project
+from coec.geometry.projection import half_field_of_view_rad, project
 
 OTHER_POSES = 64
 """Poses within reach from which the mean and the standard deviation of a score are taken; they are then known to an
@@ -150,6 +149,9 @@ class Fusion:
     within the reach nor a little outside are left out.
 
     Attributes:
+        edges, depth: the witnesses.
+        start: (4, 4) the pose from which the reach is counted.
+        reach: the half-widths of the search.
         ranking: the objectives on which a basin is polished in turn before it is ranked. The coarsest band is not among
             them, because the charts have settled it.
         settling: the objectives on which the best basin is polished in turn at the end.
@@ -159,7 +161,7 @@ class Fusion:
     settling: tuple[FusedObjective, FusedObjective]
 
     def __init__(self, edges: EdgeCue, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
-        self._edges, self._depth = edges, depth
+        self.edges, self.depth, self.start, self.reach = edges, depth, start, reach
         poses = sample_reach(start, reach, OTHER_POSES)
         self._of_depth = Scale.of(np.array([at.score for at in depth.evaluate_each(poses)]))
         of_edges = replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD))
@@ -185,7 +187,7 @@ class Fusion:
     def edge_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
         """How far the edge witness, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);
         standard deviations."""
-        of_bands = np.stack([significances(band, poses) for band in self._edges.bands], axis=1)
+        of_bands = np.stack([significances(band, poses) for band in self.edges.bands], axis=1)
         return [self._of_bands.standard(float(np.mean(z))) for z in of_bands]
 
     def edge_contrast(self, T_camera_lidar: Matrix4) -> float:
@@ -194,7 +196,7 @@ class Fusion:
 
     def depth_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
         """How far the depth witness stands above other poses at each of K poses (K, 4, 4); standard deviations."""
-        return [self._of_depth.standard(at.score) for at in self._depth.evaluate_each(poses)]
+        return [self._of_depth.standard(at.score) for at in self.depth.evaluate_each(poses)]
 
     def depth_contrast(self, T_camera_lidar: Matrix4) -> float:
         """The same at one pose (4, 4)."""

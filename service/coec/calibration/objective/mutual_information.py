@@ -26,7 +26,6 @@ from coec.config import ObjectiveConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, in_image, scaled
-from coec.geometry.culling import azimuth_order, bundle, half_field_of_view_rad, within_cone
 from coec.geometry.mutual_information import (
     BinnedFrames,
     FrameInformation,
@@ -35,7 +34,7 @@ from coec.geometry.mutual_information import (
     share_of_pixels,
 )
 from coec.geometry.points import lengths, thinned
-from coec.geometry.projection import project
+from coec.geometry.projection import azimuth_order, bundle, half_field_of_view_rad, project, within_cone
 
 COLUMNS, ROWS = 8, 2
 """Sectors of the image, across and down. There are more than degrees of freedom, so that their scatter can be

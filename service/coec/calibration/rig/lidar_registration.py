@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import sensor_twist
 from coec.calibration.frames.pairing import azimuth_offsets_s
-from coec.calibration.ports import Neighbourhood, NeighbourSearch
+from coec.calibration.objective.landscape import scatter
 from coec.calibration.rig.lidar_sampling import (
     KNOWN_BEFORE,
     LEAST_SHARE,
@@ -33,8 +33,7 @@ from coec.calibration.rig.lidar_sampling import (
     RangeBias,
     SweepPair,
 )
-from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, SweepTiming
-from coec.calibration.uncertainty.scatter import scatter
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Neighbourhood, NeighbourSearch, Reason, SweepTiming
 from coec.geometry import se3
 from coec.geometry.linalg import congruent, eigen, inverted, solved
 from coec.geometry.points import lengths

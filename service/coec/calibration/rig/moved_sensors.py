@@ -32,7 +32,7 @@ from coec.calibration.baseline import normal_quantile
 from coec.calibration.monitor.change_detector import ROTATIONS, TRANSLATIONS
 from coec.calibration.rig.edge_observations import REACH, EdgeSteps
 from coec.calibration.rig.graph import KnownTransform, RigGraph, SensorKind
-from coec.calibration.search.prior import MOUNT_RAD
+from coec.calibration.types import MOUNT_RAD
 from coec.geometry import linalg, se3
 
 Array = NDArray[np.float64]

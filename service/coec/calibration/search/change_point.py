@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import degrees, inf, pi, radians
+from math import inf, pi, radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ from coec.calibration.objective.edges import EdgeCue, Edges, build_edges, in_rea
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.solver import WindowData
-from coec.calibration.types import FramePair, Matrix4, MovedWithin, Window
+from coec.calibration.types import FramePair, Matrix4, MovedWithin
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
 from coec.geometry.edges.alignment import (
@@ -457,15 +457,6 @@ def moved_within(change: ChangePoint, edges: EdgeCue, data: WindowData) -> Moved
     step = step_time(change, DatedEdges(stamps_ns, edges), window.between, lambda pairs: _edges_of(pairs, data))
     pairs_after = sum(stamp_ns >= step.first_after_ns for stamp_ns in stamps_ns)
     return MovedWithin(step.last_before_ns, step.first_after_ns, pairs_after, step.T_before, step.T_after)
-
-
-def move_text(moved: MovedWithin, window: Window) -> str:
-    """By how much and when the camera moved, to be appended to a sentence that says that it moved."""
-    turn_deg = degrees(se3.rotation_angle_rad(moved.T_after @ se3.inverse(moved.T_before)))
-    before_s, after_s = (
-        (stamp_ns - window.pairs[0].stamp_ns) / 1e9 for stamp_ns in (moved.last_before_ns, moved.first_after_ns)
-    )
-    return f", by {turn_deg:.1f}° between {before_s:.1f} and {after_s:.1f} s after its first pair"
 
 
 def _edges_of(pairs: Sequence[FramePair], data: WindowData) -> DatedEdges | None:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from coec.calibration.objective.edges import EdgeCue, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
-from coec.calibration.search.prior import of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.geometry.edges.charts import (
@@ -187,7 +186,7 @@ def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 def _pattern_searched(
     charts: EdgeCharts, poses: NDArray[np.float64], number: _Round, start: Matrix4, reach: SearchBox
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    steps = of_both(number.step_rad)
+    steps = se3.axis_steps(number.step_rad)
     if reach.translation_m == 0.0:
         steps[3:] = 0.0
     few = _at_most(charts, number.points)

@@ -30,11 +30,9 @@ import nlopt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.derivatives import Curvature
+from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Objective, SearchBox
-from coec.calibration.ports import Progress
-from coec.calibration.search.prior import POLISH_METRES_PER_RADIAN, of_both
-from coec.calibration.types import Matrix4, StopReason
+from coec.calibration.types import Matrix4, Progress, StopReason
 from coec.config import SearchConfig, VerdictConfig
 from coec.geometry import se3
 
@@ -102,6 +100,10 @@ POLISH_STEPS = 4.0
 """Half-width of the box of a polish, in steps: the search that leads to a basin ends within a few steps of its
 maximum."""
 
+POLISH_METRES_PER_RADIAN = 10.0
+"""Metres per radian of the first trust region of a polish. It is wider along the translations because their hill is
+wider. See docs/measured.md."""
+
 NEAR = 0.1
 """Tolerance, as a share of the difference step, of a maximum that only ranks a basin or leads to a finer level. The
 score there is half a percent of the hill below its maximum, and takes half as many evaluations."""
@@ -142,7 +144,7 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
     step = _per_axis(config.dof, radians(config.step_deg), config.step_m)
     best, exhausted = maximum_in(_box(centre, half_width, half_width, step, config), scores, centre, most)
-    reach, step = (of_both(turn_rad)[: config.dof] for turn_rad in (REFINE_BOX_RAD, REFINE_STEP_RAD))
+    reach, step = (se3.axis_steps(turn_rad)[: config.dof] for turn_rad in (REFINE_BOX_RAD, REFINE_STEP_RAD))
     best, exhausted_again = maximum_in(_box(best, reach, half_width, step, config), scores, best, most)
     stop_reason = StopReason.TOLERANCE
     if exhausted or exhausted_again:
@@ -189,7 +191,7 @@ def polish(
         progress.step("search", evaluations, config.max_evaluations)
         return [at.score for at in objective.evaluate_each(np.array([pose(point) for point in points]))]
 
-    step = of_both(objective.step_rad, POLISH_METRES_PER_RADIAN)[moved]
+    step = se3.axis_steps(objective.step_rad, POLISH_METRES_PER_RADIAN)[moved]
     centre, reach = np.zeros(len(moved)), POLISH_STEPS * step
     best, exhausted = maximum_in(_box(centre, reach, reach, step, config), scores, centre, config.max_evaluations)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE

@@ -37,18 +37,17 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import sensor_twist
 from coec.calibration.objective.edges import in_reach
+from coec.calibration.objective.landscape import certainty
 from coec.calibration.objective.mutual_information import COLUMNS, ROWS, SearchBox, sectors
 from coec.calibration.search.local_search import Box, maximum_in
 from coec.calibration.types import Matrix4, Window
-from coec.calibration.uncertainty.scatter import certainty
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
-from coec.geometry.culling import half_field_of_view_rad
 from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, alignment_of_parts, alignments, alignments_of_late
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, SHARP_SIGMA_PX, VOID
 from coec.geometry.linalg import inverted
 from coec.geometry.points import lengths, thinned
-from coec.geometry.projection import project
+from coec.geometry.projection import half_field_of_view_rad, project
 
 TURNS, SHIFTS, CLOCKS, LENS = range(3), range(3, 6), range(6, 9), range(9, 12)
 """Places in a deviation (12,). Turns and shifts: the perturbation ξ of the pose, rad and m. Clocks, s: by how much the

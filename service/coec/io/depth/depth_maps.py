@@ -12,8 +12,7 @@ from collections import OrderedDict
 from contextlib import suppress
 from pathlib import Path
 
-from coec.calibration.ports import DepthModel
-from coec.calibration.types import CameraFrame, DepthMap
+from coec.calibration.types import CameraFrame, DepthMap, DepthModel
 from coec.config import DepthConfig, LimitsConfig
 from coec.errors import DecodeError, ModelError, OutputError, UsageError, permission_denied
 from coec.io import storage

@@ -43,7 +43,7 @@ _QUIET = 4  # onnxruntime's log level "fatal", since its errors arrive as except
 
 
 class OnnxDepth:
-    """Depth maps from one network. Implements `coec.calibration.ports.DepthModel`; one caller at a time.
+    """Depth maps from one network. Implements `coec.calibration.types.DepthModel`; one caller at a time.
 
     The same image gives the same bytes on the same machine: one operator after another, deterministic
     kernels, no provider chosen at run time.

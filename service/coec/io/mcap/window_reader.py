@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coec.calibration.search.prior import MOUNT_RAD
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
+from coec.calibration.types import MOUNT_RAD, CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
 from coec.errors import ConfigError, DecodeError, SourceError, WindowError
 from coec.io.mcap.reader import (

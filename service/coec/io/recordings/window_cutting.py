@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.frames.window import NS_PER_S, BetweenPairs
-from coec.calibration.search.prior import MOUNT_RAD
-from coec.calibration.types import FramePair, Matrix4, Window
+from coec.calibration.types import MOUNT_RAD, FramePair, Matrix4, Window
 from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
 from coec.errors import SourceError, UsageError
 from coec.geometry import se3
-from coec.geometry.culling import half_field_of_view_rad
+from coec.geometry.projection import half_field_of_view_rad
 from coec.io.images import CompressingReducer
 from coec.io.mcap.window_reader import is_window, read_result, read_window
 from coec.io.recordings.layouts import RecordingSource, open_source

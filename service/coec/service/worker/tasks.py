@@ -19,7 +19,6 @@ from coec.calibration.commissioning import MAX_PAIRS, commission_in_steps
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import Silence, Step, Steps
 from coec.calibration.rig.lidar_registration import register
 from coec.calibration.rig.lidar_sampling import LidarEdge, LidarRig, SweepPair
 from coec.calibration.types import (
@@ -29,6 +28,9 @@ from coec.calibration.types import (
     Matrix4,
     Reason,
     Rig,
+    Silence,
+    Step,
+    Steps,
     Window,
 )
 from coec.config import CalibrationConfig, Config, DepthConfig

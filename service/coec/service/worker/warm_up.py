@@ -14,7 +14,6 @@ import numpy as np
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.pipeline import calibrate
-from coec.calibration.ports import Silence
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import (
     CameraFrame,
@@ -25,6 +24,7 @@ from coec.calibration.types import (
     ImageFormat,
     LidarFrame,
     Rig,
+    Silence,
     Window,
 )
 from coec.config import CalibrationConfig
