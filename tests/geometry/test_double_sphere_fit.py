@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from coec.geometry import cameras
-from coec.geometry.cameras import Camera, DoubleSphere
+from coec.geometry.cameras import Camera
+from coec.geometry.cameras.double_sphere import DoubleSphere
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.geometry.projection import project, unproject
 

@@ -1,27 +1,18 @@
 """numba, as every kernel of this program imports it: with its on-disk cache in a directory of the user, with the
-formulas of the camera models registered, and with prefetching of memory. The directory is keyed by a hash of the
-sources in `coec.geometry`. numba itself only looks at the file that holds the outermost kernel, so that after an
-edit to a camera formula it would use a stale kernel from another file. The camera model is chosen at compile time,
-by the type of the camera. A kernel therefore needs no branch and no code per model, and numba caches it on disk,
-which it does not do for a kernel that takes a function as an argument. No formula uses fastmath. numba compiles a
-parallel kernel twice: for the process that first runs it, and for the cache. If it may re-associate and fuse, the
-two differ in the last bit, but decisions have to replay to the byte. The loops vectorise anyway. (The one
-exception, `projection.certain_pixels`, compiles these formulas for itself and answers only where the last bits do
-not matter.) Importing this module loads a compiler: 70 MB and a third of a second, which the process that serves
-queries avoids.
+formulas of the camera models registered, and with prefetching of memory.
 
 The directory is keyed by a hash of the sources in `coec.geometry`. numba itself only looks at the file that holds the
 outermost kernel, so that after an edit to a camera formula it would use a stale kernel from another file.
 
+The camera model is chosen at compile time, by the type of the camera. A kernel therefore needs no branch and no code
+per model, and numba caches it on disk, which it does not do for a kernel that takes a function as an argument.
+
+No formula uses fastmath. numba compiles a parallel kernel twice: for the process that first runs it, and for the cache.
+If it may re-associate and fuse, the two differ in the last bit, but decisions have to replay to the byte. The loops
+vectorise anyway. (The one exception, `projection.certain_pixels`, compiles these formulas for itself and answers only
+where the last bits do not matter.)
+
 Importing this module loads a compiler: 70 MB and a third of a second, which the process that serves queries avoids.
-
-The model is chosen at compile time, by the type of the camera. A kernel therefore needs no branch and no code per
-model, and numba caches it on disk, which it does not do for a kernel that takes a function as an argument.
-
-None of them uses fastmath. numba compiles a parallel kernel twice: for the process that first runs it, and for the
-cache. If it may re-associate and fuse, the two differ in the last bit, but decisions have to replay to the byte. The
-loops vectorise anyway. (The one exception, `pixel_lookup.certain_pixels`, compiles these formulas for itself and
-answers only where the last bits do not matter.)
 """
 
 from __future__ import annotations
@@ -47,7 +38,6 @@ from numba.core.cpu_options import ParallelOptions
 from numba.extending import intrinsic, overload, register_jitable
 from numpy.typing import NDArray
 
-import coec.geometry.compiler  # noqa: F401  makes the formulas known
 from coec.geometry import compilation_events
 from coec.geometry.cameras.base import (
     arc_over_tangent,
@@ -60,8 +50,7 @@ from coec.geometry.cameras.base import (
     solve_odd_polynomial,
     undistort,
 )
-from coec.geometry.cameras.rational import rational_distort, rational_factor, rational_radius, rational_slope
-from coec.geometry.cameras.registry import image_point, model_of, project_point, unproject_point
+from coec.geometry.cameras.registry import HELPERS, image_point, model_of, project_point, unproject_point
 
 __all__ = ["PRANGE", "njit", "on_one_thread", "prange"]
 
@@ -237,10 +226,12 @@ event.register("numba:compile", _Kernels())
 # their caller's, so that NaN stays invalid in a caller with fastmath.
 _OPTIONS: Any = {"error_model": "numpy"}
 
-for _formula in (
-    distort, guarded_pixel, guarded_ray, odd_polynomial, polar_angle, project_point, rational_distort, rational_factor,
-    rational_radius, rational_slope, solve_odd_polynomial, undistort,
-):  # fmt: skip
+_FORMULAS: tuple[Any, ...] = (
+    distort, guarded_pixel, guarded_ray, odd_polynomial, polar_angle, project_point, solve_odd_polynomial, undistort,
+    *HELPERS,
+)  # fmt: skip
+
+for _formula in _FORMULAS:
     register_jitable(**_OPTIONS)(_formula)
 
 

@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import Camera, DoubleSphere, project_point
+from coec.geometry.cameras import Camera, project_point
+from coec.geometry.cameras.double_sphere import DoubleSphere
 from coec.geometry.compiler import njit
 from coec.geometry.mutual_information import BinnedFrames
 

@@ -4,13 +4,6 @@ A camera is an immutable named tuple, so that compiled code takes it as it is an
 Points of the camera frame: x right, y down, z forward, metres. Pixel centres lie at integer coordinates (OpenCV).
 """
 
-from coec.geometry.cameras.double_sphere import DoubleSphere
-from coec.geometry.cameras.eucm import Eucm
-from coec.geometry.cameras.kannala_brandt import KannalaBrandt
-from coec.geometry.cameras.mei import Mei
-from coec.geometry.cameras.pinhole import Pinhole
-from coec.geometry.cameras.radtan import RadTan
-from coec.geometry.cameras.rational import Rational
 from coec.geometry.cameras.registry import (
     MODELS,
     Camera,
@@ -32,14 +25,7 @@ from coec.geometry.cameras.registry import (
 __all__ = [
     "MODELS",
     "Camera",
-    "DoubleSphere",
-    "Eucm",
-    "KannalaBrandt",
-    "Mei",
     "Model",
-    "Pinhole",
-    "RadTan",
-    "Rational",
     "build",
     "cropped",
     "domain_angle_rad",

@@ -47,9 +47,17 @@ def like(constant: float, value: float) -> float:  # noqa: ARG001  (only its typ
     return constant
 
 
-class _ImageSize(Protocol):
-    """The fields that every camera model has and that the guards read."""
+class CameraFields(Protocol):
+    """The fields that every camera model has."""
 
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def fx(self) -> float: ...
+    @property
+    def fy(self) -> float: ...
     @property
     def cx(self) -> float: ...
     @property
@@ -57,7 +65,7 @@ class _ImageSize(Protocol):
 
 
 def guarded_pixel(
-    camera: _ImageSize, x: float, y: float, z: float, u: float, v: float, in_domain: bool
+    camera: CameraFields, x: float, y: float, z: float, u: float, v: float, in_domain: bool
 ) -> tuple[float, float, bool]:
     """(u, v, True) for a point (x, y, z) in the domain with a sane pixel, else the principal point and False."""
     range2 = x * x + y * y + z * z

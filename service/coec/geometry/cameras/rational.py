@@ -185,3 +185,7 @@ def unproject_point(camera: Rational, u: float, v: float) -> tuple[float, float,
     allowed = _TOLERANCE * (1.0 + distorted_radius)
     close = (abs(xr - xd) < allowed) & (abs(yr - yd) < allowed)
     return guarded_ray(x, y, 1.0, close & (x * x + y * y < camera.max_radius2))
+
+
+HELPERS = (rational_distort, rational_factor, rational_radius, rational_slope)
+"""What the formulas call beside `base`; compiled with them."""

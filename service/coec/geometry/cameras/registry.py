@@ -10,23 +10,24 @@ import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import double_sphere, eucm, kannala_brandt, mei, pinhole, radtan, rational
 from coec.geometry.cameras.base import guarded_pixel, positive
-from coec.geometry.cameras.double_sphere import DoubleSphere
-from coec.geometry.cameras.eucm import Eucm
-from coec.geometry.cameras.kannala_brandt import KannalaBrandt
-from coec.geometry.cameras.mei import Mei
-from coec.geometry.cameras.pinhole import Pinhole
-from coec.geometry.cameras.radtan import RadTan
-from coec.geometry.cameras.rational import Rational
 from coec.geometry.points import rows_of
 
-Camera = Pinhole | RadTan | Rational | KannalaBrandt | Mei | Eucm | DoubleSphere
+Camera = (
+    pinhole.Pinhole
+    | radtan.RadTan
+    | rational.Rational
+    | kannala_brandt.KannalaBrandt
+    | mei.Mei
+    | eucm.Eucm
+    | double_sphere.DoubleSphere
+)
 
 
 class Model(NamedTuple):
@@ -48,16 +49,19 @@ MODELS: Mapping[str, Model] = MappingProxyType(
     {
         name: Model(name, camera_type, module.build, module.image_point, module.unproject_point)
         for name, camera_type, module in (
-            ("pinhole", Pinhole, pinhole),
-            ("radtan", RadTan, radtan),
-            ("rational", Rational, rational),
-            ("kannala_brandt", KannalaBrandt, kannala_brandt),
-            ("mei", Mei, mei),
-            ("eucm", Eucm, eucm),
-            ("double_sphere", DoubleSphere, double_sphere),
+            ("pinhole", pinhole.Pinhole, pinhole),
+            ("radtan", radtan.RadTan, radtan),
+            ("rational", rational.Rational, rational),
+            ("kannala_brandt", kannala_brandt.KannalaBrandt, kannala_brandt),
+            ("mei", mei.Mei, mei),
+            ("eucm", eucm.Eucm, eucm),
+            ("double_sphere", double_sphere.DoubleSphere, double_sphere),
         )
     }
 )
+
+HELPERS: tuple[Callable[..., Any], ...] = rational.HELPERS
+"""Functions of lenses that their formulas call: compiled with them."""
 
 _BY_TYPE: Mapping[type, Model] = MappingProxyType({model.camera_type: model for model in MODELS.values()})
 

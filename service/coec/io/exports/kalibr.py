@@ -59,8 +59,8 @@ def _camera(camera: CameraIntrinsics) -> tuple[str, list[float], str, list[float
             if given.get("k3"):
                 raise OutputError("Kalibr's radtan has no k3: this camera cannot be written for it")
             return "pinhole", pinhole, "radtan", tangential
-        case "rational":
-            raise OutputError("Kalibr has no rational distortion: this camera cannot be written for it")
+        case _:
+            raise OutputError(f"Kalibr has no {camera.model} distortion: this camera cannot be written for it")
 
 
 def _flow(values: list[float]) -> str:

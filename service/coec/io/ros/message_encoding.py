@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
+from types import MappingProxyType
 from typing import Final, Literal
 
 import numpy as np
@@ -14,8 +16,9 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.errors import CoecError
-from coec.geometry.cameras import Camera, intrinsics_of, name_of
-from coec.geometry.cameras.kannala_brandt_fit import fit_kannala_brandt
+from coec.geometry.cameras import MODELS, Camera, intrinsics_of, name_of, unproject_point
+from coec.geometry.cameras.base import CommonIntrinsics
+from coec.geometry.cameras.kannala_brandt import fit_kannala_brandt
 from coec.geometry.se3 import quaternion_xyzw_from_rotation
 from coec.io.images import BYTES_PER_PIXEL
 from coec.io.ros import point_clouds
@@ -177,15 +180,24 @@ def _figure_text(metric: MetricReply) -> str:
 DEPTH_FORMAT: Final = "16UC1; png"
 """`CompressedImage.format` of a recorded depth map."""
 
-DISTORTION: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
-    "pinhole": ("plumb_bob", ()),
-    "radtan": ("plumb_bob", ("k1", "k2", "p1", "p2", "k3")),
-    "rational": ("rational_polynomial", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    "kannala_brandt": ("equidistant", ("k1", "k2", "k3", "k4")),
-    "mei": ("mei", ("xi", "k1", "k2", "p1", "p2")),
-    "eucm": ("eucm", ("alpha", "beta")),
-    "double_sphere": ("double_sphere", ("xi", "alpha")),
-}
+_ROS_DISTORTION: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "pinhole": "plumb_bob",
+        "radtan": "plumb_bob",
+        "rational": "rational_polynomial",
+        "kannala_brandt": "equidistant",
+    }
+)
+
+DISTORTION: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = MappingProxyType(
+    {
+        name: (
+            _ROS_DISTORTION.get(name, name),
+            tuple(one for one in model.parameters if one not in CommonIntrinsics._fields),
+        )
+        for name, model in MODELS.items()
+    }
+)
 """`CameraInfo.distortion_model` and the order of `d`, by camera model. `plumb_bob`, `rational_polynomial` and
 `equidistant` are from sensor_msgs/distortion_models.hpp. ROS has no names for the others, so that they have the names
 of `dataset.yaml`."""
@@ -298,12 +310,12 @@ def ros_camera(camera: Camera) -> tuple[Camera, float]:
     """The camera in a model that ROS's own programs know, and its largest error in pixels.
 
     Raises:
-        UnsayableCameraError: no model is within `MAX_RESIDUAL_PX`.
+        UnsupportedCameraError: no model is within `MAX_RESIDUAL_PX`.
     """
     if DISTORTION[name_of(camera)][0] in ROS_MODELS:
         return camera, 0.0
     try:
-        fit = fit_kannala_brandt(camera)
+        fit = fit_kannala_brandt(camera, partial(unproject_point, camera))
     except ValueError as error:
         raise UnsupportedCameraError(f"ROS has no model {name_of(camera)}, and not as equidistant: {error}") from error
     if fit.residual_max_px > MAX_RESIDUAL_PX:
