@@ -290,6 +290,40 @@ def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: boo
         colour[2] = colour[2] * (1 - dark) + dark * lit * 0.27
 
 
+@njit(cache=True)
+def _shininess(kind: int, facing: float) -> float:
+    """The share of the light that a surface mirrors, by the cosine of the angle at which it is seen (Schlick 1994)."""
+    if kind == GLASS:
+        return 0.08 + 0.92 * (1 - facing) ** 5
+    if kind == LACQUER:
+        return 0.05 + 0.6 * (1 - facing) ** 5
+    return 0.0
+
+
+@njit(cache=True)
+def _reflect(
+    kind: int, shiny: float, dx: float, dy: float, dz: float, nx: float, ny: float, nz: float, u: float, v: float,
+    light: Doubles, clouds: float, sky_share: float, shadowed: float, colour: Doubles,
+) -> None:  # fmt: skip
+    """Mixes into `colour` what a surface mirrors of the sky, of what stands opposite, and of the sun: the share `shiny`
+    of a ray along d onto the normal n at its coordinates u, v."""
+    along = 2.0 * (nx * dx + ny * dy + nz * dz)
+    rx, ry, rz = dx - along * nx, dy - along * ny, dz - along * nz
+    mirrored = np.empty(3)
+    if rz > 0.25 or (kind == LACQUER and rz > 0.02):
+        _sky(rx, ry, rz, light, clouds, False, mirrored)
+    else:  # what stands opposite, a blotch
+        shade_of = 0.10 + 0.25 * _noise(0.35 * u + 3 * rx, 0.35 * v + 3 * rz, SALTS[40])
+        for c in range(3):
+            mirrored[c] = shade_of * (light[3, c] + 0.3 * light[1, c])
+    for c in range(3):
+        mirrored[c] *= sky_share
+    glint = rx * light[0, 0] + ry * light[0, 1] + rz * light[0, 2]
+    spot = 6.0 * max(glint, 0.0) ** 400 * (1.0 - shadowed) if glint > 0.9 else 0.0
+    for c in range(3):
+        colour[c] = colour[c] * (1 - shiny) + shiny * mirrored[c] + spot * light[1, c]
+
+
 @njit(cache=True, parallel=PRANGE)
 def _shade(
     origin: Doubles,
@@ -328,11 +362,7 @@ def _shade(
             flat = math.sqrt(nx * nx + ny * ny)
             u, v = (ny * x - nx * y) / flat, z
         kind = material[t]
-        shiny = 0.0
-        if kind == GLASS:
-            shiny = 0.08 + 0.92 * (1 - facing) ** 5
-        elif kind == LACQUER:
-            shiny = 0.05 + 0.6 * (1 - facing) ** 5
+        shiny = _shininess(kind, facing)
         factor = 1.0 if kind in (GLASS, LACQUER) else _texture(kind, u, v, foot)
         sunny = max(nx * light[0, 0] + ny * light[0, 1] + nz * light[0, 2], 0.0)
         if kind == FOLIAGE:
@@ -346,21 +376,7 @@ def _shade(
             ambient = 0.55 * (light[2, c] + light[3, c]) * 0.5 * open_sky + 0.06 * light[1, c] * (1 - 0.5 * nz)
             colour[c] = paint[t, c] * factor * (light[1, c] * sunny + ambient * sky_share[i] + lamps[i])
         if shiny > 0.0:
-            along = 2.0 * (nx * dx + ny * dy + nz * dz)
-            rx, ry, rz = dx - along * nx, dy - along * ny, dz - along * nz
-            mirrored = np.empty(3)
-            if rz > 0.25 or (kind == LACQUER and rz > 0.02):
-                _sky(rx, ry, rz, light, clouds, False, mirrored)
-            else:  # what stands opposite, a blotch
-                shade_of = 0.10 + 0.25 * _noise(0.35 * u + 3 * rx, 0.35 * v + 3 * rz, SALTS[40])
-                for c in range(3):
-                    mirrored[c] = shade_of * (light[3, c] + 0.3 * light[1, c])
-            for c in range(3):
-                mirrored[c] *= sky_share[i]
-            glint = rx * light[0, 0] + ry * light[0, 1] + rz * light[0, 2]
-            spot = 6.0 * max(glint, 0.0) ** 400 * (1.0 - shadowed[i]) if glint > 0.9 else 0.0
-            for c in range(3):
-                colour[c] = colour[c] * (1 - shiny) + shiny * mirrored[c] + spot * light[1, c]
+            _reflect(kind, shiny, dx, dy, dz, nx, ny, nz, u, v, light, clouds, sky_share[i], shadowed[i], colour)
         if kind == LAMP:
             for c in range(3):
                 colour[c] = LAMP_RADIANCE

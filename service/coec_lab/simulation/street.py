@@ -76,17 +76,28 @@ def house(rng: np.random.Generator, plan: HousePlan) -> Mesh:
     return join(parts)
 
 
-def _wall(
-    rng: np.random.Generator,
-    plan: HousePlan,
-    width_m: float,
-    colour: Doubles,
-    kind: Material,
-    frame: Doubles,
-    *,
-    door: bool,
-) -> Mesh:
-    """A wall in the plane y = 0, seen from y < 0, of bays with a window each."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Openings:
+    """The bays of a wall in the plane y = 0, one window or door each: (N,) metres.
+
+    Attributes:
+        u0, u1, v0, v1: the bay.
+        left, right, low, high: its opening.
+        entrance: (N,) bool, whether that is the door.
+    """
+
+    u0: Floating
+    u1: Floating
+    v0: Floating
+    v1: Floating
+    left: Floating
+    right: Floating
+    low: Floating
+    high: Floating
+    entrance: NDArray[np.bool_]
+
+
+def _openings(rng: np.random.Generator, plan: HousePlan, width_m: float, *, door: bool) -> _Openings:
     bays = max(1, round(width_m / plan.bay_m))
     bay = width_m / bays
     share_u, share_v = rng.uniform(0.38, 0.62), rng.uniform(0.45, 0.62)
@@ -107,25 +118,38 @@ def _wall(
         left = np.where(entrance, u0 + bay / 2 - 0.55, left)
         right = np.where(entrance, u0 + bay / 2 + 0.55, right)
         low, high = np.where(entrance, 0.02, low), np.where(entrance, 2.2, high)
-    v0 = np.where(row == 0, FOOT_M, v0)
+    return _Openings(u0, u1, np.where(row == 0, FOOT_M, v0), v1, left, right, low, high, entrance)
+
+
+def _wall(
+    rng: np.random.Generator,
+    plan: HousePlan,
+    width_m: float,
+    colour: Doubles,
+    kind: Material,
+    frame: Doubles,
+    *,
+    door: bool,
+) -> Mesh:
+    """A wall in the plane y = 0, seen from y < 0, of bays with a window each."""
+    of = _openings(rng, plan, width_m, door=door)
+    u0, u1, v0, v1, left, right, low, high = of.u0, of.u1, of.v0, of.v1, of.left, of.right, of.low, of.high
+    entrance = of.entrance
     zero, deep = np.zeros_like(u0), np.full_like(u0, REVEAL_M)
 
-    def face(*corners: tuple[Floating, Floating, Floating]) -> Floating:
-        return np.stack([np.stack(corner, axis=-1) for corner in corners], axis=1)
-
     walls = np.concatenate([
-        face((u0, zero, v0), (u1, zero, v0), (u1, zero, low), (u0, zero, low)),
-        face((u0, zero, high), (u1, zero, high), (u1, zero, v1), (u0, zero, v1)),
-        face((u0, zero, low), (left, zero, low), (left, zero, high), (u0, zero, high)),
-        face((right, zero, low), (u1, zero, low), (u1, zero, high), (right, zero, high)),
+        _faces((u0, zero, v0), (u1, zero, v0), (u1, zero, low), (u0, zero, low)),
+        _faces((u0, zero, high), (u1, zero, high), (u1, zero, v1), (u0, zero, v1)),
+        _faces((u0, zero, low), (left, zero, low), (left, zero, high), (u0, zero, high)),
+        _faces((right, zero, low), (u1, zero, low), (u1, zero, high), (right, zero, high)),
     ])  # fmt: skip
     reveals = np.concatenate([
-        face((left, zero, low), (right, zero, low), (right, deep, low), (left, deep, low)),
-        face((left, zero, high), (right, zero, high), (right, deep, high), (left, deep, high)),
-        face((left, zero, low), (left, deep, low), (left, deep, high), (left, zero, high)),
-        face((right, zero, low), (right, deep, low), (right, deep, high), (right, zero, high)),
+        _faces((left, zero, low), (right, zero, low), (right, deep, low), (left, deep, low)),
+        _faces((left, zero, high), (right, zero, high), (right, deep, high), (left, deep, high)),
+        _faces((left, zero, low), (left, deep, low), (left, deep, high), (left, zero, high)),
+        _faces((right, zero, low), (right, deep, low), (right, deep, high), (right, zero, high)),
     ])  # fmt: skip
-    panes = face((left, deep, low), (right, deep, low), (right, deep, high), (left, deep, high))
+    panes = _faces((left, deep, low), (right, deep, low), (right, deep, high), (left, deep, high))
     shade = rng.uniform(0.02, 0.12, (len(u0), 1)) * np.array([1.1, 1.0, 0.95])
     curtained = rng.random(len(u0)) < 0.25
     shade[curtained] = np.array([0.42, 0.45, 0.47]) * rng.uniform(0.6, 1.2)
@@ -133,16 +157,16 @@ def _wall(
     slim, wide = (left + right) / 2 - 0.04, (left + right) / 2 + 0.04
     near = np.full_like(u0, REVEAL_M - 0.04)
     bars = np.concatenate([
-        face((slim, near, low), (wide, near, low), (wide, near, high), (slim, near, high)),
-        face((left, near, low), (right, near, low), (right, near, low + 0.07), (left, near, low + 0.07)),
-        face((left, near, high - 0.07), (right, near, high - 0.07), (right, near, high), (left, near, high)),
-        face((left, near, low), (left + 0.07, near, low), (left + 0.07, near, high), (left, near, high)),
-        face((right - 0.07, near, low), (right, near, low), (right, near, high), (right - 0.07, near, high)),
+        _faces((slim, near, low), (wide, near, low), (wide, near, high), (slim, near, high)),
+        _faces((left, near, low), (right, near, low), (right, near, low + 0.07), (left, near, low + 0.07)),
+        _faces((left, near, high - 0.07), (right, near, high - 0.07), (right, near, high), (left, near, high)),
+        _faces((left, near, low), (left + 0.07, near, low), (left + 0.07, near, high), (left, near, high)),
+        _faces((right - 0.07, near, low), (right, near, low), (right, near, high), (right - 0.07, near, high)),
     ])  # fmt: skip
     out = np.full_like(u0, -0.08)
     sills = np.concatenate([
-        face((left, out, low), (right, out, low), (right, zero, low), (left, zero, low)),
-        face((left, out, low - 0.06), (right, out, low - 0.06), (right, out, low), (left, out, low)),
+        _faces((left, out, low), (right, out, low), (right, zero, low), (left, zero, low)),
+        _faces((left, out, low - 0.06), (right, out, low - 0.06), (right, out, low), (left, out, low)),
     ])[np.tile(~entrance, 2)]  # fmt: skip
     parts = [
         quads(walls, colour, kind),
@@ -154,6 +178,11 @@ def _wall(
     if entrance.any():
         parts.append(quads(panes[entrance], leaf, Material.PAINT))
     return join(parts)
+
+
+def _faces(*corners: tuple[Floating, Floating, Floating]) -> Floating:
+    """(N, 4, 3) from the coordinates (N,) of four corners."""
+    return np.stack([np.stack(corner, axis=-1) for corner in corners], axis=1)
 
 
 def _turned(mesh: Mesh, at_m: tuple[float, float], angle_rad: float) -> Mesh:
