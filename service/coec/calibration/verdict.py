@@ -65,14 +65,14 @@ _CONTRADICTED = {HELD_FREE: "with the held centre", CLOCKS_FREE: "with the clock
 
 
 def saw_one_scene(independent_samples: float, frames: int) -> bool:
-    """Whether frames that are worth so many independent `looks` show the same again and again, as those of a standing
+    """Whether frames that are worth so many `independent_samples` show the same again and again, as those of a standing
     vehicle do."""
     return independent_samples < SAME_SCENE * frames
 
 
 def counted_once(metrics: tuple[Metric, ...], independent_samples: float, frames: int) -> tuple[Metric, ...]:
     """The metrics of an objective, with what the frames have in common counted once, not once a frame. If the number of
-    independent `looks` is not finite, every frame counts."""
+    `independent_samples` is not finite, every frame counts."""
     share = independent_samples / frames if isfinite(independent_samples) else 1.0
     return tuple(replace(m, value=m.value * share) if m.name == COUNTED else m for m in metrics)
 
@@ -125,7 +125,7 @@ def repetition_metric(
 
 def intrinsics_metric(relaxed: Sequence[RelaxedAssumption], limits: VerdictConfig) -> tuple[Metric, ...]:
     """How certainly another lens explains the window better than that of the rig; empty if none was tried. A lens that
-    hardly moves the edges (`Loosened.matters`) counts as 0."""
+    hardly moves the edges (`RelaxedAssumption.matters`) counts as 0."""
     return tuple(
         Metric(
             INTRINSICS_OFF,
@@ -214,7 +214,7 @@ def judge(
     details: Mapping[str, str] = MappingProxyType({}),
 ) -> Verdict:
     """Equation (2) over the metrics of the objective and of its optimum. If a window is too uncertain because its
-    `frames` are worth few independent `looks`, one reason more says that it needs motion past other things. `details`
+    `frames` are worth few `independent_samples`, one reason more says that it needs motion past other things. `details`
     holds, by the name of a metric, what its failure means in this window."""
     reasons = [
         Reason(

@@ -76,7 +76,7 @@ class ObjectiveLandscape:
     objective: Objective
 
     def score(self, T_camera_lidar: Matrix4) -> float:
-        """See `Landscape.score`."""
+        """See `ScoreFunction.score`."""
         return self.objective.evaluate(T_camera_lidar).score
 
 

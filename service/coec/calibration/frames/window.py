@@ -248,7 +248,7 @@ class CarriedOverPairs:
 
 @dataclass(frozen=True, slots=True)
 class SliceClosed:
-    """The end of a slice in which at least one pair was chosen. `pairs` includes those that were `kept` for it; the
+    """The end of a slice in which at least one pair was chosen. `pairs` includes those that were carried over; the
     slice is `complete` if they are enough for a window."""
 
     window_id: str

@@ -3,7 +3,7 @@ and from what was known before some sensors moved and is still true after the mo
 
 The unknowns are the poses of the sensors, each moved by x (6,) from where the vehicle was built, and one number for
 every error that windows share. For example, a displaced lens displaces every pair of its camera; how far, each window
-states for itself (`confidence.budget`). Least squares over both, iterated from the poses found (Gauss, Newton):
+states for itself (`uncertainty.systematic`). Least squares over both, iterated from the poses found (Gauss, Newton):
 
 ξ_measured = x_a - Ad(T_a_b) · x_b + Σ s_k · z_k + noise, x ~ N(0, P), z ~ N(0, 1)
 
@@ -76,7 +76,7 @@ OWNERS: Mapping[str, Owner] = {
     "columns": SWEEP,
     "stamps": CLOCKS,
 }
-"""The owner of each error by its name in `confidence.budget`; any other error is the pair's own."""
+"""The owner of each error by its name in `uncertainty.systematic`; any other error is the pair's own."""
 
 LASTING = frozenset({"lens_across", "lens_down", "lens_scale"})
 """Errors that a sensor has whatever it sees. The others change with the scene: how far edges of near things, or

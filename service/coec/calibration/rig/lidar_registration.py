@@ -3,7 +3,7 @@ Geman, McClure 1985), over several pairs of sweeps, each motion-compensated to o
 the pose.
 
 It is the sandwich of maximum-likelihood theory (Huber 1967), with the scatter of the score between pairs of sweeps and
-between sectors of the surroundings, as for a window of a camera (`confidence.noise`): a standing vehicle sees the same
+between sectors of the surroundings, as for a window of a camera (`measure_noise`): a standing vehicle sees the same
 again, and points of one wall agree with each other. Two errors reduce what the points seem to determine: normals are
 measured (a long wall whose normals scatter seems to hold the direction along it), and clocks are not exact.
 

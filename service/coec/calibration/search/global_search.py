@@ -67,7 +67,7 @@ class _Round:
 
 
 COARSE, FINE = 0, 1
-"""Places of the charts in `EdgeWitness.charts` and `.thinned`."""
+"""Places of the charts in `EdgeCue.charts` and `.thinned`."""
 
 ROUNDS = (
     _Round(1500, radians(0.9), COARSE, thinned=True, points=800, step_rad=radians(0.45), halvings=1),

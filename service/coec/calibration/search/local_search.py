@@ -176,7 +176,7 @@ def polish(
     constraint: Constraint | None = None,
 ) -> SearchResult:
     """The maximum next to `basin` (4, 4), within a few difference steps of the objective. `evaluations` were made
-    before and are included in the result. Every pose that is tried obeys `kept`."""
+    before and are included in the result. Every pose that is tried obeys `constraint`."""
     moved = [axis for axis in range(config.dof) if constraint is None or axis not in constraint.axes]
 
     def pose(coordinates: NDArray[np.float64]) -> Matrix4:

@@ -1,28 +1,19 @@
 """The nuisance parameters of a window, and what changes when they are relaxed: where the camera's centre is, when the
-exposures were, and through which lens they were taken. Does the window contradict what was assumed? A held camera
-centre, trusted clocks and a lens taken from a sheet, if wrong, leave a pattern in the residuals that no pose
-removes. They are relaxed one after the other, the earlier ones staying free: the centre, then the clocks, then the
-lens (a nested likelihood ratio, Wilks 1938, on the sharpest edges). The gain is compared with the scatter of frames
-and sectors of the image. A parameter that is relaxed moves together with the pose that answers it. For example, a
-principal point further right acts on most of the image like a camera turned to the left; only what the turn does
-not explain shows the principal point. Two cases are weighed by Bayes' rule: the assumption is right, within its
-known accuracy; or it is wrong, and the window is the only evidence. The error that this adds to the pose is the
-root mean square of how far the pose moves in each case. Nothing jumps: a slightly surer gain counts slightly more.
-Where ascents have several ends, the one is taken that moves the pose farthest.
+exposures were, and through which lens they were taken. Does the window contradict what was assumed?
 
-An assumption that is set free moves together with the pose that answers it. For example, a principal point further
-right looks on most of the image like a camera turned to the left; only what the turn does not explain shows the
-principal point.
+A held camera centre, trusted clocks and a lens taken from a sheet, if wrong, leave a pattern in the residuals that no
+pose removes. They are relaxed one after the other, the earlier ones staying free: the centre, then the clocks, then the
+lens (a nested likelihood ratio, Wilks 1938, on the sharpest edges). The gain is compared with the scatter of frames and
+sectors of the image.
+
+A parameter that is relaxed moves together with the pose that answers it. For example, a principal point further right
+acts on most of the image like a camera turned to the left; only what the turn does not explain shows the principal
+point.
 
 Two cases are weighed by Bayes' rule: the assumption is right, within its known accuracy; or it is wrong, and the window
 is the only evidence. The error that this adds to the pose is the root mean square of how far the pose moves in each
-case. Nothing jumps: a slightly surer gain counts slightly more.
-
-A held camera centre, trusted clocks and a lens taken from a sheet, if wrong, leave a pattern in the residuals that no
-pose removes. They are set free one after the other, the earlier ones staying free: the centre, then the clocks, then
-the lens (a nested likelihood ratio, Wilks 1938, on the sharpest edges). The gain is compared with the scatter of frames
-and sectors of the image. How far the pose moves meanwhile is how far the assumption led it astray, as far as the window
-is believed (`belief`). Where climbs have several ends, the one is taken that led it farthest.
+case. Nothing jumps: a slightly surer gain counts slightly more. Where ascents have several ends, the one is taken that
+moves the pose farthest.
 """
 
 from __future__ import annotations
@@ -226,7 +217,7 @@ def moves(window: Window) -> bool:
 
 
 def _moved_by_lens(assumed: Camera, camera: Camera, uv_px: NDArray[np.float64], place: int) -> NDArray[np.float64]:
-    """(E, 2) how pixels (E, 2) of a camera move with one place of the lens, in units of the lens `told`."""
+    """(E, 2) how pixels (E, 2) of a camera move with one place of the lens, in units of the deviation."""
     moved = np.zeros_like(uv_px)
     if place == LENS.start:
         moved[:, 0] = assumed.fx
@@ -394,7 +385,7 @@ def _scores(level: AssumedEdges, deviations: NDArray[np.float64]) -> NDArray[np.
 
 
 CENTRE_EVEN = 1.5
-"""Certainty (`landscape.certainty`) at which a centre is as likely wrong as right: three standard deviations. See
+"""Certainty (`Landscape.certainty`) at which a centre is as likely wrong as right: three standard deviations. See
 docs/measured.md."""
 
 LEAST_CERTAINTY = 1e-6
@@ -447,7 +438,7 @@ HELD_FREE, CLOCKS_FREE, LENS_FREE = "held_free", "clocks_free", "lens_free"
 """Names of the assumptions that are set free."""
 
 EVEN = 1.0
-"""Certainty (`landscape.certainty`) at which clocks are as likely wrong as right: two standard deviations on a
+"""Certainty (`Landscape.certainty`) at which clocks are as likely wrong as right: two standard deviations on a
 paraboloid. Chance reaches it once in ten windows, and then moves the pose by a few hundredths of a degree or a few
 centimetres. An offset of the clocks that looks like a shift along the way gains little more, but moves the pose by
 decimetres."""
@@ -474,7 +465,7 @@ class RelaxedAssumption:
         name: of the assumption.
         certainty: of the gain; see `Landscape.certainty`.
         moved_px: how far it moves the edges beyond what the pose can do, root mean square, pixels of the sharpest map.
-        deviation: (12,) from what was assumed, together with what was set free before it; see `told`.
+        deviation: (12,) from what was assumed, together with what was set free before it; see `TURNS`.
         shift: (6,) by how much the pose turned and shifted meanwhile, rad and m.
         believed: the share by which the shift counts.
     """

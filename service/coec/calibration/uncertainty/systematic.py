@@ -1,18 +1,13 @@
 """The errors that all frames of a window share, so that no number of frames averages them away: one term for each, in
-units of the resolution of its sensors. Each term is a displacement of the rays to the points by the standard
-deviation of an error. The pose moves by the least-squares answer to that displacement, over the points that settled
-it. An error that is the same for all things in view acts on a rotation; one that only near things have acts on a
-translation. Errors that differ from edge to edge, such as the place of an edge within a beam or a column, are in
-the scatter of the noise and have no term here. A held translation is such an error, too: it was measured once, and
-not to the last millimetre. A camera model that was fitted to another one is refused if its residual alone makes
-every result too uncertain.
+units of the resolution of its sensors.
 
-Each term is a displacement of the sight lines by the standard deviation of an error. The pose moves by the
+Each term is a displacement of the rays to the points by the standard deviation of an error. The pose moves by the
 least-squares answer to that displacement, over the points that settled it. An error that is the same for all things in
 view acts on a rotation; one that only near things have acts on a translation. Errors that differ from edge to edge,
 such as the place of an edge within a beam or a column, are in the scatter of the noise and have no term here.
 
-A held translation is such an error, too: it was measured once, and not to the last millimetre.
+A held translation is such an error, too: it was measured once, and not to the last millimetre. A camera model that was
+fitted to another one is refused if its residual alone makes every result too uncertain.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 odd polynomial of radial distortion with its inverse, and the radial and tangential distortion of normalised image
 coordinates as in OpenCV's `projectPoints`.
 
-Plain Python on numbers, which `compiled` hands to numba as it is. What runs in loops over many points has no
+Plain Python on numbers, which `compiler` hands to numba as it is. What runs in loops over many points has no
 branches.
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)

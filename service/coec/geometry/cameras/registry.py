@@ -144,7 +144,7 @@ def image_point(camera: Camera, x: float, y: float, z: float) -> tuple[float, fl
     """(u, v, in_domain): the model's formula alone. Outside its domain, and for what is no point (NaN, infinity, the
     origin), u and v are anything.
 
-    Compiled for the precision of the point, which must be that of the camera's fields: see `formulas.like`.
+    Compiled for the precision of the point, which must be that of the camera's fields: see `base.like`.
     """
     return model_of(type(camera)).image_point(camera, x, y, z)
 

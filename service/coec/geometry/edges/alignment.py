@@ -378,8 +378,8 @@ def _mix(
     strength: NDArray[np.float32],
     square: NDArray[np.float32],
 ) -> None:
-    """Interpolates the strengths of points (n,) and weighs them into `told`, with the squared weights in `square`. A
-    point lies `right` and `down` of a pixel of strength p; q is to the right of p, r below p, and s below q. Zero if
+    """Interpolates the strengths of points (n,) and weighs them into `strength`, with the squared weights in `square`.
+    A point lies `right` and `down` of a pixel of strength p; q is to the right of p, r below p, and s below q. Zero if
     there is no place or if one of the four is void."""
     for i in range(strength.shape[0]):
         seen = (place[i] >= 0) & (p[i] != VOID) & (q[i] != VOID) & (r[i] != VOID) & (s[i] != VOID)
