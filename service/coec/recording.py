@@ -28,8 +28,8 @@ from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
-from coec.io.exports.exported_extrinsic import ExportedExtrinsic, ExportFrames, extrinsic_of_result
-from coec.io.exports.formats import FORMATS
+from coec.io.exported_extrinsic import ExportedExtrinsic, ExportFrames, extrinsic_of_result
+from coec.io.exports import formats
 from coec.io.images import GreyImages
 from coec.io.recordings import window_cutting
 from coec.io.recordings.layouts import RecordingSource as Source
@@ -181,7 +181,7 @@ def export_text(extrinsic: ExportedExtrinsic, form: str, path: Path | None) -> s
         OutputError: the present content cannot be changed.
     """
     require_format(form)
-    return FORMATS[form].text(extrinsic, None if path is None else _present_text(path))
+    return formats()[form].text(extrinsic, None if path is None else _present_text(path))
 
 
 def require_format(form: str) -> None:
@@ -190,8 +190,8 @@ def require_format(form: str) -> None:
     Raises:
         UsageError: there is no such format; the message lists those that exist.
     """
-    if form not in FORMATS:
-        raise UsageError(f"format {form}: known are {', '.join(FORMATS)}")
+    if form not in formats():
+        raise UsageError(f"format {form}: known are {', '.join(formats())}")
 
 
 def _present_text(path: Path) -> str | None:
@@ -312,8 +312,8 @@ class Result:
 
         Args:
             path: the file; its folder is made if it does not exist.
-            format: `tf`, `urdf`, `autoware`, `kalibr`, `kitti`, `kitti360`, `nuscenes`, `openlabel`, `colmap`,
-                `opencv` or `json`. The file states the direction of its transform.
+            format: `urdf`, `tf`, `autoware` or another that `coec export --help` lists. The file states the direction
+                of its transform.
             parent: name of the parent frame; None: the LiDAR's.
             child: name of the child frame; None: the camera's.
             T_parent_lidar: (4, 4) pose of the LiDAR in `parent`, metres; None: the LiDAR is the parent.

@@ -166,7 +166,7 @@ def test_a_file_is_replaced_whole_and_stays_what_it_was(coec: Coec, result: Path
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--format", "ros"), "known are tf, urdf, autoware"),
+        (("--format", "ros"), "known are autoware, colmap, json"),
         (("--format", "tf", "--parent-pose", "1,2"), "seven finite numbers"),
         (("--format", "tf", "--parent", "a b"), "names no frame"),
     ],

@@ -251,7 +251,7 @@ def test_an_export_is_the_one_of_the_command(coec: Coec, right: package.Result, 
 
 
 def test_what_cannot_be_exported_says_why(right: package.Result, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="known are tf, urdf"):
+    with pytest.raises(UsageError, match="known are autoware, colmap"):
         right.export(tmp_path / "a", format="xls")
     with pytest.raises(UsageError, match="T_parent_lidar"):
         right.export(tmp_path / "a", format="tf", T_parent_lidar=np.eye(3))

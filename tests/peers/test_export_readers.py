@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from coec.io.exports.formats import FORMATS
+from coec.io.exports import formats
 from peers.environments import Peer, peer
 from support.estimates import exported_extrinsic
 
@@ -23,9 +23,9 @@ def readers() -> Iterator[Peer]:
         yield readers
 
 
-@pytest.mark.parametrize("name", sorted(FORMATS.keys() - OURS))
+@pytest.mark.parametrize("name", sorted(formats().keys() - OURS))
 def test_others_read_the_same_transform(readers: Peer, name: str) -> None:
     for seed in range(20):
         told = exported_extrinsic(np.random.default_rng(seed).uniform(-2.0, 2.0, 6))
-        read = readers.ask(format=name, text=FORMATS[name].text(told, None))
+        read = readers.ask(format=name, text=formats()[name].text(told, None))
         np.testing.assert_allclose(read["T_child_parent"], told.T_child_parent, atol=TOLERANCE, rtol=0)

@@ -11,7 +11,7 @@ from coec.calibration.types import Decision, Estimate, Metric, Optimum, Rig, Sto
 from coec.config import CameraIntrinsics
 from coec.geometry import se3
 from coec.geometry.cameras import build
-from coec.io.exports.exported_extrinsic import ExportedExtrinsic, ExtrinsicOrigin
+from coec.io.exported_extrinsic import ExportedExtrinsic, ExtrinsicOrigin
 
 ESTIMATE_RIG = Rig(
     "front",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,17 +10,12 @@ import typer
 
 from coec.cli.options import Json, pair_named, suggesting
 from coec.errors import DecodeError, SourceError, UsageError
+from coec.io.exports import NAMES
 
 if TYPE_CHECKING:
     from coec.calibration.types import Matrix4
     from coec.config import CameraIntrinsics, Config
-    from coec.io.exports.exported_extrinsic import ExportedExtrinsic, ExportFrames
-
-
-def _formats() -> Iterable[str]:
-    from coec.io.exports.formats import FORMATS
-
-    return tuple(FORMATS)
+    from coec.io.exported_extrinsic import ExportedExtrinsic, ExportFrames
 
 
 CalibrationSource = Annotated[
@@ -36,9 +30,9 @@ Format = Annotated[
     str,
     typer.Option(
         "--format",
-        help="tf, urdf, autoware, kalibr, kitti, kitti360, nuscenes, openlabel, colmap, opencv or json.",
+        help=f"{', '.join(NAMES[:-1])} or {NAMES[-1]}.",
         metavar="NAME",
-        autocompletion=suggesting(_formats),
+        autocompletion=suggesting(lambda: NAMES),
         show_default=False,
     ),
 ]
@@ -80,7 +74,7 @@ def export(
 ) -> int:
     """Write a calibration into the files of other programs: exit 1 if it is not accepted."""
     from coec.io import user_files as files
-    from coec.io.exports.exported_extrinsic import ExportFrames
+    from coec.io.exported_extrinsic import ExportFrames
     from coec.recording import export_text, require_accepted, require_format
     from coec.reports import console
 
@@ -115,7 +109,7 @@ def _read(source: Path, config: Path | None, pair: str | None, frames: ExportFra
 
 
 def _of_window(path: Path, frames: ExportFrames) -> ExportedExtrinsic:
-    from coec.io.exports.exported_extrinsic import extrinsic_of_result
+    from coec.io.exported_extrinsic import extrinsic_of_result
     from coec.io.mcap.window_reader import read_result, read_window
     from coec.io.rig_files import intrinsics_config
 
@@ -127,7 +121,7 @@ def _of_window(path: Path, frames: ExportFrames) -> ExportedExtrinsic:
 
 
 def _of_document(path: Path, camera: CameraIntrinsics | None, frames: ExportFrames) -> ExportedExtrinsic:
-    from coec.io.exports.exported_extrinsic import extrinsic_of_reply, extrinsic_of_result
+    from coec.io.exported_extrinsic import extrinsic_of_reply, extrinsic_of_result
     from coec.io.user_files import read_bytes
     from coec.recording import MAX_EXPORT_BYTES
     from coec.schemas.message import from_json
@@ -146,7 +140,7 @@ def _of_document(path: Path, camera: CameraIntrinsics | None, frames: ExportFram
 
 def _of_state(folder: Path, name: str | None, config: Config | None, frames: ExportFrames) -> ExportedExtrinsic:
     """The calibration that the service of a state directory serves, with its full covariance."""
-    from coec.io.exports.exported_extrinsic import intrinsics_config_of
+    from coec.io.exported_extrinsic import intrinsics_config_of
     from coec.service.api.reply_builders import exported
     from coec.service.records.state_store import read_pairs
 
@@ -169,7 +163,7 @@ def _of_state(folder: Path, name: str | None, config: Config | None, frames: Exp
 
 
 def _pose(text: str | None) -> Matrix4 | None:
-    from coec.io.exports.exported_extrinsic import parse_pose
+    from coec.io.exported_extrinsic import parse_pose
 
     if text is None:
         return None

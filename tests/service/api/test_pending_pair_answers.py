@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from coec.calibration.types import Reason
-from coec.io.exports.exported_extrinsic import ExportFrames
+from coec.io.exported_extrinsic import ExportFrames
 from coec.io.ros.wire_format import Publisher
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.schemas.commands import COMMAND_NAMES

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from coec.io.exports.exported_extrinsic import ExportedExtrinsic, roll_pitch_yaw, set_yaml_entry, translation_m
+from coec.io.exported_extrinsic import ExportedExtrinsic, roll_pitch_yaw, set_yaml_entry, translation_m
 
+ENCODING = "application/yaml"
 DIRECTION = (
     "pose in the parent of the camera's body frame (x forward, y left, z up); the optical frame is the body frame "
     "turned by the quaternion x y z w = -0.5 0.5 -0.5 0.5; rad, R = Rz(yaw) Ry(pitch) Rx(roll)"

@@ -6,8 +6,9 @@ import re
 
 from coec.config import CameraIntrinsics
 from coec.errors import OutputError
-from coec.io.exports.exported_extrinsic import ExportedExtrinsic, set_yaml_entry
+from coec.io.exported_extrinsic import ExportedExtrinsic, set_yaml_entry
 
+ENCODING = "application/yaml"
 DIRECTION = "T_cam_lidar maps coordinates in the parent to the optical camera frame (z forward); rows of a 4x4 matrix"
 
 

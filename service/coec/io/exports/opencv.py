@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 
 from coec.errors import OutputError
-from coec.io.exports.exported_extrinsic import ExportedExtrinsic
+from coec.io.exported_extrinsic import ExportedExtrinsic
 
+ENCODING = "application/yaml"
 HEAD = "%YAML:1.0\n---\n"
 DIRECTION = "maps coordinates in the parent to the optical camera frame (z forward); row by row"
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import shlex
 
-from coec.io.exports.exported_extrinsic import ExportedExtrinsic, quaternion_xyzw, translation_m
+from coec.io.exported_extrinsic import ExportedExtrinsic, quaternion_xyzw, translation_m
 
+ENCODING = "text/plain"
 DIRECTION = "pose of the child (optical: z forward) in the parent; quaternion x y z w"
 
 _MARK = "# coec: "

@@ -7,8 +7,9 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from coec.errors import OutputError
-from coec.io.exports.exported_extrinsic import ExportedExtrinsic, roll_pitch_yaw, translation_m
+from coec.io.exported_extrinsic import ExportedExtrinsic, roll_pitch_yaw, translation_m
 
+ENCODING = "application/xml"
 DIRECTION = "origin: pose of the child (optical: z forward) in the parent; rpy in rad, R = Rz(y) Ry(p) Rx(r)"
 
 

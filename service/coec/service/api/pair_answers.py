@@ -20,8 +20,8 @@ from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Matrix4, Reason, Rig
 from coec.config import Config, OpenPairConfig, PairConfig, config_hash
 from coec.errors import CoecError, NotAcceptedError, NotFoundError
-from coec.io.exports.exported_extrinsic import ExportFrames
-from coec.io.exports.formats import FORMATS
+from coec.io.exported_extrinsic import ExportFrames
+from coec.io.exports import formats
 from coec.io.ros.messages import CAMERA_INFO
 from coec.io.serialise import reasons_of, result_of
 from coec.io.zenoh.bus import Answer
@@ -157,6 +157,10 @@ class Overlays:
         self._worker.submit(worker_jobs.overlay(self._pair, path, T_camera_lidar, title, on_outcome, deadline_s))
 
 
+_EXPORTS = formats()
+"""Loaded with the service, so that no query has to wait for it."""
+
+
 class PairAnswers:
     """The answers of one pair."""
 
@@ -287,7 +291,7 @@ class PairAnswers:
         exportable = exported(self._known.state, self._vehicle, self.name, own, camera.intrinsics, frames)
         if exportable.origin.rejection_reasons:
             raise NotAcceptedError(" ".join(exportable.origin.rejection_reasons))
-        written = FORMATS[form]
+        written = _EXPORTS[form]
         return Answer(written.text(exportable, None).encode(), written.encoding)
 
     def health(self, form: Format) -> Answer:

@@ -24,7 +24,7 @@ from coec.calibration.state_machine import AlarmRecord, HealthState, step_betwee
 from coec.calibration.types import Decision, Estimate, Reason, Rig, Uncertainty
 from coec.config import CameraIntrinsics, PairConfig
 from coec.geometry import se3
-from coec.io.exports.exported_extrinsic import NOMINAL, ExportedExtrinsic, ExportFrames, ExtrinsicOrigin, between_frames
+from coec.io.exported_extrinsic import NOMINAL, ExportedExtrinsic, ExportFrames, ExtrinsicOrigin, between_frames
 from coec.io.serialise import degrees_or_null, intrinsics_of, number_or_null, reasons_of, result_of, transform_of
 from coec.io.zenoh.bus import JSON, MSGPACK, Answer
 from coec.schemas import replies

@@ -11,8 +11,8 @@ import zenoh
 from pydantic import BaseModel
 
 from coec.errors import UsageError
-from coec.io.exports.exported_extrinsic import ExportFrames
-from coec.io.exports.formats import FORMATS
+from coec.io.exported_extrinsic import ExportFrames
+from coec.io.exports import NAMES
 from coec.io.zenoh.bus import Answer, Bus, QueryLane, Request, Route
 from coec.schemas.keys import (
     LAST,
@@ -207,7 +207,7 @@ class VehicleRoutes:
 
 
 def _extrinsic(pair: AnyPairAnswers, request: Request) -> Answer:
-    selector = parse_extrinsic_selector(request.parameters, FORMATS)
+    selector = parse_extrinsic_selector(request.parameters, NAMES)
     if selector.export is None:
         return pair.extrinsic(selector.format)
     return pair.exported(selector.export, ExportFrames(selector.parent, selector.child))

@@ -10,6 +10,7 @@ Here the library only finds the place of an entry, and the lines of that entry a
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Sequence
@@ -330,6 +331,28 @@ def parse_pose(text: str) -> NDArray[np.float64]:
     if len(values) != 7 or not all(math.isfinite(value) for value in values):
         raise ValueError("seven finite numbers are expected: x,y,z,qx,qy,qz,qw")
     return se3.transform_from(se3.rotation_from_quaternion_xyzw(np.array(values[3:])), np.array(values[:3]))
+
+
+def number_row(values: Sequence[float]) -> str:
+    """Numbers with blanks between them, exact to the bit."""
+    return " ".join(repr(value) for value in values)
+
+
+def parsed_json(text: str) -> Any:
+    """The values of a JSON document.
+
+    Raises:
+        OutputError: the text is no JSON.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise OutputError(f"the file is no JSON: {error}") from error
+
+
+def json_text(document: object) -> str:
+    """A JSON document as text, indented."""
+    return json.dumps(document, indent=2) + "\n"
 
 
 INDENT = "  "
