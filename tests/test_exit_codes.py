@@ -21,7 +21,7 @@ from ruamel.yaml import YAML
 from coec import daemon
 from coec.cli import check_config
 from coec.cli.check_config import example, template
-from coec.cli.signals import success_on_sigterm
+from coec.cli.options import success_on_sigterm
 from coec.config import Config, StateConfig, ZenohConfig
 from coec.daemon import exit_code_of
 from coec.errors import EXIT_CODE_MEANINGS, MAY_BE_CURED, NOT_CURED_BY_RESTART, CoecError, ConfigError, ExitCode

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.metadata import entry_points
 from os import PathLike, fspath
 from typing import Any, Unpack
 
 from coec.calibration_options import CalibrationOptions
 from coec.errors import UsageError
+from coec.extensions import FUNCTIONS, added_by_packages
 from coec.io.recordings.layouts import open_source
 from coec.recording import Recording, Result, Window
-
-GROUP = "coec.api"
-"""Group of entry points by which another package adds a function to `coec`: its name, and `module:function`."""
 
 
 def open(source: str | PathLike[str]) -> Recording:
@@ -77,8 +74,9 @@ def added(name: str) -> Callable[..., Any]:
 
     Without such a package it is a function that raises UsageError, which names what to install.
     """
-    for point in entry_points(group=GROUP, name=name):
-        function: Callable[..., Any] = point.load()
+    load = added_by_packages(FUNCTIONS).get(name)
+    if load is not None:
+        function: Callable[..., Any] = load()
         return function
 
     def absent(*_: object, **__: object) -> Any:

@@ -23,9 +23,8 @@ import zenoh
 
 from cli.conftest import Coec
 from coec.calibration.types import LidarFrame
-from coec.cli import doctor_computer, doctor_connection
-from coec.cli.doctor import examine
-from coec.cli.doctor_streams import StreamSamples, stream_findings
+from coec.cli.doctor import environment, examine
+from coec.cli.doctor.streams import StreamSamples, stream_findings
 from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, ZenohConfig, load_config
 from coec.io import system
 from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
@@ -262,7 +261,7 @@ def test_no_router_is_told_and_fails(coec: Coec, tmp_path: Path) -> None:
 def test_a_port_at_which_something_else_answers_is_told_from_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor_connection, "CONNECT_S", 1.0)
+    monkeypatch.setattr(environment, "CONNECT_S", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as other:
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
         found = list(examine(written(tmp_path, ZenohConfig(connect=(endpoint,)), "front"), 0.5))
@@ -348,22 +347,22 @@ def found_with(authority: Path, port: int, name: str, folder: Path, vehicle: str
     session = {"connect": {"endpoints": [f"tls/127.0.0.1:{port}"]}, "transport": {"link": {"tls": tls}}}
     file.write_text(json.dumps(session))
     config = pair_configuration(folder).model_copy(update={"zenoh": ZenohConfig(file=file), "vehicle": vehicle})
-    found = [*doctor_connection.certificate_findings(config), *doctor_connection.router_findings(config)]
-    with_session = doctor_connection.session_of_client(config)
-    found.append(doctor_connection.session_finding(config, with_session))
+    found = [*environment.certificate_findings(config), *environment.router_findings(config)]
+    with_session = environment.session_of_client(config)
+    found.append(environment.session_finding(config, with_session))
     if with_session is not None:
-        as_of_service = doctor_connection.session_as_of_service(config)
+        as_of_service = environment.session_as_of_service(config)
         assert as_of_service is not None
         with with_session, as_of_service:
-            found.append(doctor_connection.rules_finding(config, as_of_service, with_session))
+            found.append(environment.rules_finding(config, as_of_service, with_session))
     return {one.check: one for one in found}
 
 
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """What does not come about is given up soon."""
-    monkeypatch.setattr(doctor_connection, "CONNECT_S", 1.0)
-    monkeypatch.setattr(doctor_connection, "SEEN_S", 0.3)
+    monkeypatch.setattr(environment, "CONNECT_S", 1.0)
+    monkeypatch.setattr(environment, "SEEN_S", 0.3)
 
 
 @pytest.mark.usefixtures("soon")
@@ -444,7 +443,7 @@ def test_an_endpoint_has_files_of_its_own(authority: Path) -> None:
 
 
 def levels(config: Config) -> dict[str, str]:
-    return {one.check: one.level for one in doctor_computer.state_findings(config.state)}
+    return {one.check: one.level for one in environment.state_findings(config.state)}
 
 
 @pytest.mark.fault("a full disk before the start", "the doctor says so, and leaves nothing behind on it")
@@ -459,7 +458,7 @@ def test_a_full_disk_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "pwrite", full)
-    (writing,) = (one for one in doctor_computer.state_findings(config.state) if one.check == "writing")
+    (writing,) = (one for one in environment.state_findings(config.state) if one.check == "writing")
     assert writing.level == "fail"
     assert "No space left" in writing.text
     assert writing.advice is not None
@@ -471,9 +470,9 @@ def test_a_service_that_holds_the_state_is_seen_and_not_disturbed(tmp_path: Path
     config = pair_configuration(tmp_path)
     with (tmp_path / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        (held,) = (one for one in doctor_computer.state_findings(config.state) if one.check == "lock")
+        (held,) = (one for one in environment.state_findings(config.state) if one.check == "lock")
         assert "a service runs here" in held.text
-    (free,) = (one for one in doctor_computer.state_findings(config.state) if one.check == "lock")
+    (free,) = (one for one in environment.state_findings(config.state) if one.check == "lock")
     assert "no service runs here" in free.text
 
 
@@ -487,11 +486,11 @@ def test_a_state_directory_that_cannot_be_made_fails(tmp_path: Path) -> None:
 
 def test_a_cold_cache_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
-    cold = doctor_computer.kernels_finding()
+    cold = environment.kernels_finding()
     assert (cold.level, cold.where) == ("warn", str(tmp_path))
     (tmp_path / "geometry").mkdir()
     (tmp_path / "geometry" / "kernel.nbi").write_text("")
-    assert doctor_computer.kernels_finding().level == "ok"
+    assert environment.kernels_finding().level == "ok"
 
 
 @pytest.mark.parametrize(
@@ -506,8 +505,8 @@ def test_a_cold_cache_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_a_clock_that_nobody_keeps_is_told(
     monkeypatch: pytest.MonkeyPatch, state: system.ClockState | None, level: str
 ) -> None:
-    monkeypatch.setattr(doctor_computer, "clock_state", lambda: state)
-    assert doctor_computer.clock_finding().level == level
+    monkeypatch.setattr(environment, "clock_state", lambda: state)
+    assert environment.clock_finding().level == level
 
 
 def test_the_kernel_tells_of_its_clock() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from coec.cli.doctor_streams import NAMED, StreamSamples, stream_findings, topic_findings
+from coec.cli.doctor.streams import NAMED, StreamSamples, stream_findings, topic_findings
 from coec.config import IDENTITY, Config
 from coec.io.ros.wire_format import Publisher
 from coec.io.zenoh.ros_node import RosTopicList

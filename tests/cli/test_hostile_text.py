@@ -15,7 +15,7 @@ from pydantic import BaseModel
 import coec as coec_library
 from cli.conftest import Coec, Outcome
 from coec.cli import doctor, query
-from coec.cli.doctor_connection import service_findings
+from coec.cli.doctor.environment import service_findings
 from coec.config import Config
 from coec.errors import DecodeError, RemoteError
 from coec.io.zenoh.bus import JSON, MSGPACK

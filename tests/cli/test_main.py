@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from cli.conftest import Coec
-from coec import __version__, api
-from coec.cli.main import BUILT_IN, GROUP, application
+from coec import __version__, api, extensions
+from coec.cli.main import BUILT_IN, application
 from coec.errors import UsageError
 
 COMMANDS = ("calibrate", "run", "check-config", "play", "query", "replay", "convert", "models", "demo")
@@ -73,7 +73,10 @@ def test_a_command_is_declared_without_the_others() -> None:
     everything = application(["--help", "check-config"])
     names = {each.name for each in everything.registered_commands}
     names |= {each.name for each in everything.registered_groups}
-    assert names == {*BUILT_IN, *(point.name for point in entry_points(group=GROUP) if "." not in point.name)}
+    assert names == {
+        *BUILT_IN,
+        *(point.name for point in entry_points(group=extensions.COMMANDS) if "." not in point.name),
+    }
 
 
 def test_a_mistyped_command_is_told_which_is_meant(coec: Coec) -> None:

@@ -12,7 +12,8 @@ from importlib.metadata import entry_points
 import pytest
 from rich.text import Text
 
-from coec.cli.main import BUILT_IN, GROUP, application
+from coec import extensions
+from coec.cli.main import BUILT_IN, application
 from coec.reports import console, plain_text
 
 SIGNS = "185° ± 0.3 ≥ 1 ✓ −2 σ²"
@@ -82,7 +83,7 @@ def test_help_of_everything_is_plain_where_the_locale_is_ascii() -> None:
         "    sys.argv = ['coec', *words, '--help']\n"
         "    main()\n"
     )
-    names = (*BUILT_IN, *(point.name for point in entry_points(group=GROUP)))
+    names = (*BUILT_IN, *(point.name for point in entry_points(group=extensions.COMMANDS)))
     words = [[], *(name.split(".") for name in names), ["sim", "drive"], ["sim", "matrix"]]
     environment = {"PYTHONPATH": ":".join(sys.path), "PYTHONIOENCODING": "ascii", "TERM": "dumb", "PATH": os.defpath}
     done = subprocess.run([sys.executable, "-c", code, repr(words)], capture_output=True, env=environment)

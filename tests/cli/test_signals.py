@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from coec.cli import signals
-from coec.cli.signals import no_interrupt_lost
+from coec.cli import main as command_line
+from coec.cli.main import no_interrupt_lost
 
 DEADLINE_S = 60.0
 
@@ -27,7 +27,7 @@ def _interruptible() -> Iterator[None]:
 @pytest.mark.usefixtures("_interruptible")
 def test_ctrl_c_inside_a_call_from_c_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
     # Long enough for a busy machine to return from the call before.
-    monkeypatch.setattr(signals, "LATER_S", 1.0)
+    monkeypatch.setattr(command_line, "LATER_S", 1.0)
     calls: list[int] = []
 
     def called_back() -> int:

@@ -53,7 +53,7 @@ PATIENCE_S = 60.0
 def viewing(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Outcome]:
     """Runs `coec view ARGS --json`, and `look(url)` beside it as soon as it is served; then tells it to end. What is
     done every second or other is done more often."""
-    for name in ("view_vehicle.REPEAT_S", "view_vehicle.QUERY_S", "view_recording.AGAIN_S"):
+    for name in ("view.vehicle.REPEAT_S", "view.vehicle.QUERY_S", "view.recording.AGAIN_S"):
         monkeypatch.setattr(f"coec.cli.{name}", OFTEN_S)
 
     def run(look: Callable[[str], None], *arguments: object) -> Outcome:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from cli.vehicle_on_screen import PAIR, RIG, configuration, extrinsic, health
-from coec.cli import view_vehicle
 from coec.cli.view import ListenAddress, listen_address
-from coec.cli.view_vehicle import (
+from coec.cli.view import vehicle as view_vehicle
+from coec.cli.view.vehicle import (
     DEPTHS,
     SILENT_S,
     SensorStreams,

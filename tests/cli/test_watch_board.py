@@ -15,7 +15,7 @@ import zenoh
 from rich.console import Console
 
 from cli.conftest import Coec
-from coec.cli.fleet_screen import Board, PairQuery
+from coec.cli.watch.board import Board, PairQuery
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import DecodeError
 from coec.fleet.fleet_state import FleetFilter, FleetState

@@ -87,10 +87,11 @@ def diagnose(
 
 def _detection_experiment() -> Any:
     """The module behind `--detection`, which another package registers by the entry points of `coec.experiments`."""
-    from importlib.metadata import entry_points
+    from coec.extensions import EXPERIMENTS, added_by_packages
 
-    for point in entry_points(group="coec.experiments", name="detection"):
-        return point.load()
+    experiment = added_by_packages(EXPERIMENTS).get("detection")
+    if experiment is not None:
+        return experiment()
     raise UsageError("--detection is an experiment of the laboratory: `pip install coec-lab`")
 
 

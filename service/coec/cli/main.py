@@ -1,62 +1,57 @@
 """The frame of the command line: finds the command, runs it, and turns its outcome into an exit status.
 
-A command is a function `module:function` with the parameters that Typer reads, whose docstring is its help and which
-returns the exit status. This package names its commands in `BUILT_IN`; another package adds commands by entry points of
-group `coec.commands`. Exit codes (CONTRACT, "Command line") are those of `coec.errors`. With `--json`, standard
+A command is a function with the parameters that Typer reads, whose docstring is its help and which returns the exit
+status. In this package every module beside `main` and `options`, and every folder, is a command with its name and its
+function's; or a group of commands, a `typer.Typer` that is called `app`. Another package adds commands by entry points
+(`coec.extensions`). Exit codes (CONTRACT, "Command line") are those of `coec.errors`. With `--json`, standard
 output holds one JSON document and nothing else.
 """
 
 from __future__ import annotations
 
+import _thread
 import errno
 import inspect
 import json
 import logging
 import os
 import platform
+import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from importlib import import_module
+from pkgutil import iter_modules
 from typing import Annotated, Any
 
 import typer
 
-from coec import __version__
-from coec.cli.signals import no_interrupt_lost
+from coec import __version__, cli
 from coec.errors import CoecError, ExitCode, UsageError
 from coec.reports import plain_text
 from coec.untrusted import json_printable
 
-BUILT_IN = {
-    "models": "coec.cli.models:app",
-    "fleet": "coec.cli.fleet:app",
-    "calibrate": "coec.cli.calibrate:calibrate",
-    "commission": "coec.cli.commission:commission",
-    "diagnose": "coec.cli.diagnose:diagnose",
-    "run": "coec.cli.run:run",
-    "check-config": "coec.cli.check_config:check_config",
-    "doctor": "coec.cli.doctor:doctor",
-    "play": "coec.cli.play:play",
-    "query": "coec.cli.query:query",
-    "watch": "coec.cli.watch:watch",
-    "fetch": "coec.cli.fetch:fetch",
-    "view": "coec.cli.view:view",
-    "router": "coec.cli.router:router",
-    "warmup": "coec.cli.warmup:warmup",
-    "batch": "coec.cli.batch:batch",
-    "replay": "coec.cli.replay:replay",
-    "convert": "coec.cli.convert:convert",
-    "sbom": "coec.cli.sbom:sbom",
-    "check": "coec.cli.check:check",
-    "lidars": "coec.cli.lidars:lidars",
-    "export": "coec.cli.export:export",
-}
-"""Commands of this package in the order of the help text: a function, or a `typer.Typer` with subcommands."""
+SHARED = frozenset({"main", "options"})
+"""Modules of this package that are no commands."""
 
-GROUP = "coec.commands"
-"""Group of entry points by which another package adds commands: the name, with a dot before that of a subcommand
-(`models.assess`), and `module:function` or, for a group of commands, `module:app`."""
+# fmt: off
+ORDER = (
+    "calibrate", "commission", "diagnose", "run", "check-config", "doctor", "play", "query", "watch", "fetch", "view",
+    "router", "warmup", "batch", "replay", "convert", "sbom", "check", "lidars", "export", "models", "fleet",
+)
+# fmt: on
+"""Commands that the help text lists first, in the order of the work; all others follow."""
+
+BUILT_IN = tuple(
+    sorted(
+        (module.name.replace("_", "-") for module in iter_modules(cli.__path__) if module.name not in SHARED),
+        key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER),
+    )
+)
+"""Commands of this package, known before any is imported."""
 
 DECIDING = ("numpy", "numba", "llvmlite", "onnxruntime", "opencv-python-headless", "nlopt", "eclipse-zenoh")
 """Distributions whose other versions may round, sample or order differently. Where two machines decide differently,
@@ -80,16 +75,17 @@ def application(arguments: Sequence[str]) -> typer.Typer:
     )
     app.callback(result_callback=_exit_with)(_coec)
     first = arguments[0] if arguments else ""
-    is_built_in = first in BUILT_IN
-    built_in = {first: BUILT_IN[first]} if is_built_in else BUILT_IN
-    # Of the commands here, only groups get subcommands from other packages.
-    others = {} if is_built_in and not BUILT_IN[first].endswith(":app") else _added_commands()
-    if is_built_in or first in others:
-        built_in = built_in if is_built_in else {}
-        others = {name: load for name, load in others.items() if first in (name, name.partition(".")[0])}
     commands: dict[str, Any] = {}
-    for name, target in built_in.items():
-        commands[name] = _add(app, name, _load(target), None)
+    if first in BUILT_IN:
+        commands[first] = _add(app, first, _command(first), None)
+        # Of the commands here, only groups get subcommands from other packages.
+        others = {} if commands[first] is None else _added_commands()
+    else:
+        others = _added_commands()
+    if first in BUILT_IN or first in others:
+        others = {name: load for name, load in others.items() if first in (name, name.partition(".")[0])}
+    else:
+        commands = {name: _add(app, name, _command(name), None) for name in BUILT_IN}
     for name in sorted(others, key=lambda name: "." in name):  # groups before what is added to them
         group, _, subcommand = name.rpartition(".")
         if not group:
@@ -99,16 +95,18 @@ def application(arguments: Sequence[str]) -> typer.Typer:
     return app
 
 
-def _load(target: str) -> Any:
-    module, _, name = target.partition(":")
-    return getattr(import_module(module), name)
+def _command(name: str) -> Any:
+    """The command in a module of this package: a function, or a group."""
+    own = name.replace("-", "_")
+    module = import_module(f"{cli.__name__}.{own}")
+    return module.app if hasattr(module, "app") else getattr(module, own)
 
 
 def _added_commands() -> dict[str, Callable[[], Any]]:
     """What other packages add, by name: functions that load the commands."""
-    from importlib.metadata import entry_points
+    from coec.extensions import COMMANDS, added_by_packages  # reads the metadata of all packages, which takes long
 
-    return {point.name: point.load for point in entry_points(group=GROUP)}
+    return added_by_packages(COMMANDS)
 
 
 def _add(app: typer.Typer, name: str, command: Any, panel: str | None) -> typer.Typer | None:
@@ -225,6 +223,36 @@ def main() -> int:
             _print_error("internal", f"{type(error).__name__}: {error}")
         return ExitCode.FAULT
     return 0
+
+
+LATER_S = 0.05
+"""Delay until a lost Ctrl-C is sent again: by then the call that lost it has returned, or it loses it again."""
+
+
+@contextmanager
+def no_interrupt_lost() -> Iterator[None]:
+    """Sends a lost Ctrl-C again a moment later. Python drops a Ctrl-C, with a traceback, if it arrives in a callback
+    from C, for example from the compiler."""
+    before = sys.unraisablehook
+
+    def resend(what: sys.UnraisableHookArgs) -> None:
+        if issubclass(what.exc_type, KeyboardInterrupt):
+            # No `threading.Timer`: its start waits for its thread, and an interrupt within this hook is lost for good.
+            _thread.start_new_thread(_interrupt_later, (threading.get_ident(),))
+        else:
+            before(what)
+
+    sys.unraisablehook = resend
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
+def _interrupt_later(thread: int) -> None:
+    time.sleep(LATER_S)
+    # A signal rather than `interrupt_main`, which does not wake a waiting thread.
+    signal.pthread_kill(thread, signal.SIGINT)
 
 
 def _unread() -> int:

@@ -1,4 +1,5 @@
-"""Options of several commands, and what they stand for: the options of a calibration, a service, a pair.
+"""What several commands share: options, what these stand for (a calibration, a service, a pair), and the end by a
+signal.
 
 Each option is declared once, here or in the module of its only command; the options of a calibration are made from
 their list, `coec.calibration_options`. Every command imports this module, so it imports nothing heavy at its top.
@@ -7,16 +8,21 @@ their list, `coec.calibration_options`. Every command imports this module, so it
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from coec.calibration_options import Entry, entries
-from coec.errors import UsageError
+from coec.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from coec.config import Config, PairConfig
@@ -245,3 +251,35 @@ Faults = Annotated[
         metavar="FAULT",
     ),
 ]
+
+
+@contextmanager
+def until_signal() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set, so that a command can withdraw what it announced before it ends."""
+    stop = threading.Event()
+
+    def receive(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, receive) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def success_on_sigterm() -> Iterator[None]:
+    """Ends the process with success on SIGTERM while a service is loaded, before it handles signals itself. The first
+    process of a container has no default for a signal: the kernel would drop it, and the engine would wait for nothing.
+    """
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        sys.exit(ExitCode.SUCCESS)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from coec.cli.options import Connect, Json, Source
-from coec.cli.signals import until_signal
+from coec.cli.options import Connect, Json, Source, until_signal
 from coec.errors import DecodeError, SourceError, UsageError
 
 if TYPE_CHECKING:

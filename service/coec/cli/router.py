@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from coec.cli.signals import success_on_sigterm, until_signal
+from coec.cli.options import success_on_sigterm, until_signal
 
 _log = logging.getLogger(__name__)
 

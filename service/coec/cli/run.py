@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coec.cli.options import ConfigFile
-from coec.cli.signals import success_on_sigterm
+from coec.cli.options import ConfigFile, success_on_sigterm
 
 if TYPE_CHECKING:
     from coec.config import Config

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 from urllib.parse import parse_qsl
@@ -14,6 +13,7 @@ from urllib.parse import parse_qsl
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 from coec.config import CalibrationConfig
 from coec.errors import UsageError
+from coec.extensions import SOURCES, added_by_packages
 from coec.io.user_files import expand_home
 
 SensorMessage = CameraFrame | LidarFrame | EgoMotion
@@ -206,8 +206,9 @@ def installed_layout(name: str) -> Any:
     Raises:
         UsageError: no installed package reads such sources.
     """
-    for point in entry_points(group="coec.sources", name=name):
-        return point.load()
+    load = added_by_packages(SOURCES).get(name)
+    if load is not None:
+        return load()
     raise UsageError(f"sources of the form `{name}:` come with the laboratory: `pip install coec-lab`")
 
 

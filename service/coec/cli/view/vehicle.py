@@ -16,7 +16,7 @@ import zenoh
 
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import FramePair, Matrix4, Rig
-from coec.cli.view_recording import EXPLANATIONS, STALE, axes_of, figures_of
+from coec.cli.view.recording import EXPLANATIONS, STALE, axes_of, figures_of
 from coec.config import Config, PairConfig
 from coec.errors import DecodeError
 from coec.geometry.se3 import is_rigid

@@ -12,8 +12,7 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from coec.cli.options import ServiceAddress
-from coec.cli.signals import until_signal
+from coec.cli.options import ServiceAddress, until_signal
 from coec.errors import CoecError, UsageError
 from coec.fleet.fleet_state import RANKS, FleetFilter, FleetState, PairName, parse_states
 from coec.io.system import pressed_keys as keyboard

@@ -12,8 +12,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coec.cli.options import Connect, Prefix, RouterTimeout, ServiceAddress, ServiceConfig, SessionFile, service_address
-from coec.cli.signals import until_signal
+from coec.cli.options import (
+    Connect,
+    Prefix,
+    RouterTimeout,
+    ServiceAddress,
+    ServiceConfig,
+    SessionFile,
+    service_address,
+    until_signal,
+)
 from coec.errors import UsageError
 
 if TYPE_CHECKING:
@@ -67,7 +75,7 @@ def watch(
     In a terminal: r reasons, h history, o overlay of the chosen pair, f filter, q quit. If the output is no terminal: a
     line for each change of health, extrinsic and presence of one vehicle.
     """
-    from coec.cli.fleet_screen import show_fleet
+    from coec.cli.watch.board import show_fleet
 
     of_board = once or bool(states) or bool(find)
     of_lines = lines or seconds is not None

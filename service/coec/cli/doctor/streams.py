@@ -18,8 +18,7 @@ import numpy as np
 import zenoh
 
 from coec.calibration.types import CameraFrame, LidarFrame
-from coec.cli.doctor_computer import fail, ok, warn
-from coec.cli.doctor_connection import cause_of_silence
+from coec.cli.doctor.environment import cause_of_silence, fail, ok, warn
 from coec.config import CameraMessage, Config, EgoMessage, LidarMessage, PairConfig
 from coec.errors import DecodeError
 from coec.io.depth.depth_maps import STEREO

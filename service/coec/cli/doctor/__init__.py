@@ -64,44 +64,44 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
 
     What cannot be examined because the configuration is broken is left out.
     """
-    import coec.cli.doctor_computer as computer
-    import coec.cli.doctor_connection as connection
-    from coec.cli.doctor_computer import warn
+    from coec.cli.doctor import environment
     from coec.io.zenoh.bus import closed
 
     config, finding = _configuration(path)
     yield finding
-    yield computer.clock_finding()
-    yield computer.kernels_finding()
+    yield environment.clock_finding()
+    yield environment.kernels_finding()
     if config is None:
         return
     yield from _networks(config)
-    yield from computer.state_findings(config.state)
-    yield from connection.certificate_findings(config)
-    reached = list(connection.router_findings(config))
+    yield from environment.state_findings(config.state)
+    yield from environment.certificate_findings(config)
+    reached = list(environment.router_findings(config))
     yield from reached
     if not any(one.check == "router" and one.level == "ok" for one in reached):
         return
-    client = connection.session_of_client(config)
-    yield connection.session_finding(config, client)
+    client = environment.session_of_client(config)
+    yield environment.session_finding(config, client)
     if client is None:
         return
     with ExitStack() as sessions:
-        sessions.callback(closed, client, connection.CLOSE_S)
-        yield connection.mode_finding(config)
-        session = connection.session_as_of_service(config)
+        sessions.callback(closed, client, environment.CLOSE_S)
+        yield environment.mode_finding(config)
+        session = environment.session_as_of_service(config)
         if session is None:
-            yield warn("rules", config.vehicle, "the router accepts one session, not two", "raise its `max_sessions`")
+            yield environment.warn(
+                "rules", config.vehicle, "the router accepts one session, not two", "raise its `max_sessions`"
+            )
             return
-        sessions.callback(closed, session, connection.CLOSE_S)
-        yield connection.rules_finding(config, session, client)
+        sessions.callback(closed, session, environment.CLOSE_S)
+        yield environment.rules_finding(config, session, client)
         yield from _received(config, session, client, seconds)
-        yield from connection.service_findings(client, config)
+        yield from environment.service_findings(client, config)
 
 
 def _received(config: Config, session: zenoh.Session, client: zenoh.Session, seconds: float) -> Iterator[Finding]:
     """Findings on what a session as that of the service receives, compared with a client of the same router."""
-    import coec.cli.doctor_streams as streams
+    from coec.cli.doctor import streams
     from coec.io.zenoh.ros_node import RosSide
     from coec.reports import console
     from coec.reports.formatting import count
@@ -125,7 +125,7 @@ def _received(config: Config, session: zenoh.Session, client: zenoh.Session, sec
 
 def _configuration(path: Path) -> tuple[Config | None, Finding]:
     """The configuration, if a service could start with it, and the finding on it."""
-    from coec.cli.doctor_computer import fail, ok
+    from coec.cli.doctor.environment import fail, ok
     from coec.config import load_config
     from coec.io.rig_files import check_given, rig_of
     from coec.io.zenoh.endpoints import Endpoint
@@ -151,7 +151,7 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
 
 def _undiscovered(pair: OpenPairConfig, there: RosTopicList) -> Finding:
     """The finding on a pair whose nominal calibration no service has discovered yet."""
-    from coec.cli.doctor_computer import warn
+    from coec.cli.doctor.environment import warn
 
     absent = (there.absent(stream.topic, stream.types) for stream in pair.streams.values() if stream.topic)
     missing = [sentence for sentence in absent if sentence is not None]
@@ -161,7 +161,7 @@ def _undiscovered(pair: OpenPairConfig, there: RosTopicList) -> Finding:
 
 def _networks(config: Config) -> Iterator[Finding]:
     """Findings on the depth networks, each once."""
-    from coec.cli.doctor_computer import fail, ok
+    from coec.cli.doctor.environment import fail, ok
     from coec.io.depth.depth_maps import open_depth
 
     for depth in dict.fromkeys(pair.calibration.depth for pair in config.every_pair):
