@@ -11,7 +11,7 @@ from statistics import mean
 import pytest
 
 from coec.config import BudgetConfig
-from coec.service.cpu_budget import BUCKET_DEPTH_S, CHECKS_SHARE, CheckScheduler, Debt, TokenBucket
+from coec.service.cpu_budget import BUCKET_DEPTH_S, CHECKS_SHARE, CheckScheduler, CpuBucket, Debt
 
 S = 1_000_000_000
 FRAME_S = 0.5
@@ -269,25 +269,25 @@ def test_a_clock_that_jumps_earns_nothing_and_stops_nobody(jump_s: float) -> Non
 
 
 def test_a_freak_is_no_debt_for_an_hour() -> None:
-    store = TokenBucket(0.5)
+    store = CpuBucket(0.5)
     store.pay(500.0, usual_s=0.1)
-    assert store.level_s == pytest.approx(-2 * BUCKET_DEPTH_S * 0.5)
+    assert store.level == pytest.approx(-2 * BUCKET_DEPTH_S * 0.5)
     store.pay(1.0, usual_s=0.1)
-    assert store.level_s == pytest.approx(-2 * BUCKET_DEPTH_S * 0.5), "nor does the next one make it larger"
-    dear = TokenBucket(0.1)
+    assert store.level == pytest.approx(-2 * BUCKET_DEPTH_S * 0.5), "nor does the next one make it larger"
+    dear = CpuBucket(0.1)
     dear.pay(30.0, usual_s=30.0)
-    assert dear.level_s == pytest.approx(1.0 - 30.0), "what is usual is paid in full"
+    assert dear.level == pytest.approx(1.0 - 30.0), "what is usual is paid in full"
 
 
 def test_windows_are_paid_in_instalments() -> None:
-    store, debt = TokenBucket(0.5), Debt(over_s=100.0, owed_s=10.0)
-    store.level_s = 0.0
+    store, debt = CpuBucket(0.5), Debt(over_s=100.0, owed_s=10.0)
+    store.level = 0.0
     store.earn(1.0, [debt])
-    assert store.level_s == pytest.approx(0.4, abs=0.01)
+    assert store.level == pytest.approx(0.4, abs=0.01)
     assert debt.owed_s == pytest.approx(9.9, abs=0.01)
     debt.owed_s = 1000.0
     store.earn(2.0, [debt])
-    assert store.level_s == pytest.approx(0.4 + 0.125, abs=0.01), "looks have a quarter, whatever windows cost"
+    assert store.level == pytest.approx(0.4 + 0.125, abs=0.01), "looks have a quarter, whatever windows cost"
 
 
 def test_another_budget_holds_at_once() -> None:

@@ -36,7 +36,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from coec.config import BudgetConfig, MonitorConfig, WindowConfig
-from coec.service.timing import DriveClock
+from coec.service.timing import DriveClock, TokenBucket
 from coec.service.worker import worker_jobs
 from coec.service.worker.worker_jobs import Cost
 
@@ -98,40 +98,34 @@ class Debt:
     next_s: float = 0.0
 
 
-class TokenBucket:
-    """The store of the whole service. It begins full."""
+class CpuBucket(TokenBucket):
+    """Processor time of the whole service, s."""
 
     def __init__(self, cores: float) -> None:
         """`cores`: processor time that is earned per second."""
+        super().__init__(BUCKET_DEPTH_S * cores)
         self._cores = cores
-        self._now_s = 0.0
-        self.level_s = self.depth_s
-
-    @property
-    def depth_s(self) -> float:
-        """Largest level of the store, and largest debt, s."""
-        return BUCKET_DEPTH_S * self._cores
 
     def reconfigure(self, cores: float) -> None:
         """Sets another budget. What is in store stays, up to the new depth."""
-        self._cores = cores
-        self.level_s = min(self.level_s, self.depth_s)
+        self._cores, self.depth = cores, BUCKET_DEPTH_S * cores
+        self.add(0.0)
 
     def earn(self, now_s: float, debts: list[Debt]) -> None:
         """Time has come to `now_s`: pays the instalments due from what was earned since the last call, and stores the
         rest."""
-        passed_s, self._now_s = max(now_s - self._now_s, 0.0), max(now_s, self._now_s)
+        passed_s = self.advance(now_s)
         earned_s = self._cores * passed_s
         due_s = [max(debt.owed_s + debt.next_s, 0.0) * -math.expm1(-passed_s / debt.over_s) for debt in debts]
         paid_s = min(sum(due_s), (1.0 - CHECKS_SHARE) * earned_s)
         for debt, part_s in zip(debts, due_s, strict=True):
             debt.owed_s -= part_s * paid_s / sum(due_s) if paid_s else 0.0
-        self.level_s = min(self.level_s + earned_s - paid_s, self.depth_s)
+        self.add(earned_s - paid_s)
 
     def pay(self, cpu_s: float, usual_s: float) -> None:
         """Pays for a look. An exceptionally dear one leaves a debt of at most twice the depth, or the usual price if
         that is more."""
-        self.level_s = max(self.level_s - cpu_s, min(self.level_s, -max(2.0 * self.depth_s, usual_s)))
+        self.level = max(self.level - cpu_s, min(self.level, -max(2.0 * self.depth, usual_s)))
 
 
 SEEN_PERIODS = 6
@@ -186,7 +180,7 @@ class CheckScheduler:
     def __init__(self, cores: float) -> None:
         self._cores = cores
         self._clock = DriveClock()
-        self._bucket = TokenBucket(cores)
+        self._bucket = CpuBucket(cores)
         self._pairs: dict[str, _PairBudget] = {}
         self._windows_until_s = 0.0
 
@@ -217,7 +211,7 @@ class CheckScheduler:
         others = [each for each in self._pairs if each != name and self._waits(each)]
         ahead_s = sum(self._check_s(self._pairs[each]) for each in others if self._claim(each, now_s) > claim)
         in_hand_s = sum(each.in_hand * self._check_s(each) for each in self._pairs.values() if each.in_hand)
-        if self._bucket.level_s - in_hand_s - ahead_s < (-self._bucket.depth_s if suspected else 0.0):
+        if self._bucket.level - in_hand_s - ahead_s < (-self._bucket.depth if suspected else 0.0):
             return False
         pair.started_s, pair.waits = now_s, False
         pair.in_hand += 1
@@ -279,7 +273,7 @@ class CheckScheduler:
     @property
     def in_store_s(self) -> float:
         """Processor time in store; negative: borrowed."""
-        return self._bucket.level_s
+        return self._bucket.level
 
     def shares(self) -> Mapping[str, Share]:
         """What each pair takes."""

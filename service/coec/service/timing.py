@@ -1,11 +1,8 @@
-"""Time: the sensor time while no sample comes, one clock of driving for all pairs, and histograms of how long things
-took, from which the latencies of `metrics` are made. Sensor time is extrapolated because a slice must end even when
-the streams have stopped. The clock of driving shows the stamps of the pair that is farthest ahead; the processor
-budget is earned by it. A replay at ten times the pace of the drive therefore earns and spends ten times as much per
-second, and makes the same checks as the drive did, on any machine that keeps up.
-
-The budget is earned by this clock. A replay at ten times the pace of the drive therefore earns and spends ten times as
-much per second, and makes the same checks as the drive did, on any machine that keeps up.
+"""Time: the sensor time while no sample comes, one clock of driving for all pairs, histograms of how long things took,
+from which the latencies of `metrics` are made, and token buckets, which limit rates. Sensor time is extrapolated because
+a slice must end even when the streams have stopped. The clock of driving shows the stamps of the pair that is farthest
+ahead; the processor budget is earned by it. A replay at ten times the pace of the drive therefore earns and spends ten
+times as much per second, and makes the same checks as the drive did, on any machine that keeps up.
 """
 
 from __future__ import annotations
@@ -29,6 +26,34 @@ SILENT_GAPS = 3.0
 """The silence must also last this many times the longest recent pause, because a slow replay is not silent."""
 
 MAX_RATIO = 1000.0
+
+
+class TokenBucket:
+    """A level that time fills at a constant rate, up to a depth. It begins full. What is taken may leave a debt: the
+    level is then below zero until time has paid it back.
+
+    Attributes:
+        depth: largest level.
+        level: tokens in the bucket when it was last filled.
+    """
+
+    def __init__(self, depth: float, now_s: float = 0.0) -> None:
+        self.depth = self.level = depth
+        self._now_s = now_s
+
+    def fill(self, now_s: float, rate: float) -> float:
+        """Time has come to `now_s`: adds `rate` tokens for each second since the last call, and returns the level."""
+        return self.add(self.advance(now_s) * rate)
+
+    def advance(self, now_s: float) -> float:
+        """Seconds since the last call; 0 if the clock went back."""
+        passed_s, self._now_s = max(now_s - self._now_s, 0.0), max(now_s, self._now_s)
+        return passed_s
+
+    def add(self, tokens: float) -> float:
+        """Adds tokens, up to the depth, and returns the level."""
+        self.level = min(self.level + tokens, self.depth)
+        return self.level
 
 
 class SensorClock:

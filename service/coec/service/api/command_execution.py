@@ -6,13 +6,6 @@ a bucket of tokens that is filled at a constant rate. A sender whose name is aut
 else draws from. All other senders are known only by the attachments of their queries, which anyone may write. So
 the number of their buckets is bounded, and those without one share a common bucket. A sender who invents a new name
 for each command ends up in the common one.
-
-A sender who has proven his name has a bucket that nobody else draws from. All other senders are known only by the
-attachments of their queries, which anyone may write. So the number of their buckets is bounded, and those without one
-share a common bucket. A sender who invents a new name for each command ends up in the common one.
-
-A sensor has no extrinsic of its own: what a command holds, puts back or accepts is what the sensor's pairs serve. So a
-command for a sensor is given to each of its pairs in turn, and the thread that decides about the pair carries it out.
 """
 
 from __future__ import annotations
@@ -23,7 +16,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -47,6 +39,7 @@ from coec.service.recording.recorder import Recorder
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.pair_store import MIN_HASH, PairStore
 from coec.service.task_queue import BusyError, TaskQueue
+from coec.service.timing import TokenBucket
 
 BURST = 20
 """How many commands may come at once: more than a person gives in a row, or a script that uses every command."""
@@ -59,12 +52,6 @@ SENDERS = 64
 """How many senders have their own bucket: some 10 kB."""
 
 
-@dataclass(slots=True)
-class _CommandBucket:
-    tokens: float
-    at_s: float
-
-
 class RateLimit:
     """The rate limit of one pair. Safe to use from several threads."""
 
@@ -72,45 +59,38 @@ class RateLimit:
         """`clock`: a clock in seconds."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._reserved: dict[str, _CommandBucket] = {}
-        self._buckets: dict[str, _CommandBucket] = {}
-        self._others = _CommandBucket(BURST, clock())
+        self._reserved: dict[str, TokenBucket] = {}
+        self._buckets: dict[str, TokenBucket] = {}
+        self._others = TokenBucket(BURST, clock())
 
     def reserve_for(self, proven: Iterable[str]) -> None:
         """Gives these proven senders, and no others, buckets of their own for good. A sender who had one keeps its
         content."""
         with self._lock:
             before, now_s = self._reserved, self._clock()
-            self._reserved = {sender: before.get(sender, _CommandBucket(BURST, now_s)) for sender in proven}
+            self._reserved = {sender: before.get(sender, TokenBucket(BURST, now_s)) for sender in proven}
 
     def take(self, sender: str) -> float:
         """0 if `sender` may give a command now, which is then counted; else how many seconds he has to wait."""
         with self._lock:
             now_s = self._clock()
             bucket = self._bucket_of(sender, now_s)
-            bucket.tokens = _filled(bucket, now_s)
-            bucket.at_s = now_s
-            if bucket.tokens < 1.0:
-                return (1.0 - bucket.tokens) / PER_S
-            bucket.tokens -= 1.0
+            if bucket.fill(now_s, PER_S) < 1.0:
+                return (1.0 - bucket.level) / PER_S
+            bucket.level -= 1.0
             return 0.0
 
-    def _bucket_of(self, sender: str, now_s: float) -> _CommandBucket:
+    def _bucket_of(self, sender: str, now_s: float) -> TokenBucket:
         if sender in self._reserved:
             return self._reserved[sender]
         if sender not in self._buckets and len(self._buckets) >= SENDERS:
             # A sender whose bucket is full again is treated like a new one, so his bucket can go.
-            self._buckets = {name: held for name, held in self._buckets.items() if _filled(held, now_s) < BURST}
+            self._buckets = {name: held for name, held in self._buckets.items() if held.fill(now_s, PER_S) < BURST}
         if sender not in self._buckets:
             if len(self._buckets) >= SENDERS:
                 return self._others
-            self._buckets[sender] = _CommandBucket(BURST, now_s)
+            self._buckets[sender] = TokenBucket(BURST, now_s)
         return self._buckets[sender]
-
-
-def _filled(bucket: _CommandBucket, now_s: float) -> float:
-    """Tokens in the bucket by now."""
-    return min(BURST, bucket.tokens + (now_s - bucket.at_s) * PER_S)
 
 
 _log = logging.getLogger(__name__)

@@ -19,6 +19,7 @@ from coec.schemas.keys import MAX_LENGTH, Format, Keys
 from coec.schemas.replies import Maybe6, Vector6
 from coec.service.api.pair_answers import PairAnswers, PendingPairAnswers
 from coec.service.api.reply_builders import answer_of
+from coec.service.timing import TokenBucket
 
 ServiceState = Literal["starting", "running", "stopping", "failing"]
 
@@ -150,15 +151,14 @@ class Uplink:
         self._clock = clock
         self._lock = threading.Lock()
         self._rate = config.evidence_bytes_per_s
-        self._bytes = float(BURST_BYTES)
-        self._at_s = clock()
+        self._bucket = TokenBucket(float(BURST_BYTES), clock())
         self._sent: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
 
     def reconfigure(self, config: UplinkConfig) -> None:
         """Keeps to this rate from now on."""
         with self._lock:
-            self._fill()
+            self._bucket.fill(self._clock(), self._rate)
             self._rate = config.evidence_bytes_per_s
 
     @property
@@ -180,21 +180,16 @@ class Uplink:
             UplinkBusyError: it may not go out now; the message says how long to wait.
         """
         with self._lock:
-            self._fill()
-            if self._bytes <= 0.0:
+            level = self._bucket.fill(self._clock(), self._rate)
+            if level <= 0.0:
                 self._refused[resource] += 1
-                wait_s = max(-self._bytes / self._rate, 0.1)
+                wait_s = max(-level / self._rate, 0.1)
                 raise UplinkBusyError(
                     f"{self._rate} bytes of evidence a second go out (`uplink.evidence_bytes_per_s`): ask again in "
                     f"{wait_s:.1f} s"
                 )
         answer = make()
         with self._lock:
-            self._bytes -= len(answer.payload)
+            self._bucket.level -= len(answer.payload)
             self._sent[resource] += len(answer.payload)
         return answer
-
-    def _fill(self) -> None:
-        now_s = self._clock()
-        self._bytes = min(float(BURST_BYTES), self._bytes + (now_s - self._at_s) * self._rate)
-        self._at_s = now_s
