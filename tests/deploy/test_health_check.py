@@ -13,9 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from coec.io.http_server import HttpResponse, HttpServer
 from coec.io.system import ServiceManagerNotifier
-from coec.service.api.metrics_server import pages
+from coec.service.api.metrics_server import HttpResponse, HttpServer, pages
 from deploy.written import DEPLOY, compose, stages
 from service.api.test_metrics import a_busy_status, a_health
 from support.router import free_port

@@ -1,8 +1,8 @@
 """Time: the sensor time while no sample comes, one clock of driving for all pairs, histograms of how long things took,
-from which the latencies of `metrics` are made, and token buckets, which limit rates. Sensor time is extrapolated because
-a slice must end even when the streams have stopped. The clock of driving shows the stamps of the pair that is farthest
-ahead; the processor budget is earned by it. A replay at ten times the pace of the drive therefore earns and spends ten
-times as much per second, and makes the same checks as the drive did, on any machine that keeps up.
+from which the latencies of `metrics` are made, and token buckets, which limit rates. Sensor time is extrapolated
+because a slice must end even when the streams have stopped. The clock of driving shows the stamps of the pair that is
+farthest ahead; the processor budget is earned by it. A replay at ten times the pace of the drive therefore earns and
+spends ten times as much per second, and makes the same checks as the drive did, on any machine that keeps up.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from coec.errors import UnavailableError
-from coec.io import http_server as served
-from coec.io.http_server import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpRequest, HttpResponse, HttpServer
+from coec.service.api import metrics_server as served
+from coec.service.api.metrics_server import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpRequest, HttpResponse, HttpServer
 from support.fake_worker import wait_until
 from support.router import free_port
 
@@ -145,8 +145,8 @@ def test_slow_clients_keep_nobody_waiting(
         assert _ends(client)
         client.close()
     # The client of /page has its answer before the server's thread drops its connection.
-    wait_until(lambda: server._connections == [], "the end of the last connection", PATIENCE_S)
-    assert server._connections == []
+    wait_until(lambda: server._connections == {}, "the end of the last connection", PATIENCE_S)
+    assert server._connections == {}
 
 
 @pytest.mark.fault("a client of the HTTP page that reads nothing", "it is dropped, and nothing is kept for it")
@@ -154,7 +154,7 @@ def test_who_reads_nothing_is_dropped(server: HttpServer, monkeypatch: pytest.Mo
     monkeypatch.setattr(served, "DEADLINE_S", 0.3)
     with opened(server, b"GET /endless HTTP/1.1\r\n\r\n") as client:
         assert client.recv(15) == b"HTTP/1.1 200 OK"
-        wait_until(lambda: server._connections == [], "the end of a connection that is not read", PATIENCE_S)
+        wait_until(lambda: server._connections == {}, "the end of a connection that is not read", PATIENCE_S)
         assert _received(client) < len(ENDLESS)
 
 

@@ -12,9 +12,8 @@ import pytest
 from pydantic import ValidationError
 
 from coec.config import MetricsConfig
-from coec.io.http_server import HttpRequest, HttpResponse
 from coec.service.api.metrics import TextFormat
-from coec.service.api.metrics_server import MetricsServer, accepted_format, pages
+from coec.service.api.metrics_server import HttpRequest, HttpResponse, MetricsServer, accepted_format, pages
 from coec.service.api.problems import RouterMonitor
 from service.api.test_metrics import a_busy_status, a_health
 from support.router import free_port
