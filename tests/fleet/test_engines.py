@@ -12,9 +12,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from coec.fleet.evaluator import ReplaySettings
 from coec.fleet.jobs import Job
 from coec.fleet.local_engine import LocalEngine
-from coec.fleet.replay_settings import ReplaySettings
 from coec.fleet.worker_pool import DEADLINE, PROCESS_DIED, TOO_LARGE, Engine, WorkerLimits
 from coec.io.mcap.window_reader import read_result
 from coec.schemas.message import to_json

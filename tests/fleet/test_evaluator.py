@@ -10,9 +10,8 @@ import pytest
 
 from coec.config import CalibrationConfig
 from coec.errors import ConfigError, UsageError
-from coec.fleet.evaluator import WindowEvaluator
+from coec.fleet.evaluator import ReplaySettings, WindowEvaluator, load_settings
 from coec.fleet.jobs import Job
-from coec.fleet.replay_settings import ReplaySettings, load_settings
 from coec.io.mcap.window_reader import read_result, read_vehicle
 from coec.schemas.message import to_json
 from support.fleet import WINDOW_CONFIGURATION

@@ -13,9 +13,8 @@ import pytest
 from coec.errors import OutputError, SourceError, UsageError
 from coec.fleet import batch, tables
 from coec.fleet.batch import BatchFolder
-from coec.fleet.evaluator import WindowEvaluator
+from coec.fleet.evaluator import ReplaySettings, WindowEvaluator
 from coec.fleet.jobs import Job, empty_row, lost_row
-from coec.fleet.replay_settings import ReplaySettings
 from coec.fleet.worker_pool import FleetError
 from coec.io import storage
 from coec.schemas.fleet import WindowRow

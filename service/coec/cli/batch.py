@@ -88,8 +88,8 @@ def batch(
 ) -> int:
     """Evaluate many windows again: exit 0 if every one has a result, 1 if not."""
     from coec.fleet import batch as fleet_batch
+    from coec.fleet.evaluator import load_settings
     from coec.fleet.jobs import jobs_of
-    from coec.fleet.replay_settings import load_settings
     from coec.fleet.worker_pool import WorkerLimits
     from coec.reports import console
 

@@ -19,8 +19,8 @@ from pathlib import Path
 
 from coec.errors import DecodeError, OutputError, UsageError
 from coec.fleet import tables
+from coec.fleet.evaluator import ReplaySettings
 from coec.fleet.jobs import Job
-from coec.fleet.replay_settings import ReplaySettings
 from coec.fleet.tables import optional_library
 from coec.fleet.worker_pool import Engine
 from coec.io import storage, user_files

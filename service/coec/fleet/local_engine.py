@@ -10,9 +10,8 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import cast
 
-from coec.fleet.evaluator import WindowEvaluator
+from coec.fleet.evaluator import ReplaySettings, WindowEvaluator
 from coec.fleet.jobs import Job
-from coec.fleet.replay_settings import ReplaySettings
 from coec.fleet.worker_pool import (
     PROCESS_DIED,
     TOO_LARGE,

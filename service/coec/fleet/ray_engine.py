@@ -18,8 +18,8 @@ from typing import Any, cast
 
 from coec import __version__
 from coec.errors import SourceError
+from coec.fleet.evaluator import ReplaySettings, WindowEvaluator
 from coec.fleet.jobs import Job, StoreCredentials, failed_row, is_path, stores_of
-from coec.fleet.replay_settings import ReplaySettings
 from coec.fleet.worker_pool import (
     NODE_LOST,
     NOT_ON_NODE,
@@ -67,8 +67,6 @@ class _Judge:
 
     def __init__(self, settings: str, credentials: StoreCredentials) -> None:
         credentials.install()  # before the clients of stores are imported, which may read them then
-        from coec.fleet.evaluator import WindowEvaluator  # only the nodes need what calibrates
-
         self._evaluator = WindowEvaluator(ReplaySettings.model_validate_json(settings))
 
     def versions(self) -> tuple[str, str]:

@@ -26,8 +26,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from coec.errors import CoecError, ModelError
+from coec.fleet.evaluator import ReplaySettings
 from coec.fleet.jobs import Job, StoreError, lost_row
-from coec.fleet.replay_settings import ReplaySettings
 from coec.schemas.fleet import WindowRow
 
 PROCESS_DIED, DEADLINE, TOO_LARGE = "process_died", "deadline", "memory_exceeded"
