@@ -12,8 +12,9 @@ ARG PYTHON=python:3.11.16-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19
 
 FROM ${PYTHON} AS build
 WORKDIR /build
-COPY requirements.lock ./
+COPY requirements.lock requirements-release.lock ./
 RUN pip download --quiet --require-hashes --requirement requirements.lock --dest packages
+RUN python -m venv release && release/bin/pip install --quiet --require-hashes --requirement requirements-release.lock
 RUN python -m venv tools && tools/bin/pip install --quiet --no-index --find-links packages hatchling
 COPY pyproject.toml README.md LICENSE ./
 COPY service service
@@ -27,7 +28,8 @@ RUN tools/bin/hatchling build --target wheel --directory dist \
     && find /opt/coec/lib -type d -name __pycache__ -prune -exec rm -rf {} + \
     && /opt/coec/bin/python -m compileall -q --invalidation-mode unchecked-hash /opt/coec/lib
 # What is in the image, under which licences: /opt/coec/sbom/coec.cdx.json (CycloneDX) and licences.md.
-RUN /opt/coec/bin/coec sbom --lock requirements.lock --output /opt/coec/sbom
+COPY deploy/bill-of-materials ./
+RUN PATH="$PWD/release/bin:$PATH" ./bill-of-materials /opt/coec/bin/python /opt/coec/sbom
 RUN packages="$(echo /opt/coec/lib/python3.*/site-packages)" && mkdir -p "/own$packages" /own/opt/coec/bin \
     && mv "$packages"/coec "$packages"/coec-*.dist-info "/own$packages" \
     && mv /opt/coec/bin/coec /own/opt/coec/bin && mv /opt/coec/sbom /own/opt/coec

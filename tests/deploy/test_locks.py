@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import platform
 import re
 import shutil
 import subprocess
+import sys
 import tomllib
+from importlib import metadata
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -14,12 +17,14 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from coec.io.installed_packages import pinned_hashes
 from conftest import REPOSITORY
 
 LOCK, DOCS, CHECKS = LOCKS = tuple(
     REPOSITORY / name for name in ("requirements.lock", "requirements-docs.lock", "requirements-checks.lock")
 )
+RELEASE = REPOSITORY / "requirements-release.lock"
+"""For an environment of its own, so that it pins some packages that others pin, too."""
+
 EXTRAS = ("fleet", "foxglove", "lidars")
 """Those that commands of the pages need. Stores, Ray and training are installed by who has them."""
 
@@ -27,6 +32,15 @@ EXTRAS = ("fleet", "foxglove", "lidars")
 @pytest.fixture(scope="module")
 def project() -> Any:
     return tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+
+
+def pinned_hashes(lock: Path) -> dict[tuple[str, str], list[str]]:
+    """sha256 of the archives, by canonical name and version."""
+    pins = re.findall(r"^([A-Za-z0-9._-]+)==(\S+)(.*(?:\n .*)*)", lock.read_text(), re.MULTILINE)
+    return {
+        (canonicalize_name(name), version): re.findall(r"--hash=sha256:([0-9a-f]{64})\b", rest)
+        for name, version, rest in pins
+    }
 
 
 def pinned(lock: Path) -> dict[str, str]:
@@ -71,7 +85,43 @@ def test_what_the_site_and_the_checks_need_is_pinned_beside_it_and_nothing_twice
     assert missing(["pytest"], LOCK, DOCS), "who only reads fetches no checks"
 
 
-@pytest.mark.parametrize("lock", LOCKS, ids=lambda lock: lock.stem)
+def test_what_lists_the_packages_of_an_image_is_pinned(project: Any) -> None:
+    assert missing(project["dependency-groups"]["release"], RELEASE) == []
+
+
+def needed(name: str, extras: frozenset[str] = frozenset()) -> set[str]:
+    """Canonical names of a package and of all that it needs on this machine."""
+    names, waiting = set[str](), [(name, extras)]
+    visited = set(waiting)
+    while waiting:
+        name, extras = waiting.pop()
+        names.add(canonicalize_name(name))
+        for line in metadata.requires(name) or ():
+            requirement = Requirement(line)
+            conditions = [
+                requirement.marker is None or requirement.marker.evaluate({"extra": extra}) for extra in ("", *extras)
+            ]
+            found = requirement.name, frozenset(requirement.extras)
+            if any(conditions) and found not in visited:
+                visited.add(found)
+                waiting.append(found)
+    return names
+
+
+def test_the_table_of_licences_is_that_of_the_lock_file() -> None:
+    """docs/licences.md is written by `deploy/bill-of-materials` from an environment with what coec needs alone."""
+    if (sys.version_info[:2], platform.machine(), sys.platform) != ((3, 11), "x86_64", "linux"):
+        pytest.skip("the table is of the image: CPython 3.11 on x86-64 Linux")
+    rows = re.findall(
+        r"^\| (\S+) +\| (\S+) +\| (.+?) +\|$", (REPOSITORY / "docs" / "licences.md").read_text(), re.MULTILINE
+    )
+    shown = {canonicalize_name(name): version for name, version, _ in rows if version[0].isdigit()}
+    assert shown.keys() == needed("coec") - {"coec"}
+    assert shown.items() <= pinned_hashes(LOCK).keys()
+    assert all(licence not in ("", "UNKNOWN") for _, _, licence in rows)
+
+
+@pytest.mark.parametrize("lock", [*LOCKS, RELEASE], ids=lambda lock: lock.stem)
 def test_every_pin_has_hashes_and_no_address(lock: Path) -> None:
     assert all(pinned_hashes(lock).values())
     assert re.findall(r"https?:|file:|--(?:extra-)?index", lock.read_text()) == []

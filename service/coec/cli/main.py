@@ -40,7 +40,7 @@ SHARED = frozenset({"main", "options"})
 # fmt: off
 ORDER = (
     "calibrate", "commission", "diagnose", "run", "check-config", "doctor", "play", "query", "watch", "fetch", "view",
-    "router", "warmup", "batch", "replay", "convert", "sbom", "check", "lidars", "export", "models", "fleet",
+    "router", "warmup", "batch", "replay", "convert", "check", "lidars", "export", "models", "fleet",
 )
 # fmt: on
 """Commands that the help text lists first, in the order of the work; all others follow."""
