@@ -4,8 +4,8 @@ entry of a YAML file and leaves every other byte as it is.
 
 Each format writes the direction and the order that its readers expect, and states both in the file.
 
-A YAML library would rewrite the whole document, including the comments, quotes and number formats that people chose.
-Here the library only finds the place of an entry, and the lines of that entry are replaced.
+Of YAML the library (ruamel) only finds the place of an entry, whose lines are replaced here. Its own round trip keeps
+comments, quotes and numbers, but wraps, indents and spaces the lists of the whole document anew.
 """
 
 from __future__ import annotations

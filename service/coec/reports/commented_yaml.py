@@ -1,5 +1,9 @@
 """A configuration as YAML: with every key and a comment on each, for templates and for people who check one, or with
-nothing but what differs from the defaults, for people who edit one."""
+nothing but what differs from the defaults, for people who edit one.
+
+The text is written here because the YAML library (ruamel), which edits documents, sets no comments for keys without a
+value, wraps none, and keeps no block on one line if it fits.
+"""
 
 from __future__ import annotations
 
