@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
+from packaging.utils import NormalizedName, canonicalize_name
 
 from conftest import REPOSITORY
 
@@ -89,9 +89,9 @@ def test_what_lists_the_packages_of_an_image_is_pinned(project: Any) -> None:
     assert missing(project["dependency-groups"]["release"], RELEASE) == []
 
 
-def needed(name: str, extras: frozenset[str] = frozenset()) -> set[str]:
+def needed(name: str, extras: frozenset[str] = frozenset()) -> set[NormalizedName]:
     """Canonical names of a package and of all that it needs on this machine."""
-    names, waiting = set[str](), [(name, extras)]
+    names, waiting = set[NormalizedName](), [(name, extras)]
     visited = set(waiting)
     while waiting:
         name, extras = waiting.pop()

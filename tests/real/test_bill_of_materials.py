@@ -28,7 +28,9 @@ def test_everything_that_coec_needs_is_listed_with_its_licence(tmp_path: Path) -
     components = {canonicalize_name(each["name"]): each for each in json.loads(text)["components"]}
     assert needed("coec") <= components.keys()
     assert [name for name in needed("coec") if not components[name].get("licenses")] == []
-    texts = [each["license"].get("text", {}) for each in components["opencv-python-headless"]["licenses"]]
+    texts = [
+        each["license"].get("text", {}) for each in components[canonicalize_name("opencv-python-headless")]["licenses"]
+    ]
     packed_in = b"".join(base64.b64decode(one["content"]) for one in texts if one)
     assert b"FFmpeg" in packed_in, "the libraries of others that it has packed in"
     assert "| numba " in (tmp_path / "one/licences.md").read_text()
