@@ -19,13 +19,13 @@ from coec.calibration.tracker import (
     chi_square_tail,
     fits,
     prior_sigma,
-    track_from_dict,
-    track_to_dict,
     update_track,
 )
 from coec.calibration.types import Uncertainty
 from coec.config import TrackerConfig
 from coec.geometry import se3
+from coec.io.converter import MalformedValueError, structured
+from coec.service.records.state_store import STATE_FORM
 
 Array = NDArray[np.float64]
 
@@ -281,20 +281,21 @@ def test_a_restart_gives_the_same_bytes(rng: np.random.Generator) -> None:
     restarted = through
     for window in windows:
         through = update_track(through, window, config)
-        restarted = update_track(track_from_dict(json.loads(json.dumps(track_to_dict(restarted)))), window, config)
-    assert json.dumps(track_to_dict(through)) == json.dumps(track_to_dict(restarted))
+        document = json.loads(json.dumps(STATE_FORM.unstructure(restarted)))
+        restarted = update_track(structured(STATE_FORM, document, Track), window, config)
+    assert json.dumps(STATE_FORM.unstructure(through)) == json.dumps(STATE_FORM.unstructure(restarted))
     assert through.T_camera_lidar.tobytes() == restarted.T_camera_lidar.tobytes()
 
 
 @pytest.mark.parametrize("broken", ["slow", "stamp_ns", "step", "prior_sigma"])
 def test_a_broken_document_is_refused(broken: str) -> None:
-    document = track_to_dict(track_at(TRUTH))
+    document = STATE_FORM.unstructure(track_at(TRUTH))
     for value in (None, "x", [[1.0]]):
-        with pytest.raises(ValueError):  # noqa: PT011
-            track_from_dict({**document, broken: value})
+        with pytest.raises(MalformedValueError, match=broken):
+            structured(STATE_FORM, {**document, broken: value}, Track)
     del document[broken]
-    with pytest.raises(ValueError, match="not a track"):
-        track_from_dict(document)
+    with pytest.raises(MalformedValueError, match=f"{broken} is missing"):
+        structured(STATE_FORM, document, Track)
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,7 @@ from coec.geometry import cameras, se3
 from coec.io.serialise import result_of
 from coec.schemas.message import to_json
 from coec.service.api.reply_builders import extrinsic_of
-from coec.service.records.state_store import StateStore
-from coec.service.records.stored_pair import Clocks
+from coec.service.records.state_store import Clocks, StateStore
 from support.estimates import ESTIMATE_RIG, estimate
 
 RULES = PairRules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())

@@ -66,8 +66,7 @@ from coec.service.api.reply_builders import extrinsic_of
 from coec.service.discovery import NOMINAL_FILE, DiscoveredPair, DiscoveryStore
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.pair_store import PairStore
-from coec.service.records.state_store import StateStore
-from coec.service.records.stored_pair import Clocks
+from coec.service.records.state_store import Clocks, StateStore
 from coec.service.worker.child_process import Link, MalformedMessageError
 from coec.service.worker.worker_jobs import (
     Kind,

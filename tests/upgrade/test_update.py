@@ -27,8 +27,7 @@ from coec.service.records.history import PairHistory
 from coec.service.records.incidents import Incidents
 from coec.service.records.pair_store import PairStore
 from coec.service.records.rig_store import RigStore
-from coec.service.records.state_store import StateStore, read_pairs
-from coec.service.records.stored_pair import RestoredPair
+from coec.service.records.state_store import RestoredPair, StateStore, read_pairs
 from support.vehicles import InstantDiskWriter
 from upgrade.write_state import VEHICLE, checked, rules
 

@@ -50,6 +50,7 @@ StateStore = names.first_of(
     "coec.service.records.state_store:StateStore", "coec.runtime.decisions.state_store:StateStore"
 )
 Clocks = names.first_of(
+    "coec.service.records.state_store:Clocks",
     "coec.service.records.stored_pair:Clocks",
     "coec.runtime.decisions.stored_pair:Clocks",
     "coec.runtime.decisions.state_store:Clocks",

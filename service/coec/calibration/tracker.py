@@ -23,7 +23,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import erfc, exp, fsum, pi, radians, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -305,64 +304,3 @@ def chi_square_tail(x: float, degrees_of_freedom: int) -> float:
         power += 1.0
         term *= half / power
     return total
-
-
-def track_to_dict(track: Track) -> dict[str, Any]:
-    """Plain values for JSON; floats survive it to the last bit."""
-    return {
-        "slow": _posterior_to_dict(track.slow),
-        "candidate": None if track.candidate is None else _posterior_to_dict(track.candidate),
-        "prior_sigma": track.prior_sigma.tolist(),
-        "stamp_ns": track.stamp_ns,
-        "step": track.step.value,
-        "innovation": track.innovation,
-        "chance": track.chance,
-    }
-
-
-def track_from_dict(document: Mapping[str, Any]) -> Track:
-    """The track that `track_to_dict` wrote.
-
-    Raises:
-        ValueError: something is missing, or has a wrong type or shape.
-    """
-    try:
-        candidate = document["candidate"]
-        return Track(
-            slow=_posterior_from_dict(document["slow"]),
-            prior_sigma=_array(document["prior_sigma"], (6,)),
-            stamp_ns=int(document["stamp_ns"]),
-            step=StepState(document["step"]),
-            candidate=None if candidate is None else _posterior_from_dict(candidate),
-            innovation=float(document["innovation"]),
-            chance=float(document["chance"]),
-        )
-    except (AttributeError, KeyError, TypeError) as error:
-        raise ValueError(f"not a track: {error}") from error
-
-
-def _posterior_to_dict(posterior: PosePosterior) -> dict[str, Any]:
-    return {
-        "T_camera_lidar": posterior.T_camera_lidar.tolist(),
-        "covariance": posterior.covariance.tolist(),
-        "systematic": {name: shift.tolist() for name, shift in posterior.systematic.items()},
-        "observed": posterior.observed.tolist(),
-        "windows": posterior.windows,
-    }
-
-
-def _posterior_from_dict(document: Mapping[str, Any]) -> PosePosterior:
-    return PosePosterior(
-        _array(document["T_camera_lidar"], (4, 4)),
-        _array(document["covariance"], (6, 6)),
-        {str(name): _array(shift, (6,)) for name, shift in document["systematic"].items()},
-        _array(document["observed"], (6,)).astype(np.bool_),
-        int(document["windows"]),
-    )
-
-
-def _array(values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    array = np.asarray(values, np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"not a track: expected finite numbers of shape {shape}, got {array.shape}")
-    return array

@@ -150,16 +150,16 @@ def _of_state(folder: Path, name: str | None, config: Config | None, frames: Exp
     served = next(iter(pairs)) if name is None else name
     if served not in pairs:
         raise UsageError(f"{folder} holds no pair {served}; it holds {', '.join(sorted(pairs))}")
-    stored, state = pairs[served]
+    accepted, state = pairs[served]
     if config is not None:
         pair = pair_named(config, served)
         own = (pair.lidar.frame_id, pair.camera.frame_id)
         return exported(state, config.vehicle, served, own, pair.camera.intrinsics, frames)
-    if stored.accepted is None:
+    if accepted is None:
         raise UsageError(f"{folder}: nothing was accepted yet; --config gives the frames of the nominal calibration")
-    own = (stored.accepted.lidar_frame, stored.accepted.camera_frame)
-    camera = intrinsics_config_of(stored.accepted.intrinsics)
-    return exported(state, stored.accepted.vehicle, served, own, camera, frames)
+    own = (accepted.lidar_frame, accepted.camera_frame)
+    camera = intrinsics_config_of(accepted.intrinsics)
+    return exported(state, accepted.vehicle, served, own, camera, frames)
 
 
 def _pose(text: str | None) -> Matrix4 | None:

@@ -29,8 +29,7 @@ from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import StateError
 from coec.io.serialise import result_of
 from coec.io.storage import StateFile
-from coec.service.records.state_store import StateStore
-from coec.service.records.stored_pair import Clocks
+from coec.service.records.state_store import Clocks, StateStore
 from support.estimates import ESTIMATE_RIG, estimate
 
 RULES = PairRules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())

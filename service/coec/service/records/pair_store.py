@@ -39,8 +39,7 @@ from coec.service.ingest.frame_selector import ServedExtrinsic
 from coec.service.recording.window_store import WindowStore, WindowVersion
 from coec.service.records.history import GENESIS, CheckLog, HistoryRecord, PairHistory
 from coec.service.records.incidents import Incidents, Side
-from coec.service.records.state_store import StateStore
-from coec.service.records.stored_pair import Clocks, LostPart
+from coec.service.records.state_store import Clocks, LostPart, StateStore
 from coec.service.timing import NS_PER_S
 
 _log = logging.getLogger(__name__)
