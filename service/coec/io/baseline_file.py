@@ -8,91 +8,44 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-from collections.abc import Iterable
+from dataclasses import fields
+from math import inf
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic.fields import FieldInfo
+from cattrs import Converter
 
 from coec.calibration.baseline import Accuracy, Baseline, MonitorLimits, for_rig
 from coec.calibration.monitor.sensor_faults import BANDS, BLOCK_COLUMNS, BLOCK_ROWS, SECTORS, SceneBaseline
 from coec.calibration.types import Rig
-from coec.config import Matrix4x4, StateConfig, describe
-from coec.errors import ConfigError, StateError
+from coec.config import StateConfig
+from coec.errors import StateError
 from coec.io import storage
-from coec.io.rig_files import matrix_rows, rigid_matrix
+from coec.io.converter import POSE, MalformedValueError, array, make_converter, null_for, register, structured
 from coec.io.storage import StateFile
-
-Maybe6 = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
-
-
-def _length(count: int) -> FieldInfo:
-    field: FieldInfo = Field(min_length=count, max_length=count)
-    return field
-
 
 BASELINES = "rig.json"
 """File in the state directory with what was learned when the pairs were commissioned."""
 
 
-class _Document(BaseModel):
-    # A later version may have added fields: older ones read the rest.
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+def _baseline_form() -> Converter:
+    """The rules by which a `Baseline` is written and read."""
+    form = make_converter()
+    # NaN, on axes that are not searched, and limits that refuse nothing are null.
+    axes = array(6, null=True)
+    register(form, Accuracy, bias=axes, bias_sigma=axes, spread=axes)
+    most, least = null_for(inf), null_for(-inf)
+    # Only the first versions wrote no share.
+    required = [field.name for field in fields(MonitorLimits) if field.name != "insisted_share"]
+    register(form, MonitorLimits, required=required, max_agreement_rad=most, max_f1=most, min_mi=least, min_f2=least)
+    # Exactly as many parts as the monitor uses.
+    gradient = array(BLOCK_ROWS, BLOCK_COLUMNS)
+    register(form, SceneBaseline, gradient=gradient, bands=array(BANDS), sectors=array(SECTORS))
+    register(form, Baseline, T_camera_lidar=POSE)
+    return form
 
 
-class AccuracyDocument(_Document):
-    """`Accuracy` (rad, m); null on axes that are not searched."""
-
-    bias: Maybe6
-    bias_sigma: Maybe6
-    spread: Maybe6
-
-
-class LimitsDocument(_Document):
-    """`MonitorLimits`; null: no limit. A limit that a file of an earlier version lacks refuses nothing."""
-
-    max_distance2_rotation: float
-    max_farthest2_pose: float
-    min_edges_per_pair: float
-    insisted_share: float = 1.0
-    max_agreement_rad: float | None
-    min_overlap: float
-    min_mi: float | None
-    max_f1: float | None
-    min_f2: float | None
-
-
-class SceneDocument(_Document):
-    """`SceneBaseline`, with exactly as many parts as the monitor uses."""
-
-    gradient: Annotated[tuple[Annotated[tuple[float, ...], _length(BLOCK_COLUMNS)], ...], _length(BLOCK_ROWS)]
-    bands: Annotated[tuple[float, ...], _length(BANDS)]
-    sectors: Annotated[tuple[float, ...], _length(SECTORS)]
-    range_edges: float
-
-
-class BaselineDocument(_Document):
-    """`Baseline`; floats are written so that they read back to the same bits."""
-
-    pair: str
-    T_camera_lidar: Matrix4x4
-    rotation: AccuracyDocument
-    pose: AccuracyDocument
-    dof: int
-    limits: dict[str, float]
-    monitor: LimitsDocument
-    scene: SceneDocument
-    false_alarm_rate: float
-    windows: int
-    pairs: int
-    detected: dict[str, float]
-    sensors: dict[str, str]
-    depth_identity: str
-    config_hash: str
+_FORM = _baseline_form()
 
 
 def save_baseline(path: Path, baseline: Baseline) -> str:
@@ -159,42 +112,9 @@ def document_hash(document: dict[str, Any]) -> str:
 
 
 def baseline_to_json(baseline: Baseline) -> dict[str, Any]:
-    """The baseline as JSON values."""
-    limits, scene = baseline.monitor, baseline.scene
-    document = BaselineDocument(
-        pair=baseline.pair,
-        T_camera_lidar=matrix_rows(baseline.T_camera_lidar),
-        rotation=_accuracy_document(baseline.rotation),
-        pose=_accuracy_document(baseline.pose),
-        dof=baseline.dof,
-        limits=baseline.limits,
-        monitor=LimitsDocument(
-            max_distance2_rotation=limits.max_distance2_rotation,
-            max_farthest2_pose=limits.max_farthest2_pose,
-            min_edges_per_pair=limits.min_edges_per_pair,
-            insisted_share=limits.insisted_share,
-            max_agreement_rad=_finite(limits.max_agreement_rad),
-            min_overlap=limits.min_overlap,
-            min_mi=_finite(limits.min_mi),
-            max_f1=_finite(limits.max_f1),
-            min_f2=_finite(limits.min_f2),
-        ),
-        scene=SceneDocument(
-            gradient=tuple(_floats(row) for row in scene.gradient),
-            bands=_floats(scene.bands),
-            sectors=_floats(scene.sectors),
-            range_edges=scene.range_edges,
-        ),
-        false_alarm_rate=baseline.false_alarm_rate,
-        windows=baseline.windows,
-        pairs=baseline.pairs,
-        detected=baseline.detected,
-        sensors=baseline.sensors,
-        depth_identity=baseline.depth_identity,
-        config_hash=baseline.config_hash,
-    )
-    values: dict[str, Any] = document.model_dump(mode="json")
-    return values
+    """The baseline as JSON values; floats are written so that they read back to the same bits."""
+    document: dict[str, Any] = _FORM.unstructure(baseline)
+    return document
 
 
 def baseline_from_json(values: object) -> Baseline:
@@ -204,44 +124,9 @@ def baseline_from_json(values: object) -> Baseline:
         StateError: not a valid document; says where.
     """
     try:
-        document = BaselineDocument.model_validate(values)
-        T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
-    except (ValidationError, ConfigError) as error:
-        what = describe(error) if isinstance(error, ValidationError) else str(error)
-        raise StateError(f"the baseline cannot be read: {what}; commission again") from error
-    limits = document.monitor
-    return Baseline(
-        pair=document.pair,
-        T_camera_lidar=T_camera_lidar,
-        rotation=_accuracy(document.rotation),
-        pose=_accuracy(document.pose),
-        dof=document.dof,
-        limits=document.limits,
-        monitor=MonitorLimits(
-            max_distance2_rotation=limits.max_distance2_rotation,
-            max_farthest2_pose=limits.max_farthest2_pose,
-            min_edges_per_pair=limits.min_edges_per_pair,
-            insisted_share=limits.insisted_share,
-            max_agreement_rad=_or(limits.max_agreement_rad, math.inf),
-            min_overlap=limits.min_overlap,
-            min_mi=_or(limits.min_mi, -math.inf),
-            max_f1=_or(limits.max_f1, math.inf),
-            min_f2=_or(limits.min_f2, -math.inf),
-        ),
-        scene=SceneBaseline(
-            gradient=np.array(document.scene.gradient, dtype=np.float64),
-            bands=np.array(document.scene.bands, dtype=np.float64),
-            sectors=np.array(document.scene.sectors, dtype=np.float64),
-            range_edges=document.scene.range_edges,
-        ),
-        false_alarm_rate=document.false_alarm_rate,
-        windows=document.windows,
-        pairs=document.pairs,
-        detected=document.detected,
-        sensors=document.sensors,
-        depth_identity=document.depth_identity,
-        config_hash=document.config_hash,
-    )
+        return structured(_FORM, values, Baseline)
+    except MalformedValueError as error:
+        raise StateError(f"the baseline cannot be read: {error}; commission again") from error
 
 
 def _documents(path: Path) -> dict[str, Any]:
@@ -254,34 +139,3 @@ def _documents(path: Path) -> dict[str, Any]:
 def _pairs_of(body: dict[str, Any] | None) -> dict[str, Any]:
     pairs = {} if body is None else body.get("pairs")
     return pairs if isinstance(pairs, dict) else {}
-
-
-def _accuracy_document(accuracy: Accuracy) -> AccuracyDocument:
-    return AccuracyDocument(
-        bias=_maybe6(accuracy.bias), bias_sigma=_maybe6(accuracy.bias_sigma), spread=_maybe6(accuracy.spread)
-    )
-
-
-def _accuracy(document: AccuracyDocument) -> Accuracy:
-    return Accuracy(_array(document.bias), _array(document.bias_sigma), _array(document.spread))
-
-
-def _maybe6(values: NDArray[np.float64]) -> Maybe6:
-    a, b, c, d, e, f = (_finite(float(value)) for value in values)
-    return a, b, c, d, e, f
-
-
-def _array(values: Iterable[float | None]) -> NDArray[np.float64]:
-    return np.array([_or(value, math.nan) for value in values], dtype=np.float64)
-
-
-def _floats(values: NDArray[np.float64]) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _or(value: float | None, otherwise: float) -> float:
-    return otherwise if value is None else value

@@ -9,7 +9,7 @@ that is missing takes the default of the dataclass, if there is one.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from math import inf, isfinite, nan
 from types import GenericAlias, UnionType
 from typing import Any, TypeVar, get_args
@@ -40,6 +40,7 @@ def make_converter() -> Converter:
     converter = Converter(unstruct_collection_overrides={tuple: list})
     for plain, read in ((float, number), (int, whole_number), (bool, flag)):
         converter.register_structure_hook(plain, read)
+        converter.register_unstructure_hook(plain, plain)  # NumPy's numbers become those of Python
     # cattrs has the hook of `str` read every `StrEnum`, too.
     converter.register_structure_hook(str, lambda value, form: text(value) if form is str else form(value))
 
@@ -60,13 +61,13 @@ def make_converter() -> Converter:
     return converter
 
 
-def register(converter: Converter, form: type, *, complete: bool = False, **fields: Any) -> None:
-    """Registers the rules for fields of a dataclass; the classes of its other fields first, if they have rules. If it
-    has to be `complete`, a field with a default may not be missing either."""
+def register(converter: Converter, form: type, *, required: Collection[str] = (), **fields: Any) -> None:
+    """Registers the rules for fields of a dataclass; the classes of its other fields first, if they have rules. Fields
+    that are `required` may not be missing although they have a default."""
     read: Hook = make_dict_structure_fn(form, converter, **fields)
 
     def read_complete(value: Mapping[str, Any], of: Any) -> Any:
-        if complete and (missing := sorted({field.name for field in dataclasses.fields(form)} - value.keys())):
+        if missing := [name for name in required if name not in value]:
             raise MalformedValueError(f"{', '.join(missing)} is missing")
         return read(value, of)
 

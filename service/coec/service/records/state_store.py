@@ -222,7 +222,7 @@ def _state_form() -> Converter:
     register(form, PendingEstimate, T_camera_lidar=POSE, estimate=override(rename="result"))
     observed = array(6, of=flag)
     register(form, PosePosterior, T_camera_lidar=POSE, covariance=array(6, 6), systematic=arrays(6), observed=observed)
-    register(form, Track, complete=True, prior_sigma=array(6))
+    register(form, Track, required=[one.name for one in fields(Track)], prior_sigma=array(6))
     count = bounded(whole_number, lambda value: value >= 0, "a count")
     register(form, AlarmRecord, watched_ns=count, confirmed=count, withdrawn=count)
     # Nanoseconds since 1970, as the clocks of Linux count them.
