@@ -129,7 +129,7 @@ def test_json_gives_back_the_same_bits(model: str) -> None:
 
 def test_a_damaged_document_says_where() -> None:
     document = rig_to_json(rig_of(a_config()))
-    with pytest.raises(WindowError, match=r"camera\.fx"):
+    with pytest.raises(WindowError, match="camera: fx"):
         rig_from_json({**document, "camera": {**document["camera"], "fx": -1}}, None)
     with pytest.raises(WindowError, match="rigid"):
         rig_from_json({**document, "T_lidar_ego": [[0.0] * 4] * 4}, None)

@@ -6,12 +6,14 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
+from cattrs import Converter, override
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 from coec.calibration.types import CloudFrame, Matrix4, Rig, SweepTiming
 from coec.config import (
@@ -27,6 +29,16 @@ from coec.config import (
 )
 from coec.errors import ConfigError, DecodeError, WindowError, cannot_read, require_readable
 from coec.geometry import cameras, se3
+from coec.io.converter import (
+    POSE,
+    MalformedValueError,
+    bounded,
+    make_converter,
+    number,
+    register,
+    structured,
+    whole_number,
+)
 from coec.io.images import decode_bgr, encode_png, probe
 
 NOT_ALWAYS_THERE = ("sweep", "cloud")
@@ -35,40 +47,6 @@ NOT_ALWAYS_THERE = ("sweep", "cloud")
 ROUNDING = 1e-9
 """Relative and absolute difference up to which two numbers of an identity count as equal: far below what any mount is
 known to, far above the rounding of a double."""
-
-
-class SweepDocument(BaseModel):
-    """`SweepTiming`, kept in radians so that it reads back to the same bits."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-
-    period_s: float = Field(gt=0)
-    sign: Literal[-1, 1]
-    stamp_azimuth_rad: float
-
-
-class CloudDocument(BaseModel):
-    """`CloudFrame`."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-
-    frame_id: str
-    T_cloud_lidar: Matrix4x4
-
-
-class RigDocument(BaseModel):
-    """`rig.json`: a `Rig` without its mask. Floats are written so that they read back to the same bits."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-
-    pair: str
-    camera: CameraIntrinsics
-    camera_frame: str
-    lidar_frame: str
-    T_camera_lidar_nominal: Matrix4x4
-    T_lidar_ego: Matrix4x4
-    sweep: SweepDocument | None = None
-    cloud: CloudDocument | None = None
 
 
 def rig_of(pair: PairConfig) -> Rig:
@@ -176,53 +154,27 @@ def intrinsics_config(camera: cameras.Camera) -> CameraIntrinsics:
 
 
 def rig_to_json(rig: Rig) -> dict[str, Any]:
-    """The rig without its mask, as JSON values."""
-    document = RigDocument(
-        pair=rig.pair,
-        camera=intrinsics_config(rig.camera),
-        camera_frame=rig.camera_frame,
-        lidar_frame=rig.lidar_frame,
-        T_camera_lidar_nominal=matrix_rows(rig.T_camera_lidar_nominal),
-        T_lidar_ego=matrix_rows(rig.T_lidar_ego),
-        sweep=None
-        if rig.sweep is None
-        else SweepDocument(
-            period_s=rig.sweep.period_s,
-            sign=1 if rig.sweep.sign > 0 else -1,
-            stamp_azimuth_rad=rig.sweep.stamp_azimuth_rad,
-        ),
-        cloud=None
-        if rig.cloud is None
-        else CloudDocument(frame_id=rig.cloud.frame_id, T_cloud_lidar=matrix_rows(rig.cloud.T_cloud_lidar)),
-    )
-    return document.model_dump(mode="json", exclude_none=True)
+    """The rig without its mask, as JSON values; floats are written so that they read back to the same bits."""
+    document: dict[str, Any] = _FORM.unstructure(rig)
+    return document
+
+
+IDENTIFYING = (
+    "pair", "camera", "camera_frame", "lidar_frame", "T_camera_lidar_nominal", "T_lidar_ego", *NOT_ALWAYS_THERE,
+)  # fmt: skip
+"""Entries of `rig_to_json` that make a calibration belong to a rig: names, frames, intrinsics, nominal pose, and how
+points are placed."""
 
 
 def rig_identity(rig: Rig) -> dict[str, Any]:
-    """What makes a calibration belong to this rig, as JSON values: names, frames, intrinsics, nominal pose, and how
-    points are placed. What is not configured has no entry.
+    """What makes a calibration belong to this rig, as JSON values. What is not configured has no entry.
 
-    The form is fixed, whatever `rig_to_json` becomes, because `identity_sha256` of it is in the state directories of
-    all versions. A later version may add an entry for something that it newly knows, if it leaves that entry out where
-    the rig is as earlier versions took it to be.
+    The form is fixed, because `identity_sha256` of it is in the state directories of all versions. A later version may
+    add an entry for something that it newly knows, if it leaves that entry out where the rig is as earlier versions
+    took it to be.
     """
-    identity: dict[str, Any] = {
-        "pair": rig.pair,
-        "camera": {"model": cameras.name_of(rig.camera), **intrinsics_config(rig.camera).parameters()},
-        "camera_frame": rig.camera_frame,
-        "lidar_frame": rig.lidar_frame,
-        "T_camera_lidar_nominal": rig.T_camera_lidar_nominal.tolist(),
-        "T_lidar_ego": rig.T_lidar_ego.tolist(),
-    }
-    if rig.sweep is not None:
-        identity["sweep"] = {
-            "period_s": float(rig.sweep.period_s),
-            "sign": 1 if rig.sweep.sign > 0 else -1,
-            "stamp_azimuth_rad": float(rig.sweep.stamp_azimuth_rad),
-        }
-    if rig.cloud is not None:
-        identity["cloud"] = {"frame_id": rig.cloud.frame_id, "T_cloud_lidar": rig.cloud.T_cloud_lidar.tolist()}
-    return identity
+    document = rig_to_json(rig)
+    return {name: document[name] for name in IDENTIFYING if name in document}
 
 
 def identity_sha256(identity: dict[str, Any]) -> str:
@@ -257,27 +209,9 @@ def rig_from_json(document: object, mask_png: bytes | None) -> Rig:
         WindowError: not a valid document; says where.
     """
     try:
-        parsed = RigDocument.model_validate(document)
-        camera = camera_of(parsed.camera)
-        mask = None if mask_png is None else mask_from_image(mask_png, camera)
-        return Rig(
-            pair=parsed.pair,
-            camera=camera,
-            camera_frame=parsed.camera_frame,
-            lidar_frame=parsed.lidar_frame,
-            T_camera_lidar_nominal=rigid_matrix(parsed.T_camera_lidar_nominal, "T_camera_lidar_nominal"),
-            T_lidar_ego=rigid_matrix(parsed.T_lidar_ego, "T_lidar_ego"),
-            mask=mask,
-            sweep=None
-            if parsed.sweep is None
-            else SweepTiming(parsed.sweep.period_s, parsed.sweep.sign, parsed.sweep.stamp_azimuth_rad),
-            cloud=None
-            if parsed.cloud is None
-            else CloudFrame(parsed.cloud.frame_id, rigid_matrix(parsed.cloud.T_cloud_lidar, "T_cloud_lidar")),
-        )
-    except ValidationError as error:
-        raise WindowError(f"the rig is damaged: {describe(error)}") from error
-    except (ConfigError, DecodeError) as error:
+        rig = structured(_FORM, document, Rig)
+        return rig if mask_png is None else replace(rig, mask=mask_from_image(mask_png, rig.camera))
+    except (MalformedValueError, DecodeError) as error:
         raise WindowError(f"the rig is damaged: {error}") from error
 
 
@@ -302,3 +236,35 @@ def _cloud(lidar: LidarConfig, where: str) -> CloudFrame | None:
 
 def _sweep(sweep: SweepConfig) -> SweepTiming:
     return SweepTiming(sweep.period_s, sweep.sign, math.radians(sweep.stamp_azimuth_deg))
+
+
+def _rig_form() -> Converter:
+    """The rules by which a `Rig` is written and read. The mask is a file of its own; a sweep or cloud that is not
+    configured has no entry."""
+    form = make_converter()
+    # The fields of a camera depend on its model: they are those of the configuration.
+    form.register_unstructure_hook_func(
+        lambda one: one == cameras.Camera,
+        lambda camera: intrinsics_config(camera).model_dump(mode="json", exclude_none=True),
+    )
+    form.register_structure_hook_func(lambda one: one == cameras.Camera, _read_camera)
+    period_s = bounded(number, lambda value: value > 0.0, "a number above 0")
+    sign = bounded(whole_number, lambda value: value in (-1, 1), "-1 or 1")
+    register(form, SweepTiming, required=["stamp_azimuth_rad"], period_s=period_s, sign=sign)
+    register(form, CloudFrame, T_cloud_lidar=POSE)
+    elsewhere, not_always_there = override(omit=True), override(omit_if_default=True)
+    poses = {"T_camera_lidar_nominal": POSE, "T_lidar_ego": POSE}
+    optional = {"sweep": not_always_there, "cloud": not_always_there}
+    register(form, Rig, **poses, **optional, mask=elsewhere, camera_residual_px=elsewhere)
+    return form
+
+
+def _read_camera(value: Any, _: object) -> cameras.Camera:
+    try:
+        intrinsics = CameraIntrinsics.model_validate(value)
+        return cameras.build(intrinsics.model, **intrinsics.parameters())
+    except ValueError as error:
+        raise MalformedValueError(describe(error) if isinstance(error, ValidationError) else str(error)) from error
+
+
+_FORM = _rig_form()
