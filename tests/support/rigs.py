@@ -27,6 +27,7 @@ from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, Uncer
 from coec.config import BudgetConfig, LidarEdgesConfig, LimitsConfig, PairConfig
 from coec.geometry import se3
 from coec.io import nearest_neighbours
+from coec.io.converter import structured
 from coec.io.disk_writer import DiskWriter
 from coec.schemas.rig_state import LidarsReply, RigReply
 from coec.service.api.rig_answers import reply_of
@@ -42,8 +43,8 @@ from coec.service.worker.worker_jobs import (
     JobOutcome,
     Registered,
     WorkerJob,
-    unpack_lidars,
     unpack_sweeps,
+    wire_form,
 )
 from support.vehicles import PAIR_RIG, pair_configuration
 
@@ -238,7 +239,8 @@ class FakeLidarWorker:
     def answer(self, job: WorkerJob) -> None:
         self.waiting.remove(job)
         result = self.answers(
-            unpack_lidars(job.body["lidars"]), unpack_sweeps(job.body["frames"], LimitsConfig())[-1].a.stamp_ns
+            structured(wire_form(), job.body["lidars"], LidarRig),
+            unpack_sweeps(job.body["frames"], LimitsConfig())[-1].a.stamp_ns,
         )
         reason = result if isinstance(result, Reason) else None
         answer = None if isinstance(result, Reason) else result

@@ -34,10 +34,10 @@ class NotRigidError(ValueError):
     """A matrix that should be a pose is no rigid transform."""
 
 
-def make_converter() -> Converter:
+def make_converter(*, forbid_extra_keys: bool = False) -> Converter:
     """A converter with the rules above; tuples become lists. cattrs by itself takes whatever can be iterated for a
     tuple, and whatever a number, text or object can be made of for one."""
-    converter = Converter(unstruct_collection_overrides={tuple: list})
+    converter = Converter(forbid_extra_keys=forbid_extra_keys, unstruct_collection_overrides={tuple: list})
     for plain, read in ((float, number), (int, whole_number), (bool, flag)):
         converter.register_structure_hook(plain, read)
         converter.register_unstructure_hook(plain, plain)  # NumPy's numbers become those of Python

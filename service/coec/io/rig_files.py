@@ -253,9 +253,16 @@ def _rig_form() -> Converter:
     register(form, SweepTiming, required=["stamp_azimuth_rad"], period_s=period_s, sign=sign)
     register(form, CloudFrame, T_cloud_lidar=POSE)
     elsewhere, not_always_there = override(omit=True), override(omit_if_default=True)
-    poses = {"T_camera_lidar_nominal": POSE, "T_lidar_ego": POSE}
-    optional = {"sweep": not_always_there, "cloud": not_always_there}
-    register(form, Rig, **poses, **optional, mask=elsewhere, camera_residual_px=elsewhere)
+    register(
+        form,
+        Rig,
+        T_camera_lidar_nominal=POSE,
+        T_lidar_ego=POSE,
+        mask=elsewhere,
+        sweep=not_always_there,
+        camera_residual_px=elsewhere,
+        cloud=not_always_there,
+    )
     return form
 
 

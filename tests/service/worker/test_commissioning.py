@@ -22,7 +22,7 @@ from coec.io.images import GreyImages
 from coec.io.mcap.window_writer import WindowWriter
 from coec.service.worker import tasks
 from coec.service.worker.tasks import Solver
-from coec.service.worker.worker_jobs import DEADLINE_S, Commissioned, Kind, Underway, pack_pairs, pack_pose
+from coec.service.worker.worker_jobs import DEADLINE_S, Commissioned, Kind, Underway, pack_pairs
 from support.simulated_drives import rendered_source
 
 CONFIG = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(reach_deg=8.0))
@@ -66,7 +66,7 @@ def paths(street: Window, tmp_path: Path) -> list[Path]:
 
 def slices(solver: Solver, street: Window, paths: list[Path], run: int = 1) -> Iterator[Underway | Commissioned]:
     while True:
-        told = solver.commission(run, CONFIG, pack_pose(street.T_camera_lidar_start), paths)
+        told = solver.commission(run, CONFIG, street.T_camera_lidar_start.tolist(), paths)
         yield told
         if isinstance(told, Commissioned):
             return
@@ -79,7 +79,7 @@ def test_a_baseline_learned_between_checks_is_the_one_learned_without_a_pause(
     checked = pack_pairs(street.pairs[:5])
     stages = []
     for told in slices(solver, street, paths):
-        solver.observe(street.rig.pair, CONFIG, pack_pose(street.T_camera_lidar_start), checked)
+        solver.observe(street.rig.pair, CONFIG, street.T_camera_lidar_start.tolist(), checked)
         if isinstance(told, Underway):
             stages.append(str(told))
     assert isinstance(told, Commissioned)

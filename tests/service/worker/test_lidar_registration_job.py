@@ -14,6 +14,7 @@ from coec.calibration.types import EgoMotion, LidarFrame, Reason, SweepTiming
 from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import se3
+from coec.io.converter import structured
 from coec.service.worker import tasks
 from coec.service.worker.job_queue import JobQueue
 from coec.service.worker.tasks import Solver, answer_request
@@ -24,11 +25,10 @@ from coec.service.worker.worker_jobs import (
     MalformedAnswerError,
     Registered,
     pack_answer,
-    pack_lidars,
     read_answer,
     register,
-    unpack_lidars,
     unpack_sweeps,
+    wire_form,
 )
 from support.vehicles import pair_configuration
 
@@ -71,7 +71,7 @@ def test_a_question_carries_both_lidars_and_their_sweeps() -> None:
     found = unpack_sweeps(asked["frames"], LimitsConfig())
     np.testing.assert_array_equal(found[0].b.xyz_m, pair.b.xyz_m)
     assert (found[0].motion, found[1].motion) == (MOTION, None)
-    rig = unpack_lidars(pack_lidars(RIG))
+    rig = structured(wire_form(), asked["lidars"], LidarRig)
     np.testing.assert_array_equal(rig.T_a_b_nominal, T_A_B)
     assert (rig.a, rig.b, rig.sweep_a, rig.sweep_b) == ("roof", "bumper", None, RIG.sweep_b)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.pipeline import calibrate
 from coec.calibration.rig.lidar_registration import register
-from coec.calibration.rig.lidar_sampling import LidarEdge, LidarRig, SweepPair
+from coec.calibration.rig.lidar_sampling import LidarRig, SweepPair
 from coec.calibration.types import (
     Estimate,
     FramePair,
@@ -37,6 +37,7 @@ from coec.config import CalibrationConfig, Config, DepthConfig
 from coec.errors import CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.points import lengths
 from coec.io.baseline_file import BASELINES, baseline_of_rig, save_baseline
+from coec.io.converter import structured
 from coec.io.depth.depth_maps import CachedDepth, open_depth
 from coec.io.images import CachedGreys, GreyImages, RangeScale, decode_bgr, encode_jpeg, scale_of, stable_scale
 from coec.io.msgpack_frames import decode_camera
@@ -60,9 +61,9 @@ from coec.service.worker.worker_jobs import (
     pack_answer,
     pack_refusal,
     pack_underway,
-    unpack_lidars,
     unpack_pairs,
     unpack_sweeps,
+    wire_form,
 )
 
 _log = logging.getLogger(__name__)
@@ -337,7 +338,9 @@ class Solver:
             SourceError: the optional extra is not installed.
             DecodeError: a frame cannot be decoded.
         """
-        return _registered(register(unpack_lidars(lidars), unpack_sweeps(frames, self._config.limits), Trees()))
+        rig = structured(wire_form(), lidars, LidarRig)
+        edge = register(rig, unpack_sweeps(frames, self._config.limits), Trees())
+        return Registered(**{field.name: getattr(edge, field.name) for field in fields(Registered)})
 
     def _render(
         self,
@@ -379,19 +382,6 @@ class Solver:
         if config not in self._networks:
             self._networks[config] = CachedDepth(open_depth(config, self._config.limits), self._depth_maps_cached)
         return self._networks[config]
-
-
-def _registered(edge: LidarEdge) -> Registered:
-    return Registered(
-        edge.T_a_b,
-        edge.covariance,
-        edge.range_bias,
-        edge.rms_m,
-        edge.points,
-        edge.share,
-        edge.pairs,
-        edge.reasons,
-    )
 
 
 INTERNAL_ERROR = "internal_error"

@@ -1,13 +1,11 @@
 """The jobs of the worker, how they end, what they cost, and how requests and results are packed: plain values that the
-submitting side, the queue and the worker share. Every job ends in exactly one `JobOutcome`: a result, a failure
-with its reason, superseded by a newer one, or its deadline has passed. A request is packed into values that msgpack
-knows: pairs as frames, poses as rows. An answer is `{"id": number, "result": {field: value}}` or `{"id": number,
-"refused": {"code", "text"}}`. A slice of a commissioning is answered with `{"id": number, "underway": {"stage",
-"done", "total"}}` until it is complete. A result has the fields of its dataclass. Arrays are an extension type of
-their shape and their doubles, so that every bit is preserved.
+submitting side, the queue and the worker share.
 
 Every job ends in exactly one `JobOutcome`: a result, a failure with its reason, superseded by a newer one, or its
 deadline has passed.
+
+A request is packed into values that msgpack knows: frames in their native encoding, poses as rows. Frames are not sent
+as objects, because the native encoding gives read-only arrays in row-major order, for which the kernels are compiled.
 
 An answer is `{"id": number, "result": {field: value}}` or `{"id": number, "refused": {"code", "text"}}`. A slice of a
 commissioning is answered with `{"id": number, "underway": {"stage", "done", "total"}}` until it is complete. A result
@@ -18,57 +16,47 @@ kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import msgpack
 import numpy as np
+from cattrs import Converter, override
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, TypeAdapter
 
+from coec.calibration.baseline import BaselineDrift
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.rig.lidar_sampling import LidarRig, RangeBias, SweepPair
-from coec.calibration.types import FramePair, Matrix4, Reason, SweepTiming
+from coec.calibration.types import EgoMotion, FramePair, Matrix4, Reason, SweepTiming
 from coec.config import CalibrationConfig, LimitsConfig
-from coec.errors import DecodeError
 from coec.geometry import se3
+from coec.io.converter import MalformedValueError, make_converter, structured
+from coec.io.converter import register as register_form
 from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar, encode_camera, encode_ego, encode_lidar
 from coec.schemas.message import from_msgpack, to_msgpack
 
 if TYPE_CHECKING:
     from coec.schemas.replies import CalibrationResult
+else:
+    CalibrationResult = object  # the annotation of a field, which has a rule of its own
 
 
 T = TypeVar("T")
 
 
-def pack_pairs(pairs: Sequence[FramePair]) -> Sequence[list[bytes | None]]:
-    """Camera, LiDAR and ego-motion frame of each pair in native msgpack. Each entry is packed whenever it is read,
+def pack_pairs(pairs: Sequence[FramePair] | Sequence[SweepPair]) -> Sequence[list[bytes | None]]:
+    """Both frames of each pair, and its ego-motion, in native msgpack. Each entry is packed whenever it is read,
     because the pairs of a check have 15 MB and need not be in memory twice."""
-    return _PackedLazily(pairs, _pair)
+    return _PackedLazily(pairs)
 
 
-def pack_sweeps(pairs: Sequence[SweepPair]) -> Sequence[list[bytes | None]]:
-    """The same for sweeps of two LiDARs."""
-    return _PackedLazily(pairs, _sweeps)
-
-
-def _pair(pair: FramePair) -> list[bytes | None]:
-    return [encode_camera(pair.camera), encode_lidar(pair.lidar), encode_ego(pair.motion) if pair.motion else None]
-
-
-def _sweeps(pair: SweepPair) -> list[bytes | None]:
-    return [encode_lidar(pair.a), encode_lidar(pair.b), encode_ego(pair.motion) if pair.motion else None]
-
-
-class _PackedLazily(Sequence[list[bytes | None]], Generic[T]):
-    def __init__(self, pairs: Sequence[T], pack: Callable[[T], list[bytes | None]]) -> None:
+class _PackedLazily(Sequence[list[bytes | None]]):
+    def __init__(self, pairs: Sequence[FramePair | SweepPair]) -> None:
         self._pairs = tuple(pairs)
-        self._pack = pack
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -76,11 +64,15 @@ class _PackedLazily(Sequence[list[bytes | None]], Generic[T]):
     @overload
     def __getitem__(self, index: int) -> list[bytes | None]: ...
     @overload
-    def __getitem__(self, index: slice) -> _PackedLazily[T]: ...
-    def __getitem__(self, index: int | slice) -> list[bytes | None] | _PackedLazily[T]:
+    def __getitem__(self, index: slice) -> _PackedLazily: ...
+    def __getitem__(self, index: int | slice) -> list[bytes | None] | _PackedLazily:
         if isinstance(index, slice):
-            return _PackedLazily(self._pairs[index], self._pack)
-        return self._pack(self._pairs[index])
+            return _PackedLazily(self._pairs[index])
+        pair = self._pairs[index]
+        motion = encode_ego(pair.motion) if pair.motion else None
+        if isinstance(pair, FramePair):
+            return [encode_camera(pair.camera), encode_lidar(pair.lidar), motion]
+        return [encode_lidar(pair.a), encode_lidar(pair.b), motion]
 
 
 def unpack_pairs(frames: Sequence[Sequence[bytes | None]], limits: LimitsConfig) -> tuple[FramePair, ...]:
@@ -90,62 +82,25 @@ def unpack_pairs(frames: Sequence[Sequence[bytes | None]], limits: LimitsConfig)
         DecodeError: a frame cannot be decoded.
     """
     return tuple(
-        FramePair(
-            decode_camera(camera or b"", limits),
-            decode_lidar(lidar or b"", limits),
-            decode_ego(motion, limits) if motion else None,
-        )
+        FramePair(decode_camera(camera or b"", limits), decode_lidar(lidar or b"", limits), _motion(motion, limits))
         for camera, lidar, motion in frames
     )
 
 
 def unpack_sweeps(frames: Sequence[Sequence[bytes | None]], limits: LimitsConfig) -> tuple[SweepPair, ...]:
-    """The pairs that `pack_sweeps` packed.
+    """The same for sweeps of two LiDARs.
 
     Raises:
         DecodeError: a frame cannot be decoded.
     """
     return tuple(
-        SweepPair(
-            decode_lidar(a or b"", limits),
-            decode_lidar(b or b"", limits),
-            decode_ego(motion, limits) if motion else None,
-        )
+        SweepPair(decode_lidar(a or b"", limits), decode_lidar(b or b"", limits), _motion(motion, limits))
         for a, b, motion in frames
     )
 
 
-def pack_lidars(rig: LidarRig) -> dict[str, Any]:
-    """Two LiDARs as they were mounted."""
-    return {
-        "a": rig.a,
-        "b": rig.b,
-        "T_a_b": pack_pose(rig.T_a_b_nominal),
-        "T_a_ego": pack_pose(rig.T_a_ego),
-        "sweep_a": _packed_timing(rig.sweep_a),
-        "sweep_b": _packed_timing(rig.sweep_b),
-    }
-
-
-def unpack_lidars(packed: Mapping[str, Any]) -> LidarRig:
-    """What `pack_lidars` packed."""
-    return LidarRig(
-        packed["a"],
-        packed["b"],
-        np.array(packed["T_a_b"], dtype=np.float64),
-        np.array(packed["T_a_ego"], dtype=np.float64),
-        *(None if packed[name] is None else SweepTiming(*packed[name]) for name in ("sweep_a", "sweep_b")),
-    )
-
-
-def _packed_timing(timing: SweepTiming | None) -> list[float] | None:
-    return None if timing is None else [timing.period_s, timing.sign, timing.stamp_azimuth_rad]
-
-
-def pack_pose(T: Matrix4) -> list[list[float]]:
-    """A transform (4, 4) as rows."""
-    rows: list[list[float]] = T.tolist()
-    return rows
+def _motion(packed: bytes | None, limits: LimitsConfig) -> EgoMotion | None:
+    return decode_ego(packed, limits) if packed else None
 
 
 class Kind(StrEnum):
@@ -366,8 +321,8 @@ def check(
     """Has the monitor look at pairs at an extrinsic (4, 4); answered with `Checked`. The question brings the
     configuration of the moment at which it is asked, whatever the worker was started with."""
     body = {
-        "configuration": _configuration_document(configuration),
-        "pose": pack_pose(pose),
+        "configuration": configuration.model_dump(mode="json"),
+        "pose": pose.tolist(),
         "frames": pack_pairs(pairs),
     }
     return WorkerJob(Kind.CHECK, pair, "check", body, done)
@@ -375,14 +330,14 @@ def check(
 
 def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadline_s: float | None = None) -> WorkerJob:
     """Draws the last pair of a window's file at an extrinsic (4, 4); answered with `Drawn`."""
-    body = {"path": str(path), "pose": pack_pose(pose), "title": title}
+    body = {"path": str(path), "pose": pose.tolist(), "title": title}
     return WorkerJob(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
 
 
 def comparison(pair: str, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Done) -> WorkerJob:
     """Draws a window's file at two extrinsics (4, 4), where they differ most; `names` are their captions. Answered with
     `Drawn`."""
-    body = {"path": str(path), "poses": [pack_pose(pose) for pose in poses], "names": list(names)}
+    body = {"path": str(path), "poses": [pose.tolist() for pose in poses], "names": list(names)}
     return WorkerJob(Kind.OVERLAY, pair, path.stem, body, done)
 
 
@@ -391,8 +346,8 @@ def picture(
 ) -> WorkerJob:
     """Draws a pair of the stream at an extrinsic (4, 4); answered with `Drawn`."""
     body = {
-        "configuration": _configuration_document(configuration),
-        "pose": pack_pose(pose),
+        "configuration": configuration.model_dump(mode="json"),
+        "pose": pose.tolist(),
         "frames": pack_pairs([frame_pair]),
         "title": title,
     }
@@ -406,8 +361,8 @@ def commission(
     minutes, so it is done in slices: the worker answers `Underway` until it is complete."""
     body = {
         "run": next(_COMMISSIONINGS),
-        "configuration": _configuration_document(configuration),
-        "pose": pack_pose(pose),
+        "configuration": configuration.model_dump(mode="json"),
+        "pose": pose.tolist(),
         "paths": [str(path) for path in paths],
     }
     return WorkerJob(Kind.COMMISSION, pair, "commissioning", body, done)
@@ -415,12 +370,8 @@ def commission(
 
 def register(edge: str, rig: LidarRig, pairs: Sequence[SweepPair], done: Done) -> WorkerJob:
     """Finds the pose of one LiDAR in another from pairs of their sweeps; answered with `Registered`."""
-    body = {"lidars": pack_lidars(rig), "frames": pack_sweeps(pairs)}
+    body = {"lidars": wire_form().unstructure(rig), "frames": pack_pairs(pairs)}
     return WorkerJob(Kind.REGISTER, edge, "lidars", body, done)
-
-
-def _configuration_document(configuration: CalibrationConfig) -> dict[str, Any]:
-    return configuration.model_dump(mode="json")
 
 
 ARRAY = 1
@@ -431,28 +382,19 @@ class MalformedAnswerError(Exception):
     """An answer is not of the documented form. The message says what is wrong, but quotes none of its values."""
 
 
-@dataclass(frozen=True, slots=True)
-class _SolvedOnTheWire:
-    """`Solved` with the result in msgpack, as in the window's file and the history."""
-
-    result: bytes
-    note: Reason | None
-    written: WrittenFile | None
-
-
 def pack_answer(number: int, answer: Answer | None) -> dict[str, Any]:
     """The answer to the question of this number; None if the question asks for nothing."""
-    return {"id": number, "result": None if answer is None else _encoded(answer)}
+    return {"id": number, "result": None if answer is None else wire_form().unstructure(answer)}
 
 
 def pack_refusal(number: int, reason: Reason) -> dict[str, Any]:
     """The refusal of the question of this number, with its reason."""
-    return {"id": number, "refused": _encoded(reason)}
+    return {"id": number, "refused": wire_form().unstructure(reason)}
 
 
 def pack_underway(number: int, underway: Underway) -> dict[str, Any]:
     """The answer that the work of the question of this number is not complete."""
-    return {"id": number, "underway": _encoded(underway)}
+    return {"id": number, "underway": wire_form().unstructure(underway)}
 
 
 def number_of(message: Mapping[str, Any]) -> int:
@@ -476,109 +418,92 @@ def read_answer(message: Mapping[str, Any], kind: Kind | None) -> Answer | Under
     """
     content = {name: value for name, value in message.items() if name != "id"}
     if content.keys() == {"refused"}:
-        reason: Reason = _read(Reason, content["refused"])
-        return reason
+        return _read(Reason, content["refused"])
     if content.keys() == {"underway"} and kind is Kind.COMMISSION:
-        underway: Underway = _read(Underway, content["underway"])
-        return underway
+        return _read(Underway, content["underway"])
     if content.keys() != {"result"}:
         raise MalformedAnswerError("it is neither a result nor a refusal")
-    if kind is None:
-        if content["result"] is not None:
-            raise MalformedAnswerError("it is a result where none was asked for")
-        return None
-    if kind is Kind.SOLVE:
-        return _solved(_read(_SolvedOnTheWire, content["result"]))
-    answer: Answer = _read(ANSWERS[kind], content["result"])
-    return answer
+    if kind is not None:
+        return _read(ANSWERS[kind], content["result"])
+    if content["result"] is not None:
+        raise MalformedAnswerError("it is a result where none was asked for")
+    return None
 
 
-def _solved(wire: _SolvedOnTheWire) -> Solved:
-    # Imported here because the worker imports this module, too, and its first work, a check, needs no wire models.
-    from coec.schemas.replies import CalibrationResult
-
-    try:
-        return Solved(from_msgpack(CalibrationResult, wire.result), wire.note, wire.written)
-    except DecodeError as error:
-        raise MalformedAnswerError(str(error)) from error
-
-
-@cache
-def _reader() -> TypeAdapter[Any]:
-    """Reads a map into the dataclass with exactly its fields. Made at the first answer: only the service reads."""
-    settings = ConfigDict(arbitrary_types_allowed=True, extra="forbid")
-    forms = _SolvedOnTheWire | Checked | RenderedImage | Commissioned | Underway | Registered | Reason
-    return TypeAdapter(forms, config=settings)
-
-
-def _read(form: type, value: Any) -> Any:
-    """A value in one of the forms of `_reader`.
+def _read(form: type[T], value: Any) -> T:
+    """A value of this form, with exactly its fields.
 
     Raises:
         MalformedAnswerError: it is not in this form.
     """
     try:
-        read = _reader().validate_python(_decoded(value))
-    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
-        raise MalformedAnswerError(f"it is no {form.__name__.strip('_')}") from error
-    if not isinstance(read, form):
-        raise MalformedAnswerError(f"it is no {form.__name__.strip('_')}")
-    _check_shapes(read)
-    return read
+        return structured(wire_form(), value, form)
+    except MalformedValueError as error:
+        raise MalformedAnswerError(f"it is no {form.__name__}: {error}") from error
 
 
-def _check_shapes(read: object) -> None:
-    if isinstance(read, Commissioned) and not (read.pose.shape == (4, 4) and np.isfinite(read.pose).all()):
-        raise MalformedAnswerError("its pose is not 4×4 finite numbers")
-    if isinstance(read, Registered):
-        if not se3.is_rigid(read.T_a_b):
-            raise MalformedAnswerError("its pose is no rigid transform")
-        if read.covariance.shape != (6, 6) or not np.isfinite(read.covariance).all():
-            raise MalformedAnswerError("its covariance is not 6×6 finite numbers")
-    if isinstance(read, Checked):
-        parts = (read.observation, read.observation.drift)
-        values = (getattr(part, field.name) for part in parts if part is not None for field in fields(part))
-        if any(isinstance(value, np.ndarray) and value.shape != (6,) for value in values):
-            raise MalformedAnswerError("it has an array that is not of the six axes")
+@cache
+def wire_form() -> Converter:
+    """The rules by which answers, and the LiDARs of a registration, are packed and read. A result of a window is in
+    msgpack, as in the window's file and the history."""
+    form = make_converter(forbid_extra_keys=True)
+    form.register_structure_hook(float, _read_double)
+    form.register_structure_hook(bytes, _read_bytes)
+    axes, pose = _doubles(6), _doubles(4, 4, of="finite numbers", accepts=_are_finite)
+    register_form(form, SweepTiming)
+    register_form(form, LidarRig, T_a_b_nominal=pose, T_a_ego=pose)
+    register_form(form, BaselineDrift, value=axes, sigma=axes)
+    of_axes = ("offset", "sigma", "noise", "place", "first_derivative", "second_derivative")
+    register_form(form, Observation, **dict.fromkeys(of_axes, axes))
+    register_form(form, Solved, result=override(struct_hook=_read_result, unstruct_hook=to_msgpack))
+    register_form(form, Commissioned, pose=pose)
+    covariance = _doubles(6, 6, of="finite numbers", accepts=_are_finite)
+    rigid = _doubles(4, 4, of="numbers of a rigid transform", accepts=se3.is_rigid)
+    register_form(form, Registered, T_a_b=rigid, covariance=covariance)
+    return form
 
 
-def _encoded(value: Any) -> Any:
-    """The value as values that msgpack knows."""
-    if isinstance(value, BaseModel):
-        return to_msgpack(value)
-    if is_dataclass(value):
-        return {field.name: _encoded(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, np.ndarray):
-        doubles = np.ascontiguousarray(value, dtype="<f8")
+def _read_double(value: Any, _: object) -> float:
+    """Any double, NaN and infinity among them."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise MalformedValueError("expected a number")
+    return float(value)
+
+
+def _read_bytes(value: Any, _: object) -> bytes:
+    if not isinstance(value, bytes):
+        raise MalformedValueError("expected bytes")
+    return value
+
+
+def _read_result(value: Any, _: object) -> CalibrationResult:
+    # Imported here because the worker imports this module, too, and its first work, a check, needs no wire models.
+    from coec.schemas.replies import CalibrationResult
+
+    return from_msgpack(CalibrationResult, value)
+
+
+def _are_finite(array: NDArray[np.float64]) -> bool:
+    return bool(np.isfinite(array).all())
+
+
+def _doubles(*shape: int, of: str = "numbers", accepts: Callable[[NDArray[np.float64]], bool] = lambda _: True) -> Any:
+    """A field that is an array of this shape: an extension type, to the bit."""
+
+    def pack(array: NDArray[np.float64]) -> msgpack.ExtType:
+        doubles = np.ascontiguousarray(array, dtype="<f8")
         return msgpack.ExtType(ARRAY, msgpack.packb([doubles.shape, doubles.tobytes()]))
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, tuple):
-        return [_encoded(entry) for entry in value]
-    return value
 
+    def read(value: Any, _: object) -> NDArray[np.float64]:
+        if not isinstance(value, msgpack.ExtType) or value.code != ARRAY:
+            raise MalformedValueError("expected an array")
+        packed_shape, doubles = msgpack.unpackb(value.data)
+        array = np.frombuffer(doubles, "<f8").reshape(packed_shape).astype(np.float64)
+        if array.shape != shape or not accepts(array):
+            raise MalformedValueError(f"expected {' × '.join(map(str, shape))} {of}")
+        return array
 
-def _decoded(value: Any) -> Any:
-    """The value with the arrays that `_packed` packed, at any depth."""
-    if isinstance(value, msgpack.ExtType):
-        return _array(value)
-    if isinstance(value, dict):
-        return {name: _decoded(entry) for name, entry in value.items()}
-    if isinstance(value, list):
-        return [_decoded(entry) for entry in value]
-    return value
-
-
-def _array(packed: msgpack.ExtType) -> NDArray[np.float64]:
-    """The array in an extension type.
-
-    Raises:
-        ValueError, TypeError, UnpackException: it holds no array.
-    """
-    if packed.code != ARRAY:
-        raise ValueError("an extension type that is no array")
-    shape, doubles = msgpack.unpackb(packed.data)
-    return np.frombuffer(doubles, "<f8").reshape(shape).astype(np.float64)
+    return override(struct_hook=read, unstruct_hook=pack)
 
 
 START, IDLE, BACKLOG = "start", "idle", "backlog"
