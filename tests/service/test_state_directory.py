@@ -15,8 +15,7 @@ from coec.errors import ConfigError, UnavailableError
 from coec.io.baseline_file import BASELINES, load_baseline, save_baseline
 from coec.io.disk_writer import DiskWriter
 from coec.service.process_lifetime import locked
-from coec.service.records.rig_baseline import RigBaseline
-from coec.service.records.rig_store import RIG_FILE
+from coec.service.records.rig_store import RIG_FILE, RigBaseline
 from support.estimates import a_baseline
 from support.fake_worker import wait_until
 from support.vehicles import BEGIN_S, DRIVE_END_S, PAIR_RIG, STEP_S, PairBench, pair_configuration

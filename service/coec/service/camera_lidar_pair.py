@@ -29,7 +29,7 @@ from coec.service.ingest.pair_stream import PairStream
 from coec.service.recording.recorder import Recorder, RecordingPlan
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.records.pair_store import PairStore
-from coec.service.records.rig_baseline import RigBaseline
+from coec.service.records.rig_store import RigBaseline
 from coec.service.task_queue import TaskQueue
 from coec.service.vehicle_context import VehicleContext
 

@@ -39,7 +39,7 @@ from coec.service.ingest.frame_selector import ServedExtrinsic
 from coec.service.ingest.pair_stream import StreamStatistics
 from coec.service.recording.window_store import WindowVersion, start_ns_of
 from coec.service.records.pair_store import PairStore, StateTransition
-from coec.service.records.rig_baseline import RigBaseline
+from coec.service.records.rig_store import RigBaseline
 from coec.service.task_queue import TaskQueue
 from coec.service.worker.job_queue import STOPPING
 from coec.service.worker.worker_jobs import Checked, Commissioned, JobOutcome, Solved, WrittenFile
