@@ -352,7 +352,7 @@ class Result:
         Raises:
             DecodeError: the image cannot be decoded.
         """
-        # matplotlib takes a second to import.
+        # Few programs draw.
         from coec.reports import pictures
 
         window = self._solution.window

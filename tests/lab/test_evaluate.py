@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -352,3 +354,11 @@ def test_what_does_not_go_together_is_refused_before_the_work(
     outcome = coec(*arguments)
     assert outcome.status == 2
     assert said in outcome.err
+
+
+def test_a_user_without_a_home_gets_plots_without_words_of_the_library_that_draws(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    env = {"PYTHONPATH": ":".join(sys.path), "HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", "import coec_lab, matplotlib.figure"]
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -27,9 +27,8 @@ def _said(window: Window, T_before: Matrix4, T_after: Matrix4, caption: Caption)
     return sentences(window, telling, shift, T_before, T_after, caption)
 
 
-def _share_of(picture: np.ndarray, colour: str) -> float:
-    bgr = np.array([int(colour[k : k + 2], 16) for k in (5, 3, 1)], np.int64)
-    return float((np.abs(picture.astype(np.int64) - bgr).max(axis=2) < 8).mean())
+def _share_of(picture: np.ndarray, colour: tuple[int, int, int]) -> float:
+    return float((np.abs(picture.astype(np.int64) - colour).max(axis=2) < 8).mean())
 
 
 def test_the_words_tell_time_difference_spread_and_network() -> None:

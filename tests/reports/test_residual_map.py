@@ -13,8 +13,14 @@ from coec.config import LimitsConfig
 from coec.geometry import se3
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.io.images import GreyImages
-from coec.reports import lens_residual as lens
-from coec.reports.residual_map import local_shifts, residual_map, sentences
+from coec.reports.residual_map import (
+    lens_residual,
+    lens_sentences,
+    local_shifts,
+    residual_map,
+    residuals_px,
+    sentences,
+)
 from support import scenes
 
 
@@ -46,18 +52,18 @@ def test_a_picture_without_a_range_edge_says_that_nothing_is_told() -> None:
 
 def test_an_exact_fit_leaves_nothing_and_another_what_the_fit_says() -> None:
     exact = scenes.POST_LENSES["double_sphere"]
-    assert "0 px" in lens.sentences(exact, exact, np.zeros(4))[0]
+    assert "0 px" in lens_sentences(exact, exact, np.zeros(4))[0]
     fisheye = scenes.POST_LENSES["kannala_brandt"]
     fit = fit_double_sphere(fisheye)
     cells = (np.arange(64) + 0.5) / 64  # as the fit compares them
     u, v = np.meshgrid(640 * cells - 0.5, 360 * cells - 0.5)
-    apart = lens.residuals_px(fisheye, fit.camera, np.column_stack([u.ravel(), v.ravel()]))
+    apart = residuals_px(fisheye, fit.camera, np.column_stack([u.ravel(), v.ravel()]))
     size = np.linalg.norm(apart, axis=1)
     assert np.sqrt((size**2).mean()) == pytest.approx(fit.residual_rms_px, rel=1e-6)
     assert 0.5 * fit.residual_max_px < size.max() <= fit.residual_max_px
     said = f"{fit.residual_rms_px:.3g} px rms, {fit.residual_max_px:.3g} px at most"
-    assert said in lens.sentences(fisheye, fit.camera, size)[0]
-    picture = lens.lens_residual(fisheye, fit.camera)
+    assert said in lens_sentences(fisheye, fit.camera, size)[0]
+    picture = lens_residual(fisheye, fit.camera)
     assert picture.shape[2] == 3
     assert (picture[:4] == 255).all()
 
@@ -65,6 +71,6 @@ def test_an_exact_fit_leaves_nothing_and_another_what_the_fit_says() -> None:
 def test_where_one_has_no_pixel_nothing_is_told() -> None:
     wide, narrow = scenes.POST_LENSES["double_sphere"], scenes.POST_LENSES["mei"]
     corner = np.array([[-5000.0, -5000.0], [320.0, 180.0]])
-    apart = lens.residuals_px(narrow, wide, corner)
+    apart = residuals_px(narrow, wide, corner)
     assert np.isnan(apart[0]).all()
     assert np.isfinite(apart[1]).all()

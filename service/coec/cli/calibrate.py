@@ -185,7 +185,6 @@ def picture_of_lens_error(folder: Path | None, camera: Camera) -> Iterator[None]
             raise LensError(
                 f"{error}; with --output DIR a picture shows where in the image it is off", error.details
             ) from error
-        # matplotlib takes a second to import.
         from coec.reports import pictures
 
         path = pictures.write_lens(folder, camera, fit_double_sphere(camera).camera)

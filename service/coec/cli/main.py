@@ -13,7 +13,6 @@ import _thread
 import errno
 import inspect
 import json
-import logging
 import os
 import platform
 import signal
@@ -185,8 +184,6 @@ def main() -> int:
     as_json = "--json" in sys.argv[1:]
     plain_text.never_fail()
     plain_text.escape_interpreter()
-    # Without a home directory, matplotlib warns about where it keeps fonts, which is of no interest here.
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         command = typer.main.get_command(application(sys.argv[1:]))
         if not plain_text.is_unicode(sys.stdout.encoding):

@@ -1,8 +1,4 @@
 """Two extrinsics next to each other, enlarged where they differ most, so that a glance shows which of them is right.
-The range edges of the sweep are drawn over the grey image, joined by lines where they form an outline: this shows
-an offset of a few pixels from the edge of a pole, which ten thousand coloured points do not. Both colours are from
-Okabe and Ito's palette (2008), distinct in any colour vision, and neither occurs in a grey image. Axes are laid out
-to the pixel.
 
 The range edges of the sweep are drawn over the grey image, joined by lines where they form an outline: this shows an
 offset of a few pixels from the edge of a pole, which ten thousand coloured points do not. Both colours are from Okabe
@@ -11,18 +7,12 @@ and Ito's palette (2008), distinct in any colour vision, and neither occurs in a
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees
 
 import cv2
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle as Patch
 from numpy.typing import NDArray
 
 from coec.calibration.types import Matrix4, Rig, Window
@@ -32,6 +22,7 @@ from coec.geometry.cameras import Camera
 from coec.geometry.edges.image_edges import Rectangle
 from coec.geometry.projection import unproject
 from coec.io.images import GreyImages, decode_bgr
+from coec.reports import drawing
 from coec.reports.difference_regions import (
     DifferenceRegion,
     DifferenceRegions,
@@ -41,55 +32,16 @@ from coec.reports.difference_regions import (
     project_outlines,
     shift_px,
 )
+from coec.reports.drawing import LABEL_PX, LINE_PX, TEXT_PX, Pixels
 from coec.reports.formatting import count, instant, number
-
-DPI = 100
-"""A point of type is 1.4 px: type of 9 points, the smallest, is legible without enlarging."""
-
-LETTER_PX = 8.4
-"""Average width of a letter of bold 10-point type, in lines with many figures."""
 
 BAR_SHARE = 0.3
 """A scale bar takes at most this share of the width."""
 
 BAR_LENGTHS_PX = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
-
-def box(figure: Figure, left: int, top: int, width: int, height: int) -> Axes:
-    """Axes at these pixels of the figure, counted from its upper left corner."""
-    across, down = figure.get_size_inches() * figure.dpi
-    return figure.add_axes((left / across, 1.0 - (top + height) / down, width / across, height / down))
-
-
-def scale_bar(axes: Axes, camera: Camera, part: Rectangle) -> None:
-    """Draws a scale bar in the lower left corner of a part of an image, with its length in pixels and degrees."""
-    length = max((bar for bar in BAR_LENGTHS_PX if bar <= BAR_SHARE * part.width), default=BAR_LENGTHS_PX[0])
-    x, y = part.left - 0.5 + 0.03 * part.width, part.top - 0.5 + 0.93 * part.height
-    u, v = part.left + 0.5 * part.width, part.top + 0.5 * part.height
-    rays, valid = unproject(camera, np.array([[u - 0.5 * length, v], [u + 0.5 * length, v]]))
-    angle = f" = {degrees(np.arccos(np.clip(rays[0] @ rays[1], -1.0, 1.0))):.2f}°" if valid.all() else ""
-    axes.add_patch(Patch((x, y), length, 0.025 * part.height, facecolor="white", edgecolor="black", zorder=4))
-    axes.text(
-        x, y - 0.02 * part.height, f"{length} px{angle}", size=9, va="bottom", zorder=4,
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.85},
-    )  # fmt: skip
-
-
-def folded(lines: Sequence[str], width_px: int) -> list[str]:
-    """The lines wrapped so that none is wider than `width_px` in 10-point type."""
-    return [part for line in lines for part in textwrap.wrap(line, int(width_px / LETTER_PX))]
-
-
-def bgr_of(figure: Figure) -> NDArray[np.uint8]:
-    """The drawn figure, (H, W, 3) uint8 BGR."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    rgba = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-    return np.asarray(cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGR), dtype=np.uint8)
-
-
-COLOURS = ("#E69F00", "#56B4E9")
-"""Colours of the two extrinsics: orange, sky blue."""
+COLOURS = ((0, 159, 230), (233, 180, 86))
+"""Colours of the two extrinsics, BGR: orange, sky blue."""
 
 PLACES = 3
 """Most close-ups."""
@@ -98,6 +50,9 @@ NAMES = "ABC"
 
 PANEL_PX = (490, 350)
 """Width and height of a panel."""
+
+DOT_PX = 2.7
+"""Radius of a dot."""
 
 SHOWN_PX = 20.0
 """Wanted distance between the two extrinsics on the screen: several times the width of a line."""
@@ -108,8 +63,8 @@ ENLARGED = (1.5, 10.0)
 OVERVIEW_PX = 340
 """Largest height of the whole image."""
 
-GAP_PX, AXIS_PX, TITLE_PX, LINE_PX = 12, 44, 26, 20
-"""Gap between panels; room left of and below a panel for its axes; room above it; height of a line of text."""
+GAP_PX, AXIS_PX, TITLE_PX = 12, 44, 26
+"""Gap between panels; room left of and below a panel for its axes; room above it."""
 
 SAME_PX = 0.05
 """Extrinsics that differ by less, everywhere in the image, look the same at any enlargement."""
@@ -145,7 +100,7 @@ def close_ups(
     compensated: bool = True,
     caption: Caption = PLAIN,
     limits: LimitsConfig | None = None,
-) -> NDArray[np.uint8]:
+) -> Pixels:
     """The image of a pair, and the parts of it in which two extrinsics (4, 4) differ most, drawn at each of them.
 
     Args:
@@ -172,25 +127,24 @@ def close_ups(
     pair = window.pairs[telling.index]
     image = decode_bgr(pair.camera.image, bounds)
     width = 2 * (AXIS_PX + PANEL_PX[0]) + 3 * GAP_PX
-    lines = folded(sentences(window, telling, shift, T_before, T_after, caption), width - 2 * GAP_PX)
-    overview = _fitted(camera.width, camera.height, (width - 2 * GAP_PX, OVERVIEW_PX))
+    text = drawing.folded(sentences(window, telling, shift, T_before, T_after, caption), width - 2 * GAP_PX)
+    overview = drawing.fitted(camera.width, camera.height, (width - 2 * GAP_PX, OVERVIEW_PX))
     row_px = TITLE_PX + PANEL_PX[1] + AXIS_PX
-    height = GAP_PX + LINE_PX * len(lines) + GAP_PX + overview[1] + GAP_PX + row_px * len(telling.regions)
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
-    for index, line in enumerate(lines):
-        weight = "bold" if index == 0 else "normal"
-        figure.text(GAP_PX / width, 1 - (GAP_PX + LINE_PX * index) / height, line, va="top", weight=weight, size=10)
-    top = GAP_PX + LINE_PX * len(lines) + GAP_PX
-    _overview(box(figure, (width - overview[0]) // 2, top, *overview), image, telling.regions)
+    top = GAP_PX + LINE_PX * len(text) + GAP_PX
+    picture = drawing.blank(width, top + overview[1] + GAP_PX + row_px * len(telling.regions))
+    drawing.heading(picture, text, GAP_PX, GAP_PX)
+    _overview(picture, Rectangle((width - overview[0]) // 2, top, *overview), image, telling.regions)
     for row, place in enumerate(telling.regions):
         below = top + overview[1] + GAP_PX + row_px * row + TITLE_PX
         for column, (T, name) in enumerate(((T_before, caption.before), (T_after, caption.after))):
             left = GAP_PX + AXIS_PX + column * (PANEL_PX[0] + GAP_PX + AXIS_PX)
-            axes = box(figure, left, below, *_fitted(place.part.width, place.part.height, PANEL_PX))
-            _panel(axes, image, window.rig, telling.outlines, T, place.part, COLOURS[column])
+            shown = Rectangle(left, below, *drawing.fitted(place.part.width, place.part.height, PANEL_PX))
+            panel = picture[shown.slices]
+            _panel(panel, image, window.rig, telling.outlines, T, place.part, COLOURS[column])
+            drawing.axes(picture, shown, place.part)
             strength = number(place.strength[column], 1, sign=True)
-            axes.set_title(f"{NAMES[row]}  {name}: {strength} σ", loc="left", size=10, pad=5, color="black")
-    return bgr_of(figure)
+            drawing.write(picture, f"{NAMES[row]}  {name}: {strength} σ", (left, below - 8))
+    return picture
 
 
 def difference_text(T_before: Matrix4, T_after: Matrix4) -> str:
@@ -249,55 +203,62 @@ def _axes_text(difference: NDArray[np.float64], sigma: NDArray[np.float64] | Non
     return ", ".join(parts)
 
 
-def _fitted(width: int, height: int, within: tuple[int, int]) -> tuple[int, int]:
-    """The largest size of this shape that fits `within`."""
-    factor = min(within[0] / width, within[1] / height)
-    return max(1, round(width * factor)), max(1, round(height * factor))
-
-
-def _overview(axes: Axes, image_bgr: NDArray[np.uint8], regions: Sequence[DifferenceRegion]) -> None:
-    height, width = image_bgr.shape[:2]
-    axes.imshow(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2RGB), extent=(-0.5, width - 0.5, height - 0.5, -0.5))
-    axes.set_axis_off()
+def _overview(picture: Pixels, shown: Rectangle, image_bgr: Pixels, regions: Sequence[DifferenceRegion]) -> None:
+    view = picture[shown.slices]
+    smaller = shown.width < image_bgr.shape[1]
+    view[:] = cv2.resize(
+        image_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
+    )
+    whole = Rectangle(0, 0, image_bgr.shape[1], image_bgr.shape[0])
     for name, place in zip(NAMES, regions, strict=False):
         part = place.part
-        for colour, line_width in (("black", 3.5), ("white", 1.5)):
-            corner = (part.left - 0.5, part.top - 0.5)
-            axes.add_patch(Patch(corner, part.width, part.height, fill=False, ec=colour, lw=line_width))
-        axes.text(
-            part.left, part.top, name, size=11, weight="bold", va="bottom" if part.top > 0.1 * height else "top",
-            bbox={"facecolor": "white", "edgecolor": "black", "pad": 2}, clip_on=True,
-        )  # fmt: skip
+        corners = np.array([(part.left, part.top), (part.left + part.width, part.top + part.height)]) - 0.5
+        (left, top), (right, bottom) = np.rint(drawing.places(corners, whole, shown) + 0.5).astype(int).tolist()
+        sides = Rectangle(left, top, right - left, bottom - top)
+        drawing.outline(view, sides, drawing.BLACK, 5)
+        drawing.outline(view, sides, drawing.WHITE, 2)
+        box = Rectangle(left, top - 20 if top > 20 else top, 19, 20)
+        drawing.tint(view, box, drawing.WHITE)
+        drawing.outline(view, box, drawing.BLACK)
+        drawing.write(view, name, (box.left + 9.5, box.top + 15.5), TEXT_PX, align=0.5, bold=True)
 
 
 def _panel(
-    axes: Axes,
-    image_bgr: NDArray[np.uint8],
+    panel: Pixels,
+    image_bgr: Pixels,
     rig: Rig,
     outlines: Outlines,
     T_camera_lidar: Matrix4,
     part: Rectangle,
-    colour: str,
+    colour: drawing.Colour,
 ) -> None:
-    left, right = part.left - 0.5, part.left + part.width - 0.5
-    top, bottom = part.top - 0.5, part.top + part.height - 0.5
-    grey = cv2.cvtColor(np.ascontiguousarray(image_bgr[part.slices]), cv2.COLOR_BGR2GRAY)
+    height, width = panel.shape[:2]
+    grey = cv2.cvtColor(np.ascontiguousarray(image_bgr[part.slices]), cv2.COLOR_BGR2GRAY).astype(np.float32)
     darkest, brightest = np.percentile(grey, (1.0, 99.0))
     margin = CONTRAST_SHARE * max(1.0, brightest - darkest)
-    axes.imshow(
-        grey, cmap="gray", vmin=darkest - margin, vmax=brightest + margin, extent=(left, right, bottom, top),
-        interpolation="bicubic",
-    )  # fmt: skip
+    stretched = (grey - darkest + margin) * (255.0 / (brightest - darkest + 2.0 * margin))
+    enlarged = cv2.resize(stretched, (width, height), interpolation=cv2.INTER_CUBIC)
+    panel[:] = np.clip(np.rint(enlarged), 0.0, 255.0)[..., None]
     at = project_outlines(outlines, rig, T_camera_lidar)
-    pieces = at.uv_px[outlines.pieces[at.seen[outlines.pieces].all(axis=1)]]
-    for colour_of_line, line_width in (("black", 4.5), (colour, 2.5)):
-        axes.add_collection(
-            LineCollection(list(pieces), colors=colour_of_line, linewidths=line_width, capstyle="round")
-        )
+    on_panel = drawing.places(at.uv_px, part, Rectangle(0, 0, width, height))
+    pieces = on_panel[outlines.pieces[at.seen[outlines.pieces].all(axis=1)]]
+    for colour_of_line, line_width in ((drawing.BLACK, 4), (colour, 2)):
+        drawing.lines(panel, pieces, colour_of_line, line_width)
     alone = at.seen.copy()
     alone[outlines.pieces.ravel()] = False
-    u, v = at.uv_px[alone].T
-    axes.scatter(u, v, s=14, c=colour, edgecolors="black", linewidths=0.7, zorder=2)
-    axes.set(xlim=(left, right), ylim=(bottom, top))
-    axes.tick_params(labelsize=9)
-    scale_bar(axes, rig.camera, part)
+    drawing.dots(panel, on_panel[alone], colour, DOT_PX)
+    _scale_bar(panel, rig.camera, part)
+
+
+def _scale_bar(panel: Pixels, camera: Camera, part: Rectangle) -> None:
+    """Draws a scale bar in the lower left corner of a part of an image, with its length in pixels and degrees."""
+    height, width = panel.shape[:2]
+    length = max((bar for bar in BAR_LENGTHS_PX if bar <= BAR_SHARE * part.width), default=BAR_LENGTHS_PX[0])
+    u, v = part.left + 0.5 * part.width, part.top + 0.5 * part.height
+    rays, valid = unproject(camera, np.array([[u - 0.5 * length, v], [u + 0.5 * length, v]]))
+    angle = f" = {degrees(np.arccos(np.clip(rays[0] @ rays[1], -1.0, 1.0))):.2f}°" if valid.all() else ""
+    x, y = round(0.03 * width), round(0.93 * height)
+    bar = Rectangle(x, y, round(length * width / part.width), max(4, round(0.025 * height)))
+    drawing.tint(panel, bar, drawing.WHITE)
+    drawing.outline(panel, bar, drawing.BLACK)
+    drawing.write(panel, f"{length} px{angle}", (x + 2, y - 0.02 * height - 3), LABEL_PX, ground=0.85)

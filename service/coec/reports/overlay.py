@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +9,7 @@ from coec.calibration.types import Matrix4
 from coec.geometry.cameras import Camera
 from coec.geometry.projection import points_in_view
 from coec.io.images import NEAREST_M, RangeScale, scale_of
+from coec.reports.drawing import Pixels, write
 
 MIN_WIDTH_PX = 960
 """Narrower images are enlarged by a whole factor, so that the title is legible."""
@@ -24,8 +24,8 @@ LINE_SHARE, BAR_SHARE = 1 / 44, 1 / 36
 """Height of a line of the title, and of the bar of ranges, as shares of the width."""
 
 INK, PAPER = (24, 24, 24), (250, 250, 250)
-
-Pixels = NDArray[np.uint8]
+TYPE_SHARE = 0.85
+"""Size of type as a share of the height of its line."""
 
 
 def render_points(
@@ -91,11 +91,11 @@ def _stamp(
 
 def _title(width: int, title: str) -> Pixels:
     height = round(width * LINE_SHARE)
-    # The font has ASCII letters only.
-    lines = title.replace("\u00b0", " deg").split("\n")[:LINES]
+    lines = title.split("\n")[:LINES]
     strip = np.full((height * len(lines) + height // 4, width, 3), PAPER, dtype=np.uint8)
     for number, line in enumerate(lines):
-        _write(strip[number * height :], line, 0.01 * width, height)
+        place = (0.01 * width, (number + 0.8) * height)
+        write(strip, line, place, round(TYPE_SHARE * height), colour=INK)
     return strip
 
 
@@ -108,11 +108,5 @@ def _bar(width: int, scale: RangeScale) -> Pixels:
     for tick_m in scale.ticks_m():
         place = left + float(scale.share_of(tick_m)) * (right - left - 1)
         strip[height // 8 : height // 2 + 2, round(place)] = INK
-        _write(strip[height // 2 :], f"{tick_m:g} m", place - 0.012 * width, height // 2)
+        write(strip, f"{tick_m:g} m", (place - 0.012 * width, 0.9 * height), round(TYPE_SHARE * height / 2), colour=INK)
     return strip
-
-
-def _write(strip: Pixels, text: str, x_px: float, height_px: int) -> None:
-    font, scale = cv2.FONT_HERSHEY_SIMPLEX, height_px / 32
-    where = (max(0, round(x_px)), round(0.8 * height_px))
-    cv2.putText(strip, text, where, font, scale, INK, max(1, round(height_px / 20)), cv2.LINE_AA)

@@ -19,11 +19,10 @@ from coec.io.images import NEAREST_M, decode_bgr, encode_jpeg, encode_png, scale
 from coec.io.user_files import write_output
 from coec.reports.close_ups import Caption, close_ups, difference_text
 from coec.reports.formatting import instant
-from coec.reports.lens_residual import lens_residual
 from coec.reports.overlay import render_points, titled
 from coec.reports.page import Block, Compare, Picture, Pictures, Text
 from coec.reports.page_parts import file_picture
-from coec.reports.residual_map import residual_map
+from coec.reports.residual_map import lens_residual, residual_map
 
 PAGE_JPEG_QUALITY = 95
 """JPEG quality of pictures for a page, which shrinks large ones again."""

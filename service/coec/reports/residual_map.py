@@ -1,42 +1,34 @@
-"""Where in the image range edges and image edges agree at an extrinsic, and in which direction they differ. The image
-is cut into cells. In each cell the range edges of all pairs are shifted together by a few pixels, and the shift at
-which they fit the image best is reported: zero where extrinsic and lens are right. If all arrows point one way, the
-extrinsic is wrong; arrows only at the rim mean a wrong lens, arrows only on near objects a wrong translation.
-Colours go from pale to dark (reversed viridis), so that they can be read in grey, too.
+"""Maps of what is left over the image: where range edges and image edges agree at an extrinsic, and how far a camera
+model is from the one that it was fitted to. Colours go from pale to dark, so that they can be read in grey, too.
 
 The picture is cut into cells. In each cell the range edges of all pairs are shifted together by a few pixels, and the
-shift at which they fit the image best is reported: zero where extrinsic and lens are right, not zero where they are
-wrong. A turn of the camera shifts all cells alike, a wrong lens those at the rim, a step those with near objects.
-
-If all arrows point one way, the extrinsic is wrong; arrows only at the rim mean a wrong lens, arrows only on near
-objects a wrong translation. Colours go from pale to dark (reversed viridis), so that they can be read in grey, too.
+shift at which they fit the image best is reported: zero where extrinsic and lens are right. A rotation of the camera
+shifts all cells alike, a wrong lens those at the rim, a translation those with near objects.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import degrees
+from math import degrees, floor, log10
 
 import cv2
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import FramePair, ImageReader, Matrix4, Rig, Window
 from coec.config import LimitsConfig
 from coec.errors import CalibrationError
-from coec.geometry.cameras import Camera, pixel_rad
-from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales
+from coec.geometry.cameras import Camera, name_of, pixel_rad
+from coec.geometry.cameras.double_sphere_fit import residual
+from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales, Rectangle
 from coec.geometry.edges.range_edges import range_edges
-from coec.geometry.projection import points_in_view
+from coec.geometry.projection import points_in_view, project, unproject
 from coec.io.images import GreyImages, decode_grey
-from coec.reports.close_ups import DPI, bgr_of, box, folded
+from coec.reports import drawing
+from coec.reports.charts import Tick, linear_ticks, tick_label
 from coec.reports.difference_regions import evenly
+from coec.reports.drawing import LABEL_PX, LINE_PX, Pixels
 from coec.reports.formatting import count, instant, number
 
 FRAMES = 25
@@ -211,10 +203,8 @@ def _summit(before: float, top: float, after: float) -> float:
 PICTURE_PX = (1060, 900)
 """Largest width and height of the image: with twelve cells in a row, each has room for its figures."""
 
-MARGIN_PX, LINE_PX, BAR_PX, BAR_AXIS_PX = 12, 20, 16, 46
-"""Margin about the picture, height of a line of text, height of the colour bar, room for its figures."""
-
-COLOURS = "viridis_r"
+MARGIN_PX, BAR_PX, BAR_AXIS_PX = 12, 16, 46
+"""Margin about the picture, height of the colour scale, room for its figures."""
 
 FADED = 0.45
 """How much of the image's contrast is left as it fades to white."""
@@ -228,16 +218,11 @@ MOST = 0.9
 LEAST_END_PX = 3.0
 """Least end of the colour scale: smaller shifts are the scatter of range edges."""
 
-QUIET = "#444444"
-"""Colour of the figure in a cell that does not tell."""
-
 ARROW_SHARE = 0.42
 """The longest arrow, as a share of a cell's shorter side."""
 
 
-def residual_map(
-    window: Window, T_camera_lidar: Matrix4, *, compensated: bool = True, name: str = ""
-) -> NDArray[np.uint8]:
+def residual_map(window: Window, T_camera_lidar: Matrix4, *, compensated: bool = True, name: str = "") -> Pixels:
     """The map of a window at an extrinsic (4, 4), which is called `name`.
 
     Returns:
@@ -250,8 +235,8 @@ def residual_map(
     """
     shifts = local_shifts(window, GreyImages(LimitsConfig()), T_camera_lidar, compensated=compensated)
     pair = window.pairs[len(window.pairs) // 2]
-    lines = folded(sentences(window, shifts, name), PICTURE_PX[0])
-    return _render(decode_grey(pair.camera.image, LimitsConfig()), shifts, lines)
+    text = drawing.folded(sentences(window, shifts, name), PICTURE_PX[0])
+    return _render(decode_grey(pair.camera.image, LimitsConfig()), shifts, text)
 
 
 def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
@@ -282,63 +267,146 @@ def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
     return lines
 
 
-def _render(grey: NDArray[np.uint8], shifts: LocalShifts, lines: list[str]) -> NDArray[np.uint8]:
-    height, width = grey.shape
-    factor = min(PICTURE_PX[0] / width, PICTURE_PX[1] / height)
-    shown = max(1, round(width * factor)), max(1, round(height * factor))
-    top = MARGIN_PX + LINE_PX * len(lines) + MARGIN_PX
-    total = (PICTURE_PX[0] + 2 * MARGIN_PX, top + shown[1] + MARGIN_PX + BAR_PX + BAR_AXIS_PX)
-    figure = Figure(figsize=(total[0] / DPI, total[1] / DPI), dpi=DPI, facecolor="white")
-    for index, line in enumerate(lines):
-        place = (MARGIN_PX / total[0], 1.0 - (MARGIN_PX + LINE_PX * index) / total[1])
-        figure.text(*place, line, va="top", size=10, weight="bold" if index == 0 else "normal")
-    axes = box(figure, MARGIN_PX + (PICTURE_PX[0] - shown[0]) // 2, top, *shown)
-    pale = 255.0 - FADED * (255.0 - cv2.resize(grey, shown, interpolation=cv2.INTER_AREA))
-    axes.imshow(pale, cmap="gray", vmin=0, vmax=255, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    axes.set_axis_off()
+def _render(grey: Pixels, shifts: LocalShifts, text: list[str]) -> Pixels:
+    shown_px = drawing.fitted(grey.shape[1], grey.shape[0], PICTURE_PX)
+    top = MARGIN_PX + LINE_PX * len(text) + MARGIN_PX
+    picture = drawing.blank(PICTURE_PX[0] + 2 * MARGIN_PX, top + shown_px[1] + MARGIN_PX + BAR_PX + BAR_AXIS_PX)
+    drawing.heading(picture, text, MARGIN_PX, MARGIN_PX)
+    shown = Rectangle(MARGIN_PX + (PICTURE_PX[0] - shown_px[0]) // 2, top, *shown_px)
+    view = picture[shown.slices]
+    view[:] = np.rint(255.0 - FADED * (255.0 - cv2.resize(grey, shown_px, interpolation=cv2.INTER_AREA)))[..., None]
     # A quantile, so that a cell that matches a wrong edge does not pale all others.
     large = float(np.quantile(shifts.size_px[shifts.known], MOST)) if shifts.known.any() else 0.0
     end_px = max(LEAST_END_PX, large)
-    colours = ScalarMappable(Normalize(0.0, end_px), COLOURS)
     for row, column in np.ndindex(shifts.edges.shape):
-        _cell(axes, shifts, (row, column), (width, height), colours, end_px)
-    bar = box(figure, MARGIN_PX + PICTURE_PX[0] // 4, top + shown[1] + MARGIN_PX, PICTURE_PX[0] // 2, BAR_PX)
-    label = "range edges beside edges of the image, px"
-    figure.colorbar(colours, cax=bar, orientation="horizontal", extend="max", label=label)
-    return bgr_of(figure)
+        _cell(view, shifts, (row, column), end_px)
+    bar = Rectangle(MARGIN_PX + PICTURE_PX[0] // 4, top + shown_px[1] + MARGIN_PX, PICTURE_PX[0] // 2, BAR_PX)
+    ticks = [Tick(value / end_px, tick_label(value)) for value in linear_ticks(0.0, end_px, 8)]
+    drawing.colour_scale(picture, bar, ticks, "range edges beside edges of the image, px", open_end=True)
+    return picture
 
 
-def _cell(
-    axes: Axes,
-    shifts: LocalShifts,
-    place: tuple[int, int],
-    image_px: tuple[int, int],
-    colours: ScalarMappable,
-    end_px: float,
-) -> None:
+def _cell(view: Pixels, shifts: LocalShifts, place: tuple[int, int], end_px: float) -> None:
     """Draws a cell; nothing where it has no range edge."""
-    row, column = place
-    if shifts.edges[row, column] == 0:
+    if shifts.edges[place] == 0:
         return
-    rows, columns = shifts.edges.shape
-    width, height = image_px[0] / columns, image_px[1] / rows
-    left, top = column * width - 0.5, row * height - 0.5
-    u, v = left + 0.5 * width, top + 0.5 * height
-    ink, size = QUIET, ""
-    if shifts.known[row, column]:
-        ink, length = "black", float(shifts.size_px[row, column])
-        size = f"{length:.1f} px\n"
-        colour = colours.to_rgba(np.array(length))
-        axes.add_patch(Rectangle((left, top), width, height, facecolor=colour, edgecolor="none", alpha=COVER))
-        longest = ARROW_SHARE * min(width, height) / max(end_px, length)
-        right, down = (longest * shifts.shift_px[row, column]).tolist()
-        for line_width, line_colour in ((4.0, "white"), (1.8, "black")):
-            arrow = {"arrowstyle": "->", "color": line_colour, "linewidth": line_width, "shrinkA": 0, "shrinkB": 0}
-            middle = (u, v - 0.15 * height)
-            axes.annotate("", (u + right, middle[1] + down), middle, arrowprops=arrow, zorder=5)
-    axes.add_patch(Rectangle((left, top), width, height, fill=False, edgecolor="white", linewidth=0.8))
-    axes.text(
-        u, top + 0.97 * height, f"{size}{shifts.edges[row, column]}", ha="center", va="bottom", size=9, color=ink,
-        linespacing=1.0, bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.7},
-    )  # fmt: skip
+    ends = (
+        [round(length * index / parts) for index in (k, k + 1)]
+        for length, parts, k in zip(view.shape[:2], shifts.edges.shape, place, strict=True)
+    )
+    (top, bottom), (left, right) = ends
+    cell = Rectangle(left, top, right - left, bottom - top)
+    sides = Rectangle(left, top, right - left + 1, bottom - top + 1)  # shared with the next cells
+    middle = np.array([0.5 * (left + right), top + 0.35 * cell.height])
+    figures, ink = [str(shifts.edges[place])], drawing.GREY
+    if shifts.known[place]:
+        length, ink = float(shifts.size_px[place]), drawing.BLACK
+        figures.insert(0, f"{length:.1f} px")
+        drawing.tint(view, cell, drawing.colours(length / end_px), COVER)
+        drawing.outline(view, sides, drawing.WHITE)
+        head = middle + ARROW_SHARE * min(cell.width, cell.height) / max(end_px, length) * shifts.shift_px[place]
+        drawing.arrow(view, middle, head, TIP_PX, ((drawing.WHITE, 5), (drawing.BLACK, 2)))
+    else:
+        drawing.outline(view, sides, drawing.WHITE)
+    for above, figure in enumerate(reversed(figures)):
+        baseline = bottom - 6 - (LABEL_PX + 2) * above
+        drawing.write(view, figure, (middle[0], baseline), LABEL_PX, align=0.5, colour=ink, ground=0.7)
+
+
+SAMPLES = 200
+"""Samples along the longer side of the image; so few suffice because a lens is a smooth function."""
+
+ARROWS = 14
+"""Arrows along the longer side."""
+
+LENS_PICTURE_PX = (800, 620)
+"""Largest width and height of the picture of a lens."""
+
+AXIS_PX = 56
+"""Room for the figures and the name of an axis."""
+
+TIP_PX, LENS_TIP_PX = 8.0, 5.0
+"""Length of the tip of an arrow in a cell, and over a lens."""
+
+NOTHING = 221
+"""Grey where the lens or the model has no pixel."""
+
+DECADES, LEAST_PX = 1000.0, 1e-6
+"""The logarithmic colour scale spans this factor below the largest residual; below `LEAST_PX` all is rounding."""
+
+
+def residuals_px(camera: Camera, fitted: Camera, uv_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 2) how much further right and down `fitted` puts what `camera` has at pixels (N, 2); NaN where either model
+    has no pixel for it."""
+    rays, seen = unproject(camera, uv_px)
+    at, has_pixel = project(fitted, rays)
+    return np.where((seen & has_pixel)[:, None], at - uv_px, np.nan)
+
+
+def lens_residual(camera: Camera, fitted: Camera) -> Pixels:
+    """(H, W, 3) uint8 BGR on white: the distance in pixels, and arrows from where the lens puts a point towards where
+    the fitted model puts it."""
+    step = max(camera.width, camera.height) / SAMPLES
+    columns, rows = (max(2, round(length / step)) for length in (camera.width, camera.height))
+    u = np.linspace(0.0, camera.width - 1.0, columns)
+    v = np.linspace(0.0, camera.height - 1.0, rows)
+    grid = np.stack(np.meshgrid(u, v), axis=-1)
+    residuals = residuals_px(camera, fitted, grid.reshape(-1, 2)).reshape(rows, columns, 2)
+    size = np.hypot(residuals[..., 0], residuals[..., 1])
+    text = lens_sentences(camera, fitted, size)
+
+    shown_px = drawing.fitted(camera.width, camera.height, LENS_PICTURE_PX)
+    top = 2 * MARGIN_PX + LINE_PX * len(text)
+    picture = drawing.blank(
+        2 * MARGIN_PX + AXIS_PX + max(shown_px[0], LENS_PICTURE_PX[0]), top + shown_px[1] + AXIS_PX + BAR_PX + AXIS_PX
+    )
+    drawing.heading(picture, text, MARGIN_PX, MARGIN_PX)
+    shown = Rectangle(MARGIN_PX + AXIS_PX, top, *shown_px)
+    view = picture[shown.slices]
+    largest = float(np.nanmax(size)) if np.isfinite(size).any() else 0.0
+    end_px = max(largest, LEAST_PX)
+    share = 1.0 + np.log10(np.maximum(size / end_px, 1.0 / DECADES)) / log10(DECADES)
+    field = np.where(np.isfinite(size)[..., None], drawing.colours(np.nan_to_num(share)), np.uint8(NOTHING))
+    view[:] = cv2.resize(field, shown_px, interpolation=cv2.INTER_NEAREST)
+    every = max(1, SAMPLES // ARROWS)
+    middle = (slice(every // 2, None, every), slice(every // 2, None, every))
+    whole = Rectangle(0, 0, camera.width, camera.height)
+    at, shift = drawing.places(grid[middle].reshape(-1, 2), whole, shown), residuals[middle].reshape(-1, 2)
+    reach = 0.3 * every * step * shown.width / camera.width
+    for centre, way in zip(at, shift, strict=True):
+        if np.isfinite(way).all():
+            half = reach * way / max(float(np.hypot(*way)), LEAST_PX)
+            drawing.arrow(view, centre - half, centre + half, LENS_TIP_PX, ((drawing.BLACK, 1),))
+    drawing.axes(picture, shown, whole, labels=("column, px", "row, px"))
+    bar = Rectangle(shown.left, top + shown_px[1] + AXIS_PX, shown_px[0], BAR_PX)
+    drawing.colour_scale(picture, bar, _decades(end_px), "px beside the lens")
+    return picture
+
+
+def _decades(end_px: float) -> list[Tick]:
+    """Ticks of the logarithmic scale of colours up to `end_px`, those at powers of ten with a label."""
+    first = floor(log10(end_px / DECADES))
+    values = [step * 10.0**decade for decade in range(first, first + 5) for step in range(1, 10)]
+    shares = [1.0 + log10(value / end_px) / log10(DECADES) for value in values]
+    return [
+        Tick(share, tick_label(value) if k % 9 == 0 else "")
+        for k, (value, share) in enumerate(zip(values, shares, strict=True))
+        if -1e-9 <= share <= 1.0 + 1e-9
+    ]
+
+
+def lens_sentences(camera: Camera, fitted: Camera, size_px: NDArray[np.float64]) -> list[str]:
+    """The lines above the picture; `size_px` are distances over the image, NaN where there is none."""
+    known = size_px[np.isfinite(size_px)]
+    names = f"{name_of(fitted)} fitted to {name_of(camera)}"
+    if len(known) == 0:
+        return [f"{names}: the two have no pixel in common"]
+    fit_residual = residual(camera, fitted)
+    rms, largest = (
+        f"{value if value >= LEAST_PX else 0.0:.3g}" for value in (fit_residual.rms_px, fit_residual.max_px)
+    )
+    return [
+        f"{names}: {rms} px rms, {largest} px at most",
+        f"Over {100 * len(known) / size_px.size:.0f} % of the image; grey: the lens or the model has no pixel there. "
+        "Arrows: the direction.",
+    ]

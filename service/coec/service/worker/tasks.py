@@ -43,6 +43,7 @@ from coec.io.images import CachedGreys, GreyImages, RangeScale, decode_bgr, enco
 from coec.io.msgpack_frames import decode_camera
 from coec.io.nearest_neighbours import Trees, installed
 from coec.io.rig_files import rig_of
+from coec.reports.close_ups import Caption, close_ups
 from coec.reports.formatting import instant
 from coec.reports.overlay import render_points, titled
 from coec.service.worker import worker_jobs
@@ -242,9 +243,6 @@ class Solver:
             WindowError, DecodeError, CalibrationError: the window or an image of it cannot be used.
         """
         from coec.io.mcap.window_reader import read_window
-
-        # Imported here because Matplotlib takes 0.3 s and 30 MB, and most workers never draw such a picture.
-        from coec.reports.close_ups import Caption, close_ups
 
         window, configuration = read_window(path)
         before, after = (np.array(pose, dtype=np.float64) for pose in poses)
