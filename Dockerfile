@@ -38,7 +38,7 @@ FROM ${PYTHON}
 RUN groupadd --gid 10001 coec \
     && useradd --uid 10001 --gid 10001 --no-create-home --home-dir /var/lib/coec --shell /usr/sbin/nologin coec \
     && install --directory --owner coec --group coec /var/lib/coec /var/cache/coec
-# The packages, some 690 MB, which change with requirements.lock; then coec itself, some 15 MB.
+# The packages, some 600 MB, which change with requirements.lock; then coec itself, some 15 MB.
 COPY --from=build /opt/coec /opt/coec
 COPY --from=build /own /
 COPY deploy/check-live /opt/coec/bin/check-live

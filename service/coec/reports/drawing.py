@@ -61,7 +61,7 @@ def fitted(width: int, height: int, within: tuple[int, int]) -> tuple[int, int]:
 def places(uv_px: NDArray[np.floating], part: Rectangle, shown: Rectangle) -> NDArray[np.float64]:
     """(..., 2) places on the view of `shown`, which shows a part of an image, of pixels (..., 2) of that image."""
     scale = np.array([shown.width / part.width, shown.height / part.height])
-    return (uv_px - np.array([part.left - 0.5, part.top - 0.5])) * scale - 0.5
+    return np.asarray((uv_px - np.array([part.left - 0.5, part.top - 0.5])) * scale - 0.5)
 
 
 def text_width(text: str, size_px: int = TEXT_PX, *, bold: bool = False) -> int:
@@ -96,8 +96,8 @@ def write(
     for offset in (0, round(SAMPLING * BOLD_SHARE * size_px)) if bold else (0,):
         start = (offset, SAMPLING * above)
         cv2.putText(large, text, start, (255,), cv2.FontFace(FONT), SAMPLING * size_px)
-    cover = cv2.resize(large, (width + 1, above + below), interpolation=cv2.INTER_AREA)[..., None] / 255.0
-    tint(picture, Rectangle(left, top, width + 1, above + below), colour, cover)
+    cover = cv2.resize(large, (width + 1, above + below), interpolation=cv2.INTER_AREA)[..., None]
+    tint(picture, Rectangle(left, top, width + 1, above + below), colour, cover.astype(np.float64) / 255.0)
 
 
 def heading(picture: Pixels, lines: Sequence[str], left: int, top: int) -> None:
