@@ -84,3 +84,14 @@ def test_small_images_are_enlarged() -> None:
     picture = render_points(np.zeros((100, 200, 3), np.uint8), small, T_CAMERA_LIDAR, np.zeros((0, 3)), None)
     assert picture.shape[1] == 1000
     assert picture.shape[0] > 500
+
+
+@pytest.mark.fault(
+    "a name on a picture that is no text: unpaired surrogates, control characters, 100,000 letters",
+    "it is drawn in escapes, and cut off",
+)
+@pytest.mark.parametrize("name", ["\udc80", "a\x1b[31m\x00\n", "\u202e", 100_000 * "x", ""])
+def test_any_name_can_be_drawn(name: str) -> None:
+    picture = titled(np.zeros((HEIGHT, WIDTH, 3), np.uint8), name)
+    assert picture.shape == (picture.shape[0], WIDTH, 3)
+    assert (picture[:20] < 128).any() == bool(name)

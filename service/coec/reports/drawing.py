@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.edges.image_edges import Rectangle
 from coec.reports.charts import Tick, linear_ticks, tick_label
+from coec.untrusted import printable
 
 Pixels = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -66,7 +67,7 @@ def places(uv_px: NDArray[np.floating], part: Rectangle, shown: Rectangle) -> ND
 
 def text_width(text: str, size_px: int = TEXT_PX, *, bold: bool = False) -> int:
     """Width of a line of text, px."""
-    size = cv2.getTextSize((0, 0), text, (0, 0), cv2.FontFace(FONT), SAMPLING * size_px)
+    size = cv2.getTextSize((0, 0), printable(text), (0, 0), cv2.FontFace(FONT), SAMPLING * size_px)
     return -(-size[2] // SAMPLING) + (round(BOLD_SHARE * size_px) if bold else 0)
 
 
@@ -81,7 +82,7 @@ def write(
     colour: Colour = BLACK,
     ground: float = 0.0,
 ) -> None:
-    """Writes a line of text.
+    """Writes a line of text, as `printable` shows it: an unpaired surrogate ends OpenCV's process.
 
     Args:
         at: on its baseline.
@@ -95,7 +96,7 @@ def write(
     large = np.zeros((SAMPLING * (above + below), SAMPLING * (width + 1)), dtype=np.uint8)
     for offset in (0, round(SAMPLING * BOLD_SHARE * size_px)) if bold else (0,):
         start = (offset, SAMPLING * above)
-        cv2.putText(large, text, start, (255,), cv2.FontFace(FONT), SAMPLING * size_px)
+        cv2.putText(large, printable(text), start, (255,), cv2.FontFace(FONT), SAMPLING * size_px)
     cover = cv2.resize(large, (width + 1, above + below), interpolation=cv2.INTER_AREA)[..., None]
     tint(picture, Rectangle(left, top, width + 1, above + below), colour, cover.astype(np.float64) / 255.0)
 
@@ -197,9 +198,8 @@ def axes(picture: Pixels, shown: Rectangle, part: Rectangle, *, labels: tuple[st
         strip = blank(text_width(up) + 2, LINE_PX)
         write(strip, up, (0, TEXT_PX))
         turned = cv2.rotate(strip, cv2.ROTATE_90_COUNTERCLOCKWISE)
-        top = shown.top + (shown.height - turned.shape[0]) // 2
-        left = max(0, shown.left - TICK_PX - 6 - widest - LINE_PX)
-        picture[max(0, top) :, left:][: turned.shape[0], :LINE_PX] = turned[max(0, -top) :]
+        top, left = shown.top + (shown.height - turned.shape[0]) // 2, shown.left - TICK_PX - 6 - widest - LINE_PX
+        picture[top : top + turned.shape[0], left : left + LINE_PX] = turned
 
 
 def colours(share: NDArray[np.floating] | float) -> NDArray[np.uint8]:
