@@ -149,14 +149,15 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
     import numpy as np
 
     from coec.io.baseline_file import baseline_hash, baseline_to_json
+    from coec.io.serialise import in_degrees
 
     sigma = baseline.accuracy.sigma(baseline.pairs)
     return {
         "baseline": baseline_to_json(baseline),
         "hash": baseline_hash(baseline),
-        "bias": in_degrees(baseline.bias),
-        "bias_sigma": in_degrees(np.nan_to_num(baseline.bias_sigma)),
-        "sigma_of_a_window": in_degrees(np.nan_to_num(sigma)),
+        "bias": in_degrees(baseline.bias).tolist(),
+        "bias_sigma": in_degrees(np.nan_to_num(baseline.bias_sigma)).tolist(),
+        "sigma_of_a_window": in_degrees(np.nan_to_num(sigma)).tolist(),
     }
 
 
@@ -175,6 +176,7 @@ def show(baseline: Baseline) -> None:
 
 def show_learned(baseline: Baseline) -> None:
     """Prints bias, limits, and what the limits detect, as tables."""
+    from coec.io.serialise import in_degrees
     from coec.reports import console
 
     table = console.table("axis", "bias", "± σ", "σ of a check at 6 pairs", "unit", right=(1, 2, 3))
@@ -220,11 +222,3 @@ def _show_limits(baseline: Baseline) -> None:
         for name, value in sorted(baseline.limits.items()):
             verdicts.add_row(name, console.figure(value))
         console.out.print(verdicts)
-
-
-def in_degrees(rad_m: Any) -> list[float]:
-    import numpy as np
-
-    values = np.array(rad_m, dtype=np.float64)
-    values[:3] = np.degrees(values[:3])
-    return [float(value) for value in values]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coec.calibration_options import SolverOptions
-from coec.cli.commission import RigWindows, in_degrees, load
+from coec.cli.commission import RigWindows, load
 from coec.cli.options import Depth, Frames, Json, Source
 from coec.errors import CalibrationError, UsageError
 
@@ -55,6 +55,7 @@ def diagnose(
 ) -> int:
     """Check the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong or undecided."""
     from coec.calibration.monitor.check_verdict import diagnose as check_extrinsic
+    from coec.io.serialise import in_degrees
     from coec.reports import console, diagnosis
     from coec.reports.progress import StageTimes
 
@@ -77,7 +78,7 @@ def diagnose(
         return 0
     if output is not None:
         _write(output, seen, window, rigged, measured)
-    finding = diagnosis.finding_of(seen, in_degrees(seen.offset), in_degrees(seen.sigma), measured)
+    finding = diagnosis.finding_of(seen, in_degrees(seen.offset).tolist(), in_degrees(seen.sigma).tolist(), measured)
     if as_json:
         console.print_json(_document(seen, finding, measured))
     else:
@@ -130,7 +131,7 @@ def _baseline(file: Path | None, window: Window, rigged: RigWindows) -> Baseline
 def _document(
     seen: Observation, finding: diagnosis.ExtrinsicFinding, measured: diagnosis.SolvedOffset | None
 ) -> dict[str, Any]:
-    from coec.io.serialise import metric_of
+    from coec.io.serialise import in_degrees, metric_of
 
     return {
         "finding": finding.state,
@@ -139,11 +140,11 @@ def _document(
         "undecided": seen.undecided,
         "flagged_by_paper": seen.flagged_by_paper,
         "causes": [{"code": cause.code, "text": cause.text} for cause in seen.causes],
-        "offset": in_degrees(seen.offset),
-        "sigma": in_degrees(seen.sigma),
+        "offset": in_degrees(seen.offset).tolist(),
+        "sigma": in_degrees(seen.sigma).tolist(),
         "measured": None if measured is None else asdict(measured),
-        "drift": None if seen.drift is None else in_degrees(seen.drift.value),
-        "drift_sigma": None if seen.drift is None else in_degrees(seen.drift.sigma),
+        "drift": None if seen.drift is None else in_degrees(seen.drift.value).tolist(),
+        "drift_sigma": None if seen.drift is None else in_degrees(seen.drift.sigma).tolist(),
         "first_derivative": seen.first_derivative.tolist(),
         "second_derivative": seen.second_derivative.tolist(),
         "metrics": {metric.name: metric_of(metric).model_dump(mode="json") for metric in seen.metrics},
@@ -151,10 +152,10 @@ def _document(
 
 
 def _show(seen: Observation, finding: diagnosis.ExtrinsicFinding) -> None:
-    from coec.io.serialise import metric_of
+    from coec.io.serialise import in_degrees, metric_of
     from coec.reports import console, diagnosis
 
-    offset, sigma = in_degrees(seen.offset), in_degrees(seen.sigma)
+    offset, sigma = in_degrees(seen.offset).tolist(), in_degrees(seen.sigma).tolist()
     axes = console.table("axis", "offset", "± σ", "unit", "f'", "f''", right=(1, 2, 4, 5))
     for axis, name in enumerate(console.AXIS_NAMES):
         axes.add_row(
@@ -179,6 +180,7 @@ def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosi
     from coec.calibration.pipeline import calibrate
     from coec.calibration.types import Decision, Silence
     from coec.geometry import se3
+    from coec.io.serialise import in_degrees
     from coec.reports import diagnosis
 
     shifted = np.abs(seen.offset[3:]) >= diagnosis.TELLING * seen.sigma[3:]
@@ -194,9 +196,9 @@ def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosi
     except CalibrationError:
         return None
     difference = se3.difference(estimate.optimum.T_camera_lidar, window.T_camera_lidar_start)
-    sigma = in_degrees(estimate.uncertainty.sigma)
+    sigma = in_degrees(estimate.uncertainty.sigma).tolist()
     return diagnosis.SolvedOffset(
-        offset=tuple(in_degrees(difference)),
+        offset=tuple(in_degrees(difference).tolist()),
         sigma=tuple(value if solved else None for value, solved in zip(sigma, estimate.solved, strict=True)),
         accepted=estimate.verdict.decision is Decision.ACCEPTED,
         reasons=tuple(reason.text for reason in estimate.verdict.reasons),

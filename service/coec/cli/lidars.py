@@ -11,7 +11,6 @@ from coec.cli.options import Json
 
 if TYPE_CHECKING:
     import numpy as np
-    from numpy.typing import NDArray
 
     from coec.calibration.rig.lidar_sampling import LidarEdge
     from coec.io.recordings.layouts import LidarRecording
@@ -41,6 +40,7 @@ def lidars(
     from coec.geometry.se3 import difference
     from coec.io.nearest_neighbours import Trees
     from coec.io.recordings.layouts import open_lidars
+    from coec.io.serialise import in_degrees
     from coec.reports import console
 
     search = Trees()
@@ -52,7 +52,7 @@ def lidars(
         edge = register(recording.rig, sweeps, search)
     error = None
     if recording.truth is not None:
-        error = _in_degrees(difference(edge.T_a_b, recording.truth(sweeps[len(sweeps) // 2].a.stamp_ns)))
+        error = in_degrees(difference(edge.T_a_b, recording.truth(sweeps[len(sweeps) // 2].a.stamp_ns)))
     if as_json:
         console.print_json(_document(edge, error, time.monotonic() - started_s))
     else:
@@ -61,11 +61,12 @@ def lidars(
 
 
 def _show(recording: LidarRecording, edge: LidarEdge, error: np.ndarray | None) -> None:
+    from coec.io.serialise import in_degrees
     from coec.reports import console
     from coec.reports.formatting import count
 
     table = console.table("axis of " + edge.rig.a, "correction", "sigma", *(["error"] if error is not None else []))
-    rows = zip(console.AXES, console.UNITS, _in_degrees(edge.correction), _in_degrees(edge.sigma), strict=True)
+    rows = zip(console.AXES, console.UNITS, in_degrees(edge.correction), in_degrees(edge.sigma), strict=True)
     for number, (axis, unit, correction, sigma) in enumerate(rows):
         off = [] if error is None else [f"{error[number]:+.3f} {unit}"]
         table.add_row(axis, f"{correction:+.3f} {unit}", f"{sigma:.3f} {unit}", *off)
@@ -81,12 +82,14 @@ def _show(recording: LidarRecording, edge: LidarEdge, error: np.ndarray | None) 
 
 
 def _document(edge: LidarEdge, error: np.ndarray | None, elapsed_s: float) -> dict[str, object]:
+    from coec.io.serialise import in_degrees
+
     return {
         "a": edge.rig.a,
         "b": edge.rig.b,
         "T_a_b": edge.T_a_b.tolist(),
-        "correction": _in_degrees(edge.correction).tolist(),
-        "sigma": _in_degrees(edge.sigma).tolist(),
+        "correction": in_degrees(edge.correction).tolist(),
+        "sigma": in_degrees(edge.sigma).tolist(),
         "covariance": edge.covariance.tolist(),
         "error": None if error is None else error.tolist(),
         "range_bias_m": edge.range_bias.longer_m,
@@ -98,10 +101,3 @@ def _document(edge: LidarEdge, error: np.ndarray | None, elapsed_s: float) -> di
         "reasons": [{"code": reason.code, "text": reason.text} for reason in edge.reasons],
         "elapsed_s": elapsed_s,
     }
-
-
-def _in_degrees(rad_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Six values in degrees and metres, from radians and metres."""
-    import numpy as np
-
-    return np.array([*np.rad2deg(np.ones(3)), *np.ones(3)]) * rad_m

@@ -70,7 +70,7 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         data_stamp_ns=estimate.data_stamp_ns,
         pairs=estimate.pairs,
         camera_from_lidar=transform_of(optimum.T_camera_lidar),
-        correction=cast("replies.Vector6", tuple(float(v) for v in _in_degrees(estimate.correction))),
+        correction=cast("replies.Vector6", tuple(float(v) for v in in_degrees(estimate.correction))),
         sigma=degrees_or_null(estimate.sigma),
         correction_rad_m=cast("replies.Vector6", tuple(float(v) for v in estimate.correction)),
         noise=cast("replies.Maybe6x6", tuple(_maybe6(row) for row in uncertainty.noise)),
@@ -222,10 +222,11 @@ def _limit_of(metric: replies.MetricReply) -> float:
 
 def degrees_or_null(rad_m: NDArray[np.float64]) -> replies.Maybe6:
     """(6,) in the units of the wire; NaN becomes null."""
-    return _maybe6(_in_degrees(rad_m))
+    return _maybe6(in_degrees(rad_m))
 
 
-def _in_degrees(rad_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_degrees(rad_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6,) radians and metres in degrees and metres."""
     return np.concatenate([np.rad2deg(rad_m[:3]), rad_m[3:]])
 
 

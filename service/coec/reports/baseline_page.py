@@ -11,7 +11,7 @@ from coec.config import VerdictConfig
 from coec.io.baseline_file import baseline_hash
 from coec.reports.formatting import count, number, percent, significant
 from coec.reports.page import Block, Cell, Facts, Page, Section, Table, Text, VerdictBanner
-from coec.reports.page_parts import axes_table, in_degrees
+from coec.reports.page_parts import axes_table, finite_degrees
 from coec.reports.provenance import Provenance
 
 CHECK_PAIRS = 6
@@ -47,13 +47,13 @@ def baselines_page(
 
 def _pair(baseline: Baseline) -> tuple[Section, ...]:
     pose = baseline.pose
-    of_check = in_degrees(pose.sigma(CHECK_PAIRS))
+    of_check = finite_degrees(pose.sigma(CHECK_PAIRS))
     bias = axes_table(
         "Bias: how far the estimator puts this rig from its calibration, which is given and right. σ is how well the "
         f"bias is known. A check of {CHECK_PAIRS} pairs scatters about it by the last column.",
         "Bias",
-        in_degrees(pose.bias),
-        in_degrees(pose.bias_sigma),
+        finite_degrees(pose.bias),
+        finite_degrees(pose.bias_sigma),
         more={"σ of a check": [number(value) for value in of_check]},
     )
     sensors = tuple((name.replace("_", " ").capitalize(), serial) for name, serial in baseline.sensors.items())

@@ -23,7 +23,7 @@ from coec.reports.page_parts import (
     axis_value,
     figures_block,
     file_picture,
-    in_degrees,
+    finite_degrees,
     turn_and_shift,
 )
 from coec.reports.provenance import Provenance, content_hash, depth_items
@@ -195,7 +195,7 @@ def check_page(
     Raises:
         OutputError: a picture can no longer be read.
     """
-    offset, sigma = in_degrees(seen.offset), in_degrees(seen.sigma)
+    offset, sigma = finite_degrees(seen.offset), finite_degrees(seen.sigma)
     slopes = {
         "f′": [number(float(value), sign=True) for value in seen.first_derivative],
         "f″": [number(float(value), sign=True) for value in seen.second_derivative],
@@ -264,7 +264,7 @@ def _verdict(seen: Observation, measured: SolvedOffset | None) -> VerdictBanner:
 
 def _where(seen: Observation, measured: SolvedOffset | None) -> str:
     """How far the extrinsic is off, by the solve if it can tell, else by the check."""
-    near = f"The nearest place at which the edges fit is {turn_and_shift(in_degrees(np.nan_to_num(seen.offset)))}"
+    near = f"The nearest place at which the edges fit is {turn_and_shift(finite_degrees(np.nan_to_num(seen.offset)))}"
     if measured is None:
         return f"{near}."
     if not measured.accepted:

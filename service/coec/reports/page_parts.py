@@ -16,6 +16,7 @@ from coec.calibration.figures import FIGURES, OTHER_ADVICE
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.errors import OutputError
 from coec.geometry import se3
+from coec.io.serialise import in_degrees
 from coec.reports.console import AXIS_NAMES, UNITS
 from coec.reports.formatting import number, significant, size
 from coec.reports.page import (
@@ -248,9 +249,9 @@ def _columns(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=False)) for row in rows)
 
 
-def in_degrees(rad_m: NDArray[np.float64]) -> Maybe6:
-    """(6,) radians and metres to degrees and metres, None where there is no figure."""
-    return cast("Maybe6", tuple(finite_values(np.concatenate([np.degrees(rad_m[:3]), rad_m[3:]]))))
+def finite_degrees(rad_m: NDArray[np.float64]) -> Maybe6:
+    """(6,) radians and metres in degrees and metres, None where there is no figure."""
+    return cast("Maybe6", tuple(finite_values(in_degrees(rad_m))))
 
 
 def finite_values(values: Iterable[float]) -> list[float | None]:

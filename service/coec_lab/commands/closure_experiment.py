@@ -17,7 +17,7 @@ from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
 from coec.io.recordings import window_cutting
 from coec.reports import console
-from coec.reports.page_parts import in_degrees
+from coec.reports.page_parts import finite_degrees
 from coec.schemas.message import to_json
 from coec.schemas.replies import Vector6
 from coec_lab.experiments import evaluation_tables, solve_experiments
@@ -110,7 +110,7 @@ def _report(
         source_a=request.sources[0],
         source_b=request.sources[1],
         relation=known.relation.value,
-        known=cast("Vector6", in_degrees(offset)),
+        known=cast("Vector6", finite_degrees(offset)),
         from_recordings=request.relative is None,
         objective=bench.configuration.objective.kind,
         dof=bench.configuration.search.dof,

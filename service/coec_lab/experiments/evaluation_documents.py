@@ -7,7 +7,7 @@ from dataclasses import asdict
 from math import degrees
 from typing import cast
 
-from coec.reports.page_parts import finite_or_none, finite_values, in_degrees
+from coec.reports.page_parts import finite_degrees, finite_or_none, finite_values
 from coec.schemas.replies import Maybe6
 from coec_lab.experiments import evaluation_schema as wire
 from coec_lab.experiments import mount_steps, solve_statistics
@@ -70,9 +70,9 @@ def halves_of(halves: Halves) -> wire.HalvesReport:
         solved=halves.solved,
         accepted=halves.accepted,
         hits=halves.hits,
-        rms=in_degrees(halves.rms),
-        largest=in_degrees(halves.largest),
-        sigma=in_degrees(halves.sigma),
+        rms=finite_degrees(halves.rms),
+        largest=finite_degrees(halves.largest),
+        sigma=finite_degrees(halves.sigma),
         claimed=cast("wire.Counts6", tuple(int(count) for count in halves.claimed)),
         covered=cast("Maybe6", tuple(finite_values(halves.covered))),
     )
@@ -98,9 +98,9 @@ def normalised_of(against: str, errors: NormalisedErrors) -> wire.NormalisedErro
         judged=errors.judged,
         refused=errors.refused,
         independent=errors.independent,
-        rms=in_degrees(errors.rms),
-        largest=in_degrees(errors.largest),
-        sigma=in_degrees(errors.sigma),
+        rms=finite_degrees(errors.rms),
+        largest=finite_degrees(errors.largest),
+        sigma=finite_degrees(errors.sigma),
         sigma_over_rms=cast("Maybe6", tuple(finite_values(errors.sigma_over_rms))),
         within_1_sigma=within[0],
         within_2_sigma=within[1],

@@ -23,7 +23,7 @@ from coec.io.recordings.recording_source import HasGroundTruth
 from coec.io.recordings.window_cutting import with_thinned_pairs
 from coec.recording import CallbackProgress, Recording, fit_camera
 from coec.recording import Window as PublicWindow
-from coec.reports.page_parts import in_degrees
+from coec.reports.page_parts import finite_degrees
 from coec.schemas.replies import Vector6
 from coec_lab.experiments import solve_experiments, solve_statistics
 from coec_lab.experiments.detection import require_enough
@@ -273,12 +273,12 @@ def report_of(
         hit_rate=summary.hit_rate,
         rotation_deg=angle_spread_of(summary.rotation_rad),
         translation_m=spread_of(summary.translation_m),
-        median=cast("Vector6", in_degrees(summary.median)),
-        bias=in_degrees(summary.bias),
-        std=in_degrees(summary.std),
-        rms=in_degrees(summary.rms),
-        sigma=in_degrees(summary.sigma),
-        from_reference=cast("Vector6", in_degrees(done.from_reference.error)),
+        median=cast("Vector6", finite_degrees(summary.median)),
+        bias=finite_degrees(summary.bias),
+        std=finite_degrees(summary.std),
+        rms=finite_degrees(summary.rms),
+        sigma=finite_degrees(summary.sigma),
+        from_reference=cast("Vector6", finite_degrees(done.from_reference.error)),
         solve_s=spread_of(summary.solve_s),
         evaluations=spread_of(summary.evaluations),
         classified_correctly=summary.classified_correctly,

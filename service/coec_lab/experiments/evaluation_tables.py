@@ -12,7 +12,7 @@ from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.reports import console
 from coec.reports.formatting import count
-from coec.reports.page_parts import in_degrees
+from coec.reports.page_parts import finite_degrees
 from coec_lab.experiments import solve_statistics
 from coec_lab.experiments.detection import RIGHT
 from coec_lab.experiments.evaluation_schema import (
@@ -74,7 +74,7 @@ def csv_of(reference: Matrix4, outcomes: Sequence[SolveOutcome]) -> str:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["start", *(f"start_{axis}" for axis in axes), *(f"end_{axis}" for axis in axes), *CSV_FIGURES])
     for index, outcome in enumerate(outcomes):
-        start = in_degrees(se3.difference(outcome.trial.start, reference))
+        start = finite_degrees(se3.difference(outcome.trial.start, reference))
         estimate = outcome.trial.estimate
         figures: list[object] = [""] * 5
         reasons = solve_statistics.NOT_SOLVED
@@ -90,7 +90,7 @@ def csv_of(reference: Matrix4, outcomes: Sequence[SolveOutcome]) -> str:
             reasons,
             solve_statistics.stop_reason(outcome),
         ]
-        table.writerow([index, *start, *in_degrees(outcome.error), *judged, outcome.trial.solve_s, *figures])
+        table.writerow([index, *start, *finite_degrees(outcome.error), *judged, outcome.trial.solve_s, *figures])
     return text.getvalue()
 
 
