@@ -14,7 +14,7 @@ from rich.text import Text
 
 from coec import extensions
 from coec.cli.main import BUILT_IN, application
-from coec.reports import console, plain_text
+from coec.reports import console, formatting
 
 SIGNS = "185° ± 0.3 ≥ 1 ✓ −2 σ²"
 
@@ -34,7 +34,7 @@ def written(stream: io.TextIOWrapper) -> str:
 def test_signs_become_words_in_ascii(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = ascii_stream()
     monkeypatch.setattr(sys, "stdout", stream)
-    plain_text.never_fail()
+    formatting.never_fail()
     monkeypatch.setattr(console, "out", console.made({}))
     console.show(SIGNS)
     table = console.table("± σ", "limit")
@@ -51,7 +51,7 @@ def test_signs_become_words_in_ascii(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_sign_without_a_word_is_a_mark(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = ascii_stream()
     monkeypatch.setattr(sys, "stdout", stream)
-    plain_text.never_fail()
+    formatting.never_fail()
     print("漢字 [box]", Text("é"))
     assert written(stream).startswith("?? [box]")
 
@@ -95,6 +95,6 @@ def test_help_of_everything_is_plain_where_the_locale_is_ascii() -> None:
 
 
 def test_a_terminal_that_can_gets_the_whole_of_it() -> None:
-    assert plain_text.is_unicode("UTF-8")
-    assert not plain_text.wants_plain({"TERM": "xterm-256color", "NO_COLOR": ""})
-    assert application(["check"]).rich_markup_mode == ("rich" if plain_text.is_unicode(sys.stdout.encoding) else None)
+    assert formatting.is_unicode("UTF-8")
+    assert not formatting.wants_plain({"TERM": "xterm-256color", "NO_COLOR": ""})
+    assert application(["check"]).rich_markup_mode == ("rich" if formatting.is_unicode(sys.stdout.encoding) else None)

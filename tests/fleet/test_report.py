@@ -15,7 +15,7 @@ from coec.fleet.report import report
 from coec.io.mcap.window_reader import read_result
 from coec.reports import fleet_page
 from coec.reports.page import VerdictBanner, render
-from coec.reports.provenance import Provenance
+from coec.reports.page_parts import Provenance
 from coec.schemas.fleet import FleetNow, FleetReport, PairNow, WindowRow
 from coec.schemas.replies import Alarms, CalibrationResult
 from support.fleet import FAILED_SHARE, REFUSED_SHARE, WINDOW_SIGMA, fleet_rows

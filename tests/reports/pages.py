@@ -33,9 +33,8 @@ from coec.reports.calibration import calibration_page
 from coec.reports.diagnosis import check_page
 from coec.reports.incident_page import FetchedIncident
 from coec.reports.page import Compare, Page, Pictures
-from coec.reports.page_parts import file_picture
+from coec.reports.page_parts import Provenance, file_picture
 from coec.reports.pictures import slid_pictures
-from coec.reports.provenance import Provenance
 from coec.schemas.documents import Absent, FetchedWindow
 from coec.schemas.fleet import DayOfPair, FalseAlarms, FigureOfFleet, FleetReport, PairOfFleet
 from coec.schemas.replies import (

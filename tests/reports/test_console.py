@@ -13,7 +13,7 @@ from rich.text import Text
 
 import coec
 from coec.reports import console
-from coec.reports.progress import Bars, PlainColumn
+from coec.reports.console import Bars, PlainColumn
 from coec.schemas.replies import MetricReply
 from support.strategies import HOSTILE, obeyed_characters
 
@@ -83,8 +83,8 @@ def test_markup_in_the_words_of_a_bar_is_text() -> None:
 def test_what_the_interpreter_prints_by_itself_is_escaped() -> None:
     program = (
         "import logging, sys, threading\n"
-        "from coec.reports import plain_text\n"
-        "plain_text.escape_interpreter()\n"
+        "from coec.reports import formatting\n"
+        "formatting.escape_interpreter()\n"
         "evil = '\\x1b[35;45m\\x9b\\r'\n"
         "def fail(): raise ValueError(evil)\n"
         "thread = threading.Thread(target=fail); thread.start(); thread.join()\n"
@@ -101,7 +101,7 @@ def test_what_the_interpreter_prints_by_itself_is_escaped() -> None:
 
 PACKAGE = Path(coec.__file__).parent
 SINKS = {
-    PACKAGE / "reports" / "plain_text.py",
+    PACKAGE / "reports" / "formatting.py",
     PACKAGE / "reports" / "console.py",
     # Each of its formatters escapes the line that it makes.
     PACKAGE / "io" / "logs.py",

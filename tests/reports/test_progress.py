@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from coec.geometry import compilation_events
-from coec.reports.progress import COMPILING, COMPILING_S, LINE_S, Bars
+from coec.reports.console import COMPILING, COMPILING_S, LINE_S, Bars
 
 
 class Clock:

@@ -133,8 +133,8 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     from coec.reports import console
+    from coec.reports.console import PlainColumn
     from coec.reports.formatting import count
-    from coec.reports.progress import PlainColumn
 
     bars = Progress(
         PlainColumn("windows"),

@@ -42,7 +42,7 @@ def calibrate(
     from coec.io.recordings import window_cutting
     from coec.recording import perturbation_of, solve
     from coec.reports import calibration, console
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
 
     if output is not None:
         files.try_folder(output)
@@ -128,11 +128,11 @@ def _write(
     import numpy as np
 
     from coec.io import user_files as files
-    from coec.reports import calibration, page, pictures, provenance
+    from coec.reports import calibration, page, pictures
     from coec.reports.calibration import calibration_page
     from coec.reports.close_ups import Caption
     from coec.reports.page import Pictures
-    from coec.reports.page_parts import file_picture
+    from coec.reports.page_parts import Provenance, file_picture
     from coec.schemas.message import to_json
     from coec.schemas.replies import CalibrationReport
 
@@ -154,7 +154,7 @@ def _write(
     report = CalibrationReport.model_validate(document)
     written = files.write_output(folder / "result.json", to_json(report))
     remarks = calibration.remarks(document.get("camera_fit"), document.get("time_offset"))
-    of_result = calibration_page(report, window, calibration.start_of(window), blocks, remarks, provenance.here())
+    of_result = calibration_page(report, window, calibration.start_of(window), blocks, remarks, Provenance.here())
     return [*paths, written, page.write(folder / "report.html", of_result)], comparison.left_out
 
 

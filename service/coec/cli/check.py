@@ -13,7 +13,7 @@ from coec.errors import CalibrationError, SourceError
 if TYPE_CHECKING:
     from coec.calibration.types import Estimate
     from coec.io.recordings.layouts import RecordingSource
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
     from coec.reports.recording_fitness import Cadence, Fitness, Notice
 
 PAIRS = 6
@@ -30,7 +30,7 @@ def check(
     """Show the content of a recording and whether it is suitable: exit 1 if it allows no calibration."""
     from coec.io.recordings.layouts import open_source
     from coec.reports import console
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
     from coec.reports.recording_fitness import fitness_of
 
     try:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
     from coec.calibration.types import DepthModel, ImageReader, Window
     from coec.config import CalibrationConfig
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,9 +60,10 @@ def commission(
     from coec.calibration.commissioning import commission as learn
     from coec.io.baseline_file import load_baselines, save_baseline
     from coec.io.user_files import try_file
-    from coec.reports import console, page, provenance
+    from coec.reports import console, page
     from coec.reports.baseline_page import baselines_page
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
+    from coec.reports.page_parts import Provenance
 
     serials = _serials_of(sensors or ())
     try_file(output)
@@ -82,7 +83,7 @@ def commission(
     save_baseline(output, baseline)
     report = page.write(
         _page_for(output),
-        baselines_page(load_baselines(output), baseline.pair, sources, output.name, provenance.here()),
+        baselines_page(load_baselines(output), baseline.pair, sources, output.name, Provenance.here()),
     )
     if as_json:
         console.print_json(document_of(baseline))

@@ -57,7 +57,7 @@ def diagnose(
     from coec.calibration.monitor.check_verdict import diagnose as check_extrinsic
     from coec.io.serialise import in_degrees
     from coec.reports import console, diagnosis
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
 
     experiment = _detection_experiment() if detection > 0 else None
     with console.progress() as bars:
@@ -210,13 +210,14 @@ def _write(
     folder: Path, seen: Observation, window: Window, rigged: RigWindows, measured: diagnosis.SolvedOffset | None
 ) -> None:
     from coec.config import config_hash
-    from coec.reports import page, pictures, provenance
+    from coec.reports import page, pictures
     from coec.reports.diagnosis import check_page
+    from coec.reports.page_parts import Provenance
 
     (image,) = pictures.overlays(window, (window.T_camera_lidar_start,), rigged.configuration.motion_compensation)
     title = f"{window.rig.pair}  the extrinsic that was checked"
     written = [pictures.write_overlay(folder, "overlay", image, title)]
     of_check = check_page(
-        seen, measured, window, rigged.depth.identity, config_hash(rigged.configuration), written, provenance.here()
+        seen, measured, window, rigged.depth.identity, config_hash(rigged.configuration), written, Provenance.here()
     )
     page.write(folder / "report.html", of_check)

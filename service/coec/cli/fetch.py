@@ -206,8 +206,9 @@ class Download:
 
     def fetch(self, event_id: str) -> IncidentReport:
         from coec.io import user_files as files
-        from coec.reports import incident_page, provenance
+        from coec.reports import incident_page
         from coec.reports.page import render
+        from coec.reports.page_parts import Provenance
         from coec.schemas.documents import IncidentReport
         from coec.schemas.message import to_json
         from coec.schemas.replies import EvidenceEvent, ExtrinsicReply, HealthReply, HistoryReply, StatusReply
@@ -236,7 +237,7 @@ class Download:
         documents = (event, history, health, extrinsic, status)
         story = incident_page.FetchedIncident(*documents, tuple(windows), tuple(self.absent), holds, snippets)
         pictures = {name: (self.folder / name).read_bytes() for name in incident_page.PICTURED if name in self.files}
-        self._store(PAGE, render(incident_page.page(story, pictures, provenance.here())).encode())
+        self._store(PAGE, render(incident_page.page(story, pictures, Provenance.here())).encode())
         report = IncidentReport(
             folder=str(self.folder),
             vehicle=keys.vehicle,

@@ -41,7 +41,8 @@ def report(
     """Report drift of every pair, what is refused and why, and what an earlier batch decided otherwise."""
     from coec.fleet import report as fleet_report
     from coec.io import user_files as files
-    from coec.reports import console, fleet_page, page, provenance
+    from coec.reports import console, fleet_page, page
+    from coec.reports.page_parts import Provenance
     from coec.schemas.message import to_json
 
     if sql:
@@ -50,7 +51,7 @@ def report(
     fleet_now = None if now is None else _fleet_now(now)
     summary = fleet_report.report(results, against, fleet_now)
     if output is not None:
-        of_fleet = fleet_page.page(summary, f"Fleet: {results.resolve().name}", provenance.here())
+        of_fleet = fleet_page.page(summary, f"Fleet: {results.resolve().name}", Provenance.here())
         page.write(output / "report.html", of_fleet)
         files.write_output(output / "report.json", to_json(summary))
     if as_json:

@@ -30,7 +30,7 @@ import typer
 
 from coec import __version__, cli
 from coec.errors import CoecError, ExitCode, UsageError
-from coec.reports import plain_text
+from coec.reports import formatting
 from coec.untrusted import json_printable
 
 SHARED = frozenset({"main", "options"})
@@ -63,7 +63,7 @@ NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 def application(arguments: Sequence[str]) -> typer.Typer:
     """The commands that a command line may need: the one that its first argument names, or all if it names none, for
     the help text or the error. Importing all takes some tens of milliseconds, so most calls import only one."""
-    plain = plain_text.wants_plain(os.environ) or not plain_text.is_unicode(sys.stdout.encoding)
+    plain = formatting.wants_plain(os.environ) or not formatting.is_unicode(sys.stdout.encoding)
     app = typer.Typer(
         name="coec",
         no_args_is_help=True,
@@ -158,7 +158,7 @@ def _print_versions(requested: bool) -> None:
     else:
         own = by_name.pop("coec")
         text = f"coec {own}\n" + ", ".join(f"{name} {version or 'not installed'}" for name, version in by_name.items())
-    plain_text.write(f"{text}\n")
+    formatting.write(f"{text}\n")
     raise typer.Exit(0)
 
 
@@ -182,11 +182,11 @@ def _coec(
 def main() -> int:
     """Entry point; returns the exit status."""
     as_json = "--json" in sys.argv[1:]
-    plain_text.never_fail()
-    plain_text.escape_interpreter()
+    formatting.never_fail()
+    formatting.escape_interpreter()
     try:
         command = typer.main.get_command(application(sys.argv[1:]))
-        if not plain_text.is_unicode(sys.stdout.encoding):
+        if not formatting.is_unicode(sys.stdout.encoding):
             _encode_help(sys.stdout.encoding, command)
         with no_interrupt_lost():
             command(prog_name="coec")
@@ -196,14 +196,14 @@ def main() -> int:
         status = end.code if isinstance(end.code, int) else 0
         # A command that ends like this by itself has printed why.
         if isinstance(getattr(end.__context__, "__cause__", None), KeyboardInterrupt):
-            plain_text.write("coec: interrupted\n", on_error=True)
+            formatting.write("coec: interrupted\n", on_error=True)
             if as_json:
                 _print_error("interrupted", "ended by Ctrl-C before there was a result")
         if status == ExitCode.USAGE and as_json:
             _print_error("bad_request", "the command line does not fit; standard error says how")
         return status
     except CoecError as error:
-        plain_text.write(f"coec: {error}\n", on_error=True)
+        formatting.write(f"coec: {error}\n", on_error=True)
         if as_json:
             _print_error(error.reply_code, str(error), error.details)
         return error.exit_code
@@ -213,9 +213,9 @@ def main() -> int:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             sys.stdout = None
             message = f"coec: cannot write: {error.strerror}; make room where the output goes\n"
-            plain_text.write(message, on_error=True)
+            formatting.write(message, on_error=True)
             return ExitCode.FAILED
-        plain_text.write_traceback(error)
+        formatting.write_traceback(error)
         if as_json:
             _print_error("internal", f"{type(error).__name__}: {error}")
         return ExitCode.FAULT
@@ -263,11 +263,11 @@ def _encode_help(encoding: str, command: Any) -> None:
     otherwise be printed as UTF-8."""
     for each in (command, *command.params):
         if getattr(each, "help", None):
-            each.help = plain_text.encodable(each.help, encoding)
+            each.help = formatting.encodable(each.help, encoding)
     for below in getattr(command, "commands", {}).values():
         _encode_help(encoding, below)
 
 
 def _print_error(code: str, message: str, details: Mapping[str, Any] | None = None) -> None:
     document = {"error": {"code": code, "message": message}, **(details or {})}
-    plain_text.write(f"{json_printable(json.dumps(document, ensure_ascii=False))}\n")
+    formatting.write(f"{json_printable(json.dumps(document, ensure_ascii=False))}\n")

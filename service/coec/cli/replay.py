@@ -26,7 +26,7 @@ def replay(
     from coec.io.mcap.window_reader import read_result, read_window
     from coec.io.serialise import comparable, result_of
     from coec.reports import console
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
     from coec.schemas.message import to_json
 
     recorded = read_result(window)

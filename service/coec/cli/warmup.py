@@ -94,7 +94,7 @@ def _compile(lenses: Sequence[str]) -> int:
     from coec.config import Config
     from coec.geometry import compilation_events
     from coec.reports import console
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
     from coec.service.worker.compilation import compiled
     from coec.service.worker.second_compiler import second_compiler
     from coec.service.worker.tasks import Solver

@@ -28,7 +28,7 @@ from coec.io.images import GreyImages
 from coec.io.mcap.window_reader import read_result, read_vehicle, read_window
 from coec.io.rig_files import rig_from_json, rig_to_json
 from coec.io.serialise import comparable, result_of
-from coec.reports import provenance
+from coec.reports.page_parts import versions
 from coec.schemas.fleet import WindowRow
 from coec.schemas.message import to_json
 from coec.schemas.replies import CalibrationResult
@@ -147,7 +147,7 @@ class WindowEvaluator:
         self._limits = LimitsConfig()
         self._images = GreyImages(self._limits)
         self._networks: dict[DepthConfig, DepthModel] = {}
-        self._versions = provenance.versions()
+        self._versions = versions()
 
     def row(self, job: Job) -> WindowRow:
         """The row of a window. If anything is wrong with the window, the row says so."""

@@ -11,8 +11,7 @@ from coec.config import VerdictConfig
 from coec.io.baseline_file import baseline_hash
 from coec.reports.formatting import count, number, percent, significant
 from coec.reports.page import Block, Cell, Facts, Page, Section, Table, Text, VerdictBanner
-from coec.reports.page_parts import axes_table, finite_degrees
-from coec.reports.provenance import Provenance
+from coec.reports.page_parts import Provenance, axes_table, finite_degrees
 
 CHECK_PAIRS = 6
 """Number of pairs in the check whose spread is shown."""

@@ -17,14 +17,16 @@ from coec.reports import console
 from coec.reports.formatting import count, number, percent, second, significant, size
 from coec.reports.page import AxesTable, Block, Facts, Page, Section, Text, VerdictBanner
 from coec.reports.page_parts import (
+    Provenance,
     advice_of,
     axes_table,
     axis_value,
+    content_hash,
     copies_of,
+    depth_items,
     figures_block,
     turn_and_shift,
 )
-from coec.reports.provenance import Provenance, content_hash, depth_items
 from coec.schemas.replies import CalibrationReport, CalibrationResult, Transform, Vector6
 
 DIGITS = 9

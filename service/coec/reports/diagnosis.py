@@ -18,15 +18,17 @@ from coec.reports import console
 from coec.reports.formatting import NONE, number, second
 from coec.reports.page import Page, Pictures, Section, Text, VerdictBanner
 from coec.reports.page_parts import (
+    Provenance,
     advice_of,
     axes_table,
     axis_value,
+    content_hash,
+    depth_items,
     figures_block,
     file_picture,
     finite_degrees,
     turn_and_shift,
 )
-from coec.reports.provenance import Provenance, content_hash, depth_items
 from coec.schemas.replies import Reason
 
 TELLING = 2.0

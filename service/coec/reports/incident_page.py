@@ -11,8 +11,7 @@ from coec.reports.charts import Chart, Ground, Mark, Series
 from coec.reports.console import AXIS_NAMES, UNITS, figure
 from coec.reports.formatting import NS_PER_S, count, second
 from coec.reports.page import Block, Cell, Charts, Page, Picture, Pictures, Section, Table, Text, Tone, VerdictBanner
-from coec.reports.page_parts import TONES, advice_of, axis_value, title_of
-from coec.reports.provenance import Provenance
+from coec.reports.page_parts import TONES, Provenance, advice_of, axis_value, title_of
 from coec.reports.replies import entry_text
 from coec.schemas.documents import Absent, FetchedWindow, IncidentReport
 from coec.schemas.replies import (

@@ -27,7 +27,7 @@ from coec.geometry.mutual_information import mutual_information
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import CachedGreys, GreyImages
 from coec.io.recordings import window_cutting
-from coec.reports.progress import StageTimes
+from coec.reports.console import StageTimes
 from coec_lab.bench import scene
 from coec_lab.bench.reference_kernels import by_numpy, by_scalar_loop
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from coec.cli.commission import RigWindows
-    from coec.reports.progress import StageTimes
+    from coec.reports.console import StageTimes
     from coec_lab.experiments.evaluation_schema import DetectionReport
 
 
@@ -42,12 +42,13 @@ def show(report: DetectionReport, source: str, output: Path | None, *, as_json: 
     Raises:
         OutputError: the page cannot be written.
     """
-    from coec.reports import console, page, provenance
+    from coec.reports import console, page
+    from coec.reports.page_parts import Provenance
     from coec_lab.experiments import evaluation_tables
     from coec_lab.experiments.evaluation_page import detection_page
 
     if output is not None:
-        page.write(output / "report.html", detection_page(report, source, provenance.here()))
+        page.write(output / "report.html", detection_page(report, source, Provenance.here()))
     if as_json:
         console.print_json({"source": source, **report.model_dump(mode="json")})
     else:

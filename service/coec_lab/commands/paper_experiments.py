@@ -20,8 +20,9 @@ from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
 from coec.io.recordings import window_cutting
 from coec.io.recordings.layouts import open_source
-from coec.reports import console, page, provenance
+from coec.reports import console, page
 from coec.reports.page import Block
+from coec.reports.page_parts import Provenance
 from coec_lab.experiments import evaluation_charts, paper_figures, plots, solve_experiments, solve_statistics
 from coec_lab.experiments.evaluation_charts import bullseye
 from coec_lab.experiments.paper_figures import Plots, paper_page, run_times
@@ -93,7 +94,7 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
             "published": paper_figures.document(),
         }
     written = user_files.write_output(folder / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
-    page.write(folder / "report.html", paper_page(document, Plots(metrics, ends, drive), provenance.here()))
+    page.write(folder / "report.html", paper_page(document, Plots(metrics, ends, drive), Provenance.here()))
     if as_json:
         console.print_json(document)
     else:

@@ -14,8 +14,9 @@ from coec.config import WindowConfig
 from coec.errors import CalibrationError, ExitCode
 from coec.io import user_files
 from coec.io.recordings import window_cutting
-from coec.reports import console, page, provenance
+from coec.reports import console, page
 from coec.reports.page import Block, Page
+from coec.reports.page_parts import Provenance
 from coec.schemas.message import to_json
 from coec_lab.commands.evaluate import ALL
 from coec_lab.experiments import evaluation_tables
@@ -147,7 +148,7 @@ def _compare(
         interrupted=interrupted,
         elapsed_s=stages.elapsed_s(),
     )
-    return report, lambda: comparison_page(report, ends, provenance.here())
+    return report, lambda: comparison_page(report, ends, Provenance.here())
 
 
 def _evaluate(plan: Plan, choices: SolverOptions, subject: Subject, folder: Path | None, stages: Stages) -> Evaluated:
@@ -174,4 +175,4 @@ def _evaluate(plan: Plan, choices: SolverOptions, subject: Subject, folder: Path
         table = evaluation_tables.csv_of(bench.reference, done.outcomes)
         user_files.write_output(folder / "starts.csv", table.encode())
     report = report_of(subject, plan, bench, done, stages.elapsed_s())
-    return Evaluated(report, done.outcomes, lambda: evaluation_page(report, ends, worst, provenance.here()))
+    return Evaluated(report, done.outcomes, lambda: evaluation_page(report, ends, worst, Provenance.here()))

@@ -32,8 +32,8 @@ from coec.io.zenoh.query_client import connected
 from coec.io.zenoh.window_fetch import fetch_window
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
+from coec.reports.console import COMPILING, COMPILING_S, CompilationProgress
 from coec.reports.formatting import count
-from coec.reports.progress import COMPILING, COMPILING_S, CompilationProgress
 from coec.schemas.keys import Keys
 from coec_lab.demo import pair_drive, pair_report
 from coec_lab.demo.pair_client import Observer, PairOutcome, Snapshot, outcome_of

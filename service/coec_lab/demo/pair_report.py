@@ -20,13 +20,12 @@ from coec.io.images import decode_bgr
 from coec.io.mcap.window_reader import read_result, read_window
 from coec.io.recordings import window_cutting
 from coec.io.user_files import write_output as write_file
-from coec.reports import console, page, pictures, provenance
+from coec.reports import console, page, pictures
 from coec.reports.charts import Chart, Ground, Limit, Mark, Series
 from coec.reports.formatting import count
 from coec.reports.overlay import render_points as draw_overlay
 from coec.reports.page import Block, Cell, Charts, Compare, Facts, Page, Pictures, Section, Table, Text, VerdictBanner
-from coec.reports.page_parts import TONES, copies_of, figures_block, file_picture
-from coec.reports.provenance import Provenance
+from coec.reports.page_parts import TONES, Provenance, copies_of, figures_block, file_picture
 from coec.schemas import replies
 from coec.schemas.message import to_json
 from coec_lab.demo import pair_drive
@@ -79,7 +78,7 @@ def write_first(output: Path, drive: SimulatedDrive) -> tuple[Path, Path]:
         "coec demo",
         pair_drive.TITLE,
         (VerdictBanner("none", "Under way.", "The service has not reported anything yet."), Text((FIRST_ABOUT,))),
-        (Section("What the vehicle sees", (Pictures((file_picture(picture),)),)), provenance.here().section()),
+        (Section("What the vehicle sees", (Pictures((file_picture(picture),)),)), Provenance.here().section()),
     )
     return picture, page.write(output / pair_drive.REPORT, stand_in)
 
@@ -118,7 +117,7 @@ def write(
     happened = list(zip(observer.timeline, _happenings(observer.timeline, outcome), strict=True))
     summary = _summary(outcome, observer.timeline)
     document = demo_page(
-        pair_drive.TITLE, observer.series, happened, summary, outcome, result, compared, window, provenance.here()
+        pair_drive.TITLE, observer.series, happened, summary, outcome, result, compared, window, Provenance.here()
     )
     written.append(page.write(output / pair_drive.REPORT, document))
     return WrittenFiles(tuple(written), result)

@@ -10,11 +10,10 @@ from pathlib import Path
 
 from coec.geometry.se3 import inverse
 from coec.io.user_files import write_output as write_file
-from coec.reports import console, provenance
+from coec.reports import console
 from coec.reports.page import Cell, Page, Picture, Pictures, Section, Table, Text, VerdictBanner
 from coec.reports.page import write as write_page
-from coec.reports.page_parts import TONES, read
-from coec.reports.provenance import Provenance
+from coec.reports.page_parts import TONES, Provenance, read
 from coec_lab.demo.demo_plots import PlottedSensor, percent, rig_from_above, state_text
 from coec_lab.demo.rig_drive import (
     SCENARIO,
@@ -128,7 +127,7 @@ def write(output: Path, drive: RigDrive, acts: Sequence[Performance], scenario: 
     for outcome, snapshots in acts:
         path = output / f"{outcome.act.name}_knocked.png"
         pictures.append(write_file(path, picture(drive, outcome.act, snapshots[-1], scenario)))
-    return [*pictures, write_page(output / "report.html", page(pictures, acts, provenance.here(), scenario))]
+    return [*pictures, write_page(output / "report.html", page(pictures, acts, Provenance.here(), scenario))]
 
 
 def picture(drive: RigDrive, act: Act, snapshot: RigSnapshot, scenario: Scenario) -> bytes:

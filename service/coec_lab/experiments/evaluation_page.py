@@ -9,8 +9,7 @@ from coec.reports.charts import Chart, Limit, Series
 from coec.reports.console import AXIS_NAMES, UNITS
 from coec.reports.formatting import count, number, percent
 from coec.reports.page import Block, Cell, Charts, Facts, Page, Section, Table, Text, Tone, VerdictBanner
-from coec.reports.page_parts import DIGITS, SHOWN_UNITS
-from coec.reports.provenance import Provenance, depth_items
+from coec.reports.page_parts import DIGITS, SHOWN_UNITS, Provenance, depth_items
 from coec_lab.experiments import evaluation_charts
 from coec_lab.experiments.evaluation_schema import (
     ComparisonReport,

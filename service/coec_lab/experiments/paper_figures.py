@@ -28,7 +28,7 @@ from coec.io.depth.depth_maps import open_depth
 from coec.io.recordings import window_cutting
 from coec.reports.formatting import NONE, number, percent
 from coec.reports.page import Block, Page, Section, Table, Text, VerdictBanner
-from coec.reports.provenance import Provenance
+from coec.reports.page_parts import Provenance
 from coec_lab.experiments.solve_experiments import Bench, Stages, greys_of, inferred
 
 MOVES_DEG = (0.0, 1.0, 3.0)
