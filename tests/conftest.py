@@ -63,9 +63,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     What a test is marked to hold travels with its report, from whatever process it runs in.
     """
-    items.sort(key=lambda item: _file_order(item.path))
+    turns = {path: _file_order(path) for path in {item.path for item in items}}
+    items.sort(key=lambda item: turns[item.path])
+    benchmarks = {path for path in turns if path.is_relative_to(BENCHMARKS)}
     for item in items:
-        if item.path.is_relative_to(BENCHMARKS):
+        if item.path in benchmarks:
             item.add_marker("slow")
         item.user_properties.extend(("fault", json.dumps(row)) for row in rows_of_item(item))
 
