@@ -11,7 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from coec.errors import EXIT_CODE_MEANINGS, MAY_BE_CURED, NOT_CURED_BY_RESTART, 
 from coec.service.process_lifetime import locked
 from conftest import REPOSITORY
 from deploy.written import compose
-from e2e.processes import COMMAND, PATIENCE_S, environment
+from e2e.processes import COMMAND, PATIENCE_S, coec_here, environment
 from support.fake_worker import wait_until
 from support.router import TestAuthority, free_port
 
@@ -158,13 +158,18 @@ UNPRIVILEGED = ("setpriv", "--bounding-set=-dac_override,-dac_read_search", "--i
 """Root without the right to read what the mode of a file forbids."""
 
 
-def started(*arguments: object, log: Path) -> subprocess.Popen[bytes]:
-    """`coec ARGUMENTS` as a user whom the modes of files hold for; what it says is in `log`."""
+def unprivileged() -> Sequence[str]:
+    """What stands before a command so that the modes of files hold for it."""
     prefix: Sequence[str] = () if os.geteuid() else UNPRIVILEGED
     if prefix and shutil.which(prefix[0]) is None:
         pytest.skip("needs setpriv (Debian: apt-get install util-linux), or another user than root")
+    return prefix
+
+
+def started(*arguments: object, log: Path) -> subprocess.Popen[bytes]:
+    """`coec ARGUMENTS` as a user whom the modes of files hold for; what it says is in `log`."""
     with log.open("wb") as stream:
-        command = [*prefix, *COMMAND, *(str(argument) for argument in arguments)]
+        command = [*unprivileged(), *COMMAND, *(str(argument) for argument in arguments)]
         return subprocess.Popen(command, stdout=stream, stderr=stream, env=environment())
 
 
@@ -274,42 +279,70 @@ def zenoh_file_that_is_a_folder(folder: Path, _: TestAuthority) -> str:
     return "it is a folder; container engines make one if the file to mount does not exist"
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        no_configuration,
-        configuration_of_others,
-        no_network,
-        network_of_others,
-        folder_of_networks_of_others,
-        mask_of_others,
-        key_of_others,
-        zenoh_key_of_others,
-        zenoh_key_of_another_certificate,
-        zenoh_file_that_is_a_folder,
-    ],
-    ids=lambda spoil: spoil.__name__,
+SPOILERS = (
+    no_configuration,
+    configuration_of_others,
+    no_network,
+    network_of_others,
+    folder_of_networks_of_others,
+    mask_of_others,
+    key_of_others,
+    zenoh_key_of_others,
+    zenoh_key_of_another_certificate,
+    zenoh_file_that_is_a_folder,
 )
+
+STARTS = {"check-config": (), "run": ("--config",)}
+"""Commands that read a configuration, and what stands before its path."""
+
+ONE_AFTER_THE_OTHER = f"""
+import os, sys
+from pathlib import Path
+from coec.cli.main import main
+for folder in sys.argv[1:]:
+    for command, options in {STARTS!r}.items():
+        said = os.open(f"{{folder}}.{{command}}", os.O_WRONLY | os.O_CREAT)
+        for stream in (1, 2):
+            os.dup2(said, stream)
+        sys.argv = ["coec", command, *options, f"{{folder}}/coec.yaml"]
+        status = main()
+        sys.stdout.flush()
+        Path(f"{{folder}}.{{command}}.status").write_text(str(int(status)))
+"""
+"""A program that tries to start in each of the folders, and puts beside it what was said, and the exit status."""
+
+
+@pytest.fixture(scope="module")
+def spoiled(tmp_path_factory: pytest.TempPathFactory, authority: TestAuthority) -> Mapping[str, tuple[Path, str]]:
+    """By the name of what is wrong: a folder in which a start has failed, and what must have been said of it."""
+    made = {}
+    for spoil in SPOILERS:
+        folder = tmp_path_factory.mktemp(spoil.__name__)
+        made[spoil.__name__] = (folder, spoil(folder, authority))
+    command = [
+        *unprivileged(),
+        sys.executable,
+        "-c",
+        ONE_AFTER_THE_OTHER,
+        *(str(folder) for folder, _ in made.values()),
+    ]
+    subprocess.run(command, env=environment(), timeout=PATIENCE_S, check=True)
+    return made
+
+
+@pytest.mark.parametrize("spoil", SPOILERS, ids=lambda spoil: spoil.__name__)
 @pytest.mark.fault(
     "a file that a start needs is absent, or may not be read",
     "`run` and `check-config` end with 78 alike and name the file, its mode, the user, and what to do",
 )
 def test_what_a_start_cannot_read_ends_run_and_check_config_alike(
-    tmp_path: Path, authority: TestAuthority, spoil: Any
+    spoiled: Mapping[str, tuple[Path, str]], spoil: Any
 ) -> None:
-    words, path = spoil(tmp_path, authority), tmp_path / "coec.yaml"
-    logs = {"check-config": tmp_path / "checked", "run": tmp_path / "ran"}
-    arguments = {"check-config": (path,), "run": ("--config", path)}
-    # Both at once: they wait for each other in nothing.
-    processes = {command: started(command, *arguments[command], log=log) for command, log in logs.items()}
-    try:
-        for command, process in processes.items():
-            code, said = process.wait(PATIENCE_S), logs[command].read_text()
-            assert (code, words in said.replace("\n", " ")) == (ExitCode.CONFIGURATION, True), said
-    finally:
-        for process in processes.values():
-            process.kill()
-            process.wait()
+    folder, words = spoiled[spoil.__name__]
+    for command in STARTS:
+        said = Path(f"{folder}.{command}").read_text()
+        code = int(Path(f"{folder}.{command}.status").read_text())
+        assert (code, words in said.replace("\n", " ")) == (ExitCode.CONFIGURATION, True), said
 
 
 @pytest.mark.fault(
@@ -327,8 +360,8 @@ def test_a_state_directory_of_others_stays_theirs(tmp_path: Path) -> None:
     assert words in log.read_text()
 
 
-def test_a_command_line_that_does_not_fit_never_does(tmp_path: Path) -> None:
-    assert ended("run", "--no-such-option", log=tmp_path / "log") in never_again()
+def test_a_command_line_that_does_not_fit_never_does() -> None:
+    assert coec_here("run", "--no-such-option").returncode in never_again()
 
 
 @pytest.mark.fault(

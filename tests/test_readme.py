@@ -71,12 +71,14 @@ class Form:
         until: a person looks again until the answer holds this.
         status: exit status of `instead`.
         always: whether `instead` is typed in the slow form, too.
+        other_data: in the gate, what the commands after `instead` say is of other data: not compared with the page.
     """
 
     instead: str | None = None
     until: str | None = None
     status: int = 0
     always: bool = False
+    other_data: bool = False
 
 
 def options_known(command: str) -> Form:
@@ -91,11 +93,14 @@ DIRECTIONS = (
     f'coec evaluate "kitti360:{SAMPLES}/kitti360?camera=image_00" --depth stereo --objective mi '
     "--rotation-deg 10 --directions 200 --output out"
 )
+SIM_VIEW = "coec sim view --seed 4 --at-s 10 --output view.jpg"
 SIM_DRIVE = "coec sim drive --seed 3 --seconds 60 --fault step:30:rx=3 --output drive.mcap"
 RIG_DRIVE = "coec sim drive --rig four-fisheyes --seconds 4 --camera fisheye350 --fault front:step:2:ry=1 --output rig"
 RIG_LIDARS = 'coec lidars "sim:rig=four-fisheyes&seconds=4" roof near_left'
 RIG_DEMO = "coec demo --rig"
 RIG_MOVES = "coec sim rig-moves --drives 5 --rigs 5"
+TUTORIAL_DRIVE = "sim:seed=1&seconds=40&camera_hz=1&lidar_hz=1&workshop=0.8,-0.6,0.5"
+SMALL_DRIVE = f"{TUTORIAL_DRIVE}&camera=fisheye200&lidar=32&depth=yes"
 SIM_CALIBRATE = 'coec calibrate "sim:seed=3&seconds=60&camera_hz=0.4&lidar_hz=0.4" --perturb 3,-3,2'
 COMMISSION = "coec commission SOURCE... --output rig.json"
 DIAGNOSE = "coec diagnose SOURCE --rig rig.json"
@@ -107,7 +112,17 @@ FORMS = {
     # These set up a virtual environment, and run what is tested here: the demonstration by tests/lab/test_demo.py.
     "deploy/demo": Form("bash -n $REPOSITORY/deploy/demo", always=True),
     "tests/run": Form("bash -n $REPOSITORY/tests/run", always=True),
-    DIRECTIONS: Form(f"{DIRECTIONS} --frames 5".replace("200", "2")),
+    # The pictures that it writes are tested in tests/lab/test_evaluate.py.
+    DIRECTIONS: Form(f"{DIRECTIONS.removesuffix(' --output out')} --frames 3".replace("200", "2")),
+    # A small picture with exact depth is drawn, sent and solved in a tenth of the time, by the same commands.
+    f'coec convert "{TUTORIAL_DRIVE}" s.yaml': Form(
+        f'coec convert "{SMALL_DRIVE}" s.yaml && sed -i "s/model: stereo}}/&, objective: {{kind: mi}}/" s.yaml',
+        other_data=True,
+    ),
+    f'coec play "{TUTORIAL_DRIVE}" --config s.yaml --rate 2': Form(
+        f'coec play "{SMALL_DRIVE}" --config s.yaml --rate 8'
+    ),
+    SIM_VIEW: Form(f"{SIM_VIEW} --camera fisheye200"),
     SIM_DRIVE: Form(f"{SIM_DRIVE} --camera fisheye200".replace("60", "0.5").replace("step:30", "step:0.2")),
     RIG_DRIVE: Form(RIG_DRIVE.replace("fisheye350", "fisheye100").replace("4", "0.3").replace("step:2", "step:0.1")),
     RIG_LIDARS: Form("coec lidars --help > help.txt"),
@@ -118,7 +133,12 @@ FORMS = {
         "COLUMNS=200 coec sim rig-moves --help > help.txt && grep -q -e --drives help.txt && grep -q -e --rigs help.txt"
     ),
     # Two frames are too few for an uncertainty: the verdict is negative.
-    SIM_CALIBRATE: Form(f"{SIM_CALIBRATE} --frames 2", status=1),
+    SIM_CALIBRATE: Form(
+        f"{SIM_CALIBRATE} --frames 2 --depth stereo".replace(
+            'lidar_hz=0.4"', 'lidar_hz=0.4&camera=fisheye200&depth=yes"'
+        ),
+        status=1,
+    ),
     # What it looks at is tested in tests/cli/test_check.py; the slow form compares the figures.
     CHECK: Form("coec check --help > help.txt && grep -q -e --depth help.txt"),
     COMMISSION: options_known(COMMISSION),
@@ -283,14 +303,16 @@ def play_through(
     variables = environment() if env is None else env
     path = os.pathsep.join([str(shim(folder, coec)), variables["PATH"]])
     run_shell("\n".join(lines), cwd, {**variables, "PATH": path, "REPOSITORY": str(REPOSITORY)}, patience_s)
+    other_data = False
     for number, step in enumerate(block.steps):
         chosen = typed(step, short=short)
+        other_data |= short and FORMS.get(step.command, Form()).other_data
         out, err = ((spoken / f"{number}.{stream}").read_text() for stream in ("out", "err"))
         wanted = FORMS[step.command].status if step.command in FORMS and chosen.command != step.command else 0
         status = int((spoken / f"{number}.status").read_text())
         assert status == wanted, f"{chosen.command}\nexit status {status}\n{out}{err}"
         assert "Traceback" not in err, err
-        if chosen.shown:
+        if chosen.shown and not other_data:
             complaint = missing(chosen.shown, out)
             assert complaint is None, f"{chosen.command}\n{complaint}\nit says\n{out}"
 

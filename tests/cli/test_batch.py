@@ -77,10 +77,6 @@ def test_a_failed_try_leaves_no_folder_that_refuses_the_next(
     kept = coec("batch", recorded, "--output", folder, "--jobs", 1, "--depth", absent, "--keep-going", "--json")
     assert kept.document["errors"] == {"bad_model": 2}
 
-    other = tmp_path / "other"
-    assert coec("batch", recorded, "--output", other, "--jobs", 1, "--depth", absent).status == 1
-    assert coec("batch", recorded, "--output", other, "--jobs", 1).status == 0
-
 
 def test_what_is_not_the_word_of_a_fleet_is_told(coec: Coec, tmp_path: Path) -> None:
     said = tmp_path / "now.json"

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 Coec = Callable[..., Any]
 
 RIG = "sim:seed=1&seconds=16&camera_hz=0.5&lidar_hz=0.5&camera=fisheye320&lidar=32&depth=yes"
@@ -68,6 +70,7 @@ def test_the_published_experiments(coec: Coec, tmp_path: Path) -> None:
     assert page.count('class="plot wide"') == 3
 
 
+@pytest.mark.slow
 def test_the_published_experiments_on_every_window_of_a_drive(coec: Coec, tmp_path: Path) -> None:
     options = ("--depth", "stereo", "--runs", 4, "--samples", 3, "--slice-s", 7, "--output", tmp_path)
     outcome = coec("paper", RIG, *options, "--json")

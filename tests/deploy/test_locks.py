@@ -135,7 +135,10 @@ def test_an_argument_that_is_not_known_is_refused_before_anything_is_made() -> N
 
 @pytest.mark.parametrize(
     ("argument", "stamps"),
-    [("--docs", {"requirements", "docs"}), ("--checks", {"requirements", "docs", "checks"})],
+    [
+        pytest.param("--docs", {"requirements", "docs"}, marks=pytest.mark.slow),
+        ("--checks", {"requirements", "docs", "checks"}),
+    ],
 )
 def test_what_was_installed_is_noted_for_each_lock(tmp_path: Path, argument: str, stamps: set[str]) -> None:
     """With locks that pin nothing, and a project that cannot be installed, so that nothing is fetched."""

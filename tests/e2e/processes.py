@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -12,7 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +23,7 @@ import numpy as np
 import zenoh
 
 from coec.cli.convert import configuration_for
+from coec.cli.main import main
 from coec.config import BudgetConfig, Config, LimitsConfig, StateConfig, ZenohConfig, load_config
 from coec.errors import NotFoundError
 from coec.geometry.se3 import Array, perturb
@@ -81,6 +83,20 @@ def coec(*arguments: object, timeout_s: float = PATIENCE_S) -> subprocess.Comple
     """Runs `coec ARGS` to its end."""
     command = [*COMMAND, *(str(argument) for argument in arguments)]
     return subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=timeout_s)
+
+
+def coec_here(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Runs `coec ARGS` to its end in this process, which saves the start of another."""
+    command = ["coec", *(str(argument) for argument in arguments)]
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
+    before, sys.argv = sys.argv, command
+    try:
+        with redirect_stdout(out), redirect_stderr(err):
+            status = main()
+    finally:
+        sys.argv = before
+    said = [stream.buffer.getvalue().decode() for stream in (out, err)]  # type: ignore[attr-defined]
+    return subprocess.CompletedProcess(command, status, *said)
 
 
 def free_endpoint() -> str:

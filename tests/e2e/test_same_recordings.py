@@ -16,10 +16,15 @@ from coec.io.mcap.bag_writer import write_bag
 from coec.io.ros.topics import PairTopics
 from e2e.drives import STEPPED, Drive, rendered, without_depth
 from e2e.processes import Router, coec, service, write_configuration
-from e2e.test_same_decisions import CERTAIN_S, ENDED_S, SLICE_S, WORKSHOP, decisions
+from e2e.test_same_decisions import WORKSHOP, decisions
 from support.recordings import converted
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+SLICE_S, SLICES = 12, 2
+ENDED_S = SLICES * SLICE_S
+CERTAIN_S = 2
+"""Of driving, until the pair that ends a window is certain."""
 
 SPEED = 4.0
 """Seconds of driving per second of play."""

@@ -21,7 +21,7 @@ from coec.io.mcap.window_reader import read_result, read_window
 from coec.io.recordings.layouts import open_source
 from coec.io.zenoh.player import Frame
 from e2e.drives import NS_PER_S, SHORT, SHORT_PAIRS, Drive, later, rendered
-from e2e.processes import Router, Service, coec, free_endpoint, service, write_configuration
+from e2e.processes import Router, Service, coec, coec_here, free_endpoint, service, write_configuration
 from support.fake_worker import wait_until
 
 SHORT_S = 12
@@ -60,7 +60,7 @@ def _text(document: Any) -> str:
 
 def _asked(endpoint: str, *arguments: object) -> Any:
     """The document of `coec query ARGS --json`."""
-    done = coec("query", *arguments, "--connect", endpoint, "--json")
+    done = coec_here("query", *arguments, "--connect", endpoint, "--json")
     assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}"
     return json.loads(done.stdout)
 
@@ -92,17 +92,17 @@ def _check_same_by_calibrate(endpoint: str, extrinsic: Any, folder: Path) -> Pat
     """Downloads the window, calibrates it, replays it: the same to the byte."""
     window = folder / "downloaded.mcap"
     _asked(endpoint, f"windows/{extrinsic['window_id']}", "--output", window)
-    calibrated = coec("calibrate", window, "--json")
+    calibrated = coec_here("calibrate", window, "--json")
     assert calibrated.returncode == 0, calibrated.stderr
     assert _text(json.loads(calibrated.stdout)) == _text(extrinsic)
-    assert coec("replay", window).returncode == 0
+    assert coec_here("replay", window).returncode == 0
     return window
 
 
 def _check_exported(endpoint: str, state: Path, config: Path) -> None:
     """The file that the service answers is the one that its state directory exports to."""
     answered = _asked(endpoint, "extrinsic", "--param", "format=kalibr")
-    exported = coec("export", state, "--config", config, "--format", "kalibr")
+    exported = coec_here("export", state, "--config", config, "--format", "kalibr")
     assert exported.returncode == 0, exported.stderr
     assert exported.stdout == answered
 
@@ -121,7 +121,7 @@ def test_from_frames_to_extrinsic_and_after_a_restart(tmp_path: Path, drive: Dri
     with service(config, router) as running:
         before = _asked(router.endpoint, "extrinsic")
         assert (before["provenance"], before["status"]) == ("nominal", "not_accepted")
-        refused = coec("query", "extrinsic", "--param", "format=urdf", "--connect", router.endpoint)
+        refused = coec_here("query", "extrinsic", "--param", "format=urdf", "--connect", router.endpoint)
         assert (refused.returncode, "nothing has been accepted yet" in refused.stderr) == (1, True)
         _played(router.endpoint, drive.source, config, 0.0)
         extrinsic = _solved(running, router.endpoint, SHORT_PAIRS)
@@ -142,6 +142,7 @@ def test_from_frames_to_extrinsic_and_after_a_restart(tmp_path: Path, drive: Dri
         assert running.terminate() == 0
 
 
+@pytest.mark.slow
 def test_kitti360_from_frames_to_extrinsic(tmp_path: Path, sample_data: Path) -> None:
     """Real sensors, and a service that is its own router."""
     source = f"kitti360:{sample_data / 'kitti360'}?camera=image_00"

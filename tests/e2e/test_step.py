@@ -150,6 +150,7 @@ def changed(path: Path, **sections: BaseModel) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path, drive: Drive, router: Router) -> None:
     remembering = SnippetsConfig(memory_bytes=SNIPPET_BYTES)
     config = changed(stepped_configuration(tmp_path, router, MAPS, apply="never"), snippets=remembering)

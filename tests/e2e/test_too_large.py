@@ -46,7 +46,10 @@ def router(endpoint: str, max_bytes: int) -> Iterator[None]:
     ("limit", "stream", "numbered", "counted"),
     [
         (LimitsConfig().max_message_bytes, "lidar", True, {"camera": {"surplus": 1}, "lidar": {"sequence_gap": 1}}),
-        (2**30, "camera", False, {"camera": {}, "lidar": {"unpaired": 1}}),
+        pytest.param(
+            *(2**30, "camera", False, {"camera": {}, "lidar": {"unpaired": 1}}),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["in a router of the shipped limit", "behind a router of Zenoh's own"],
 )

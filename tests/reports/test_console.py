@@ -119,6 +119,9 @@ HARMLESS = {"isatty", "encoding"}
 DISPLAYS = {"Live", "Progress"}
 """Displays of rich that make a console of their own unless they are given one."""
 
+LAST_WORDS = {name.rpartition(".")[2] for name in PRINTS | DISPLAYS}
+STREAM_NAMES = {name.rpartition(".")[2] for name in STREAMS}
+
 
 def bypasses(path: Path) -> list[str]:
     """What a module prints with, or could print with, other than the sink."""
@@ -127,12 +130,19 @@ def bypasses(path: Path) -> list[str]:
     harmless = {id(node.value) for node in nodes if isinstance(node, ast.Attribute) and node.attr in HARMLESS}
     found = []
     for node in nodes:
-        if isinstance(node, ast.Call):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
+            if (node.func.id if isinstance(node.func, ast.Name) else node.func.attr) not in LAST_WORDS:
+                continue
             name, given = ast.unparse(node.func), {keyword.arg for keyword in node.keywords}
             alone = name in DISPLAYS and "from rich" in text and "console" not in given
             if name in PRINTS or alone:
                 found.append((node.lineno, name))
-        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load) and id(node) not in harmless:
+        elif (
+            isinstance(node, ast.Attribute)
+            and node.attr in STREAM_NAMES
+            and isinstance(node.ctx, ast.Load)
+            and id(node) not in harmless
+        ):
             found += [(node.lineno, stream) for stream in STREAMS & {ast.unparse(node)}]
     return [f"{path.relative_to(PACKAGE.parent)}:{line}: {name}" for line, name in found]
 
