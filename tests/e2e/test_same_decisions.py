@@ -27,7 +27,6 @@ from e2e.drives import (
     SHORT_PAIRS,
     STEPPED,
     Drive,
-    later,
     rendered,
     stepped_configuration,
     without_depth,
@@ -55,11 +54,12 @@ REPLAY_SPEED = 12.0
 """Seconds of driving per second, of the recording that is played."""
 
 HALF_PAIR_S = 1.0
-"""Half of what is between two pictures of the short drive: no pair is torn."""
+"""Half of what is between two pictures of the small drive: no pair is torn."""
 
 MAX_ERROR_DEG = 0.35
 
 SHORT_SLICE_S = 12
+SMALL = SHORT.replace("seconds=12", "seconds=28")
 BY_DEPTH = CalibrationConfig(depth=DepthConfig(model="stereo"), objective=ObjectiveConfig(kind="mi"))
 """Six small pictures have too few edges for `fused`."""
 
@@ -80,25 +80,25 @@ def told_of(running: Service, *kinds: str) -> dict[str, Any]:
     }
 
 
-def in_turn(drive: Drive, begin_s: float, end_s: float) -> list[Frame]:
-    """The frames between two moments of the short drive, which begins again when it has ended."""
-    endless = (frame for turn in range(SLICES + 1) for frame in later(drive.frames, turn * SHORT_SLICE_S))
-    return [frame for frame in endless if begin_s <= (frame.stamp_ns - drive.start_ns) / NS_PER_S + HALF_PAIR_S < end_s]
+def between(drive: Drive, begin_s: float, end_s: float) -> list[Frame]:
+    """The frames between two moments of the small drive."""
+    moments = ((frame, (frame.stamp_ns - drive.start_ns) / NS_PER_S + HALF_PAIR_S) for frame in drive.frames)
+    return [frame for frame, moment_s in moments if begin_s <= moment_s < end_s]
 
 
 @pytest.mark.fault("killed in the middle of a solve", "the decisions are those of an undisturbed replay")
 def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(tmp_path: Path, router: Router) -> None:
-    short = rendered(SHORT)
+    small = rendered(SMALL)
     ended_s = SLICES * SHORT_SLICE_S
 
     def configured(name: str) -> Path:
         window = WindowConfig(pairs=SHORT_PAIRS, min_pairs=4, slice_s=SHORT_SLICE_S)
         return write_configuration(
-            tmp_path / name, short.recording, router.endpoint, WORKSHOP, window=window, calibration=BY_DEPTH
+            tmp_path / name, small.recording, router.endpoint, WORKSHOP, window=window, calibration=BY_DEPTH
         )
 
     with service(configured("live"), router) as running:
-        running.send(in_turn(short, 0, ended_s + OVER_S))
+        running.send(between(small, 0, ended_s + OVER_S))
         running.rest()
         live = told_of(running, "estimate", "extrinsic")
         assert running.terminate() == 0
@@ -107,10 +107,10 @@ def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(tmp_path: Pat
 
     config = configured("killed")
     with service(config, router) as running:
-        running.send(in_turn(short, 0, ended_s))
+        running.send(between(small, 0, ended_s))
         running.rest()
         psutil.Process(running.worker()["pid"]).suspend()
-        running.send(in_turn(short, ended_s, ended_s + OVER_S))
+        running.send(between(small, ended_s, ended_s + OVER_S))
         running.until(running.counters, lambda pair: pair["windows"] == SLICES, "the last window is recorded")
         running.kill()
     with service(config, router, warm=False) as running:
@@ -225,9 +225,9 @@ def decided_by(
 
 @pytest.mark.slow
 def test_native_frames_and_topics_of_rmw_zenoh_come_to_the_same(tmp_path: Path, router: Router) -> None:
-    short = rendered(SHORT)
+    small = rendered(SMALL)
     # The first pair of the next slice ends the window, and is none itself.
-    frames = without_depth(in_turn(short, 0, SHORT_SLICE_S + OVER_S))
+    frames = without_depth(between(small, 0, SHORT_SLICE_S + OVER_S))
     network = tmp_path / "tiny.onnx"
     network.write_bytes(first_channel_network())
     network.with_suffix(".yaml").write_text(MODEL_CARD)
@@ -240,7 +240,7 @@ def test_native_frames_and_topics_of_rmw_zenoh_come_to_the_same(tmp_path: Path, 
             search=SearchConfig(max_evaluations=60),
         )
         return write_configuration(
-            tmp_path / name, short.recording, router.endpoint, window=window, calibration=calibration
+            tmp_path / name, small.recording, router.endpoint, window=window, calibration=calibration
         )
 
     native, topics = (
