@@ -30,11 +30,21 @@ SHORT = "seed=1&seconds=12&camera=pinhole240x120&lidar=32&camera_hz=0.5&lidar_hz
 SHORT_PAIRS = 6
 
 SECONDS, STEP_S, RATE_HZ = 100, 40, 1.0
-STEPPED = (
-    f"seed=1&seconds={SECONDS}&camera=pinhole480x240&lidar=32&camera_hz={RATE_HZ}&lidar_hz={RATE_HZ}&ego_hz=10"
-    f"&depth=yes&faults=step:{STEP_S}:ry=1"
-)
+EARLY_SECONDS, EARLY_STEP_S = 72, 24
+
+
+def _stepped(seconds: int, step_s: int) -> str:
+    return (
+        f"seed=1&seconds={seconds}&camera=pinhole480x240&lidar=32&camera_hz={RATE_HZ}&lidar_hz={RATE_HZ}&ego_hz=10"
+        f"&depth=yes&faults=step:{step_s}:ry=1"
+    )
+
+
+STEPPED = _stepped(SECONDS, STEP_S)
 """The mount moves by one degree in yaw, when one window and several checks have passed."""
+
+EARLY_STEPPED = _stepped(EARLY_SECONDS, EARLY_STEP_S)
+"""The same sooner, for shorter windows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +89,15 @@ def without_depth(frames: Sequence[Frame]) -> list[Frame]:
     return [replace(frame, depth=None) if isinstance(frame, CameraFrame) else frame for frame in frames]
 
 
-def stepped_configuration(folder: Path, router: Router, depth: DepthConfig, **policy: Any) -> Path:
+def stepped_configuration(
+    folder: Path, router: Router, depth: DepthConfig, slice_s: float = 32.0, **policy: Any
+) -> Path:
     """A configuration for the drive with the step, with short windows."""
     return write_configuration(
         folder,
-        rendered(STEPPED).recording,
+        open_sim(parse_spec(f"sim:{STEPPED}").query),
         router.endpoint,
-        window=WindowConfig(pairs=16, min_pairs=8, slice_s=32.0),
+        window=WindowConfig(pairs=16, min_pairs=8, slice_s=slice_s),
         monitor=MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=16.0),
         calibration=CalibrationConfig(depth=depth),
         policy=PolicyConfig(**policy),

@@ -27,7 +27,7 @@ from coec.io.mcap.window_reader import read_window
 from coec.io.zenoh.player import Player, StreamKeys, repeated, shifted
 from coec.io.zenoh.query_client import is_alive
 from coec.reports.commented_yaml import commented_yaml
-from e2e.drives import NS_PER_S, STEPPED, Drive, rendered
+from e2e.drives import EARLY_STEPPED, NS_PER_S, Drive, rendered
 from e2e.processes import PATIENCE_S, Router, Service, service, write_configuration
 from support.fake_worker import wait_until
 
@@ -157,7 +157,7 @@ def config(tmp_path: Path, router: Router) -> Path:
     """Short windows, and snippets of red events, so that there is always something to be written."""
     path = write_configuration(
         tmp_path,
-        rendered(STEPPED).recording,
+        rendered(EARLY_STEPPED).recording,
         router.endpoint,
         window=WindowConfig(pairs=12, min_pairs=8, slice_s=12.0),
         monitor=MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0),
@@ -180,7 +180,7 @@ def test_killed_at_any_moment_nothing_told_is_lost(
     seed: int,
     record_property: Callable[[str, object], None],
 ) -> None:
-    with driving(rendered(STEPPED), router):
+    with driving(rendered(EARLY_STEPPED), router):
         starts_s = lives(config, router, tmp_path / "state" / "windows", kills, seed)
     record_property(
         "figure",

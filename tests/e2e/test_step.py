@@ -16,13 +16,26 @@ from coec.io.zenoh.command_auth import CommandSender, Credentials
 from coec.io.zenoh.query_client import JSON, Reply, query_one, send_authenticated
 from coec.io.zenoh.window_fetch import fetch_window
 from coec.reports.commented_yaml import commented_yaml
-from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
+from e2e.drives import (
+    EARLY_SECONDS,
+    EARLY_STEP_S,
+    EARLY_STEPPED,
+    NS_PER_S,
+    SECONDS,
+    STEP_S,
+    STEPPED,
+    Drive,
+    rendered,
+    stepped_configuration,
+)
 from e2e.planted import plant, said, written
 from e2e.processes import PATIENCE_S, Router, Service, service
 from support.readers import read_recording
 from support.router import TestAuthority
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+EARLY_SLICE_S = 16.0
 
 NOTICED_S = 60.0
 """Of driving."""
@@ -64,24 +77,26 @@ def commanded(running: Service, name: str, credentials: Credentials) -> str:
 )
 def test_a_step_is_noticed_corrected_and_remembered(
     tmp_path: Path,
-    drive: Drive,
     router: Router,
     authority: TestAuthority,
     record_property: Callable[[str, object], None],
 ) -> None:
+    drive = rendered(EARLY_STEPPED)
     # All that it has to say is read, windows too: no answer shall be that the uplink is busy.
-    config = changed(stepped_configuration(tmp_path, router, MAPS), uplink=UplinkConfig(evidence_bytes_per_s=FAST))
+    config = changed(
+        stepped_configuration(tmp_path, router, MAPS, EARLY_SLICE_S), uplink=UplinkConfig(evidence_bytes_per_s=FAST)
+    )
     secrets = plant(config, router, authority)
     with service(config, router) as running:
         keys, pair = running.keys, running.pair
-        running.send(drive.between(0, STEP_S))
+        running.send(drive.between(0, EARLY_STEP_S))
         running.rest()
         before = running.extrinsic()
         assert running.health()["state"] == "healthy"
         assert drive.error_deg(before, 0) < MAX_ERROR_DEG
-        running.send(drive.between(STEP_S, SECONDS + 1))
+        running.send(drive.between(EARLY_STEP_S, EARLY_SECONDS + 1))
         running.rest()
-        step_ns = drive.start_ns + STEP_S * NS_PER_S
+        step_ns = drive.start_ns + EARLY_STEP_S * NS_PER_S
         # On a busy machine a pair may also be degraded while answers are awaited: by the clock, not by sensor time.
         told = [entry for entry in running.entries("state") if entry["stamp_ns"] is not None]
         assert told[0]["code"] == "healthy", "no false alarm"
@@ -95,7 +110,7 @@ def test_a_step_is_noticed_corrected_and_remembered(
         assert states["miscalibrated"] <= states["healthy"]
         # If the silence after the drive ends the open window, its last pairs are too old to acquit what it changes.
         assert running.health()["state"] in ("healthy", "unknown")
-        assert drive.error_deg(running.extrinsic(), SECONDS) < MAX_ERROR_DEG
+        assert drive.error_deg(running.extrinsic(), EARLY_SECONDS) < MAX_ERROR_DEG
 
         (event,) = running.ask(keys.evidence(pair))["events"]
         assert event["resolution"].startswith("healthy")
