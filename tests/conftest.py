@@ -24,14 +24,22 @@ BENCHMARKS = TESTS / "bench"
 
 LONGEST_FIRST = (
     "test_readme.py",
+    "e2e/test_step.py",
+    "e2e/test_service.py",
+    "service/worker",
     "e2e",
-    "lab/test_demo.py",
-    "lab",
-    "cli",
+    "soak",
+    "test_daemon.py",
+    "deploy/test_vehicle.py",
     "peers",
+    "lab",
+    "calibration",
+    "service",
+    "cli",
+    "golden",
+    "reports",
     "campaign",
     "deploy",
-    "calibration",
 )
 """Files and folders whose tests start processes, and those that calibrate. A parallel run hands out one file after the
 other: a long one that comes last is waited for by a core that has nothing to do."""
