@@ -326,7 +326,7 @@ class TestMountScatter:
 
     def test_noise_streets_and_a_step_are_no_swing(self) -> None:
         rng = np.random.default_rng(0)
-        noise = [fresh(n, flagged=False, offset=rng.normal(0.0, 0.0008, 6)) for n in range(2000)]
+        noise = [fresh(n, flagged=False, offset=rng.normal(0.0, 0.0008, 6)) for n in range(600)]
         assert max(self.evidence(noise)) < LOOSE_AT / 2
         step = [fresh(n, flagged=n > 10, offset=turned(0.0 if n < 10 else 2.0, 0.0, 0.0)) for n in range(20)]
         assert max(self.evidence(step)) < LOOSE_AT / 2

@@ -119,7 +119,7 @@ def test_stuck_odometry(drive: Window, stereo: DepthModel) -> None:
 
 
 @pytest.mark.fault("a LiDAR that is turned by 40° or 180° about its axis", "not healthy after three periods")
-@pytest.mark.parametrize("degrees", [40.0, 180.0])
+@pytest.mark.parametrize("degrees", [40.0, pytest.param(180.0, marks=pytest.mark.slow)])
 def test_a_turned_lidar(drive: Window, stereo: DepthModel, degrees: float) -> None:
     found = course(drive, stereo, lambda pair: with_points(pair, turned(degrees)))
     assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
@@ -140,7 +140,7 @@ def test_repeated_frames(drive: Window, stereo: DepthModel, *, camera: bool, sta
 
 
 @pytest.mark.fault("a focal length that is 2 % or 5 % wrong", "not healthy after three periods; the lens is named")
-@pytest.mark.parametrize("factor", [1.02, 1.05])
+@pytest.mark.parametrize("factor", [1.02, pytest.param(1.05, marks=pytest.mark.slow)])
 def test_a_wrong_focal_length(drive: Window, stereo: DepthModel, factor: float) -> None:
     camera = drive.rig.camera
     rig = replace(drive.rig, camera=camera._replace(fx=factor * camera.fx, fy=factor * camera.fy))
@@ -151,7 +151,7 @@ def test_a_wrong_focal_length(drive: Window, stereo: DepthModel, factor: float) 
 
 
 @pytest.mark.fault("a mount that swings by 1.5° about any axis in 2.3 s", "not healthy after four periods")
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("axis", [0, *(pytest.param(axis, marks=pytest.mark.slow) for axis in (1, 2))])
 def test_a_swinging_mount(drive: Window, stereo: DepthModel, axis: int) -> None:
     pose = drive.T_camera_lidar_start
 

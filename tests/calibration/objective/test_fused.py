@@ -212,7 +212,7 @@ def test_depth_that_does_not_vary_with_the_pose_leaves_the_edges_to_decide(
 
 
 # ----------------------------------------------------------------------------------------------- the calibration
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_start_twenty_five_degrees_away_comes_back(sharp_street: Window, stereo: DepthModel, seed: int) -> None:
     estimate = solve(from_start(sharp_street, seed, 25.0), stereo)
     assert error_deg(estimate) < 0.5
@@ -221,7 +221,7 @@ def test_a_start_twenty_five_degrees_away_comes_back(sharp_street: Window, stere
     assert np.abs(estimate.correction[3:]).max() < 0.01
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_start_fifteen_degrees_and_thirty_centimetres_away_comes_back(
     sharp_street: Window, stereo: DepthModel, seed: int
 ) -> None:
@@ -257,6 +257,7 @@ def test_a_knock_is_found_although_the_start_was_known(sharp_street: Window, ste
     assert error_deg(estimate) < 0.5
 
 
+@pytest.mark.slow  # of kept windows the golden decisions tell the bytes of each objective
 def test_same_input_same_bits(sharp_street: Window, stereo: DepthModel) -> None:
     first, second = (solve(from_start(sharp_street, 7, 10.0), stereo) for _ in range(2))
     assert first.optimum.T_camera_lidar.tobytes() == second.optimum.T_camera_lidar.tobytes()
@@ -291,6 +292,7 @@ def test_images_and_depth_of_other_frames_are_not_believed(sharp_street: Window,
     assert is_accounted_for(estimate)
 
 
+@pytest.mark.slow
 def test_images_of_other_frames_are_not_believed(sharp_street: Window, stereo: DepthModel) -> None:
     mixed = swapped(sharp_street, lambda pair, other: replace(pair.camera, image=other.camera.image))
     assert solve(mixed, stereo).verdict.decision is Decision.FAILED

@@ -151,6 +151,7 @@ def test_a_pair_that_suspects_a_move_asks_for_windows_and_not_again_before_the_a
     assert all(later - earlier >= late_ns for earlier, later in pairwise([first, *others]))
 
 
+@pytest.mark.slow  # the attribution has a short form: calibration/rig/test_attribution.py
 def test_where_looks_are_too_faint_an_accepted_window_names_the_camera(rows: list[RigDriveRow]) -> None:
     drive = DisplacedRigDrive(1, CAMERA)
     edge = f"{drive.cameras[0]}-{LIDAR}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from math import radians
 
 import numpy as np
@@ -21,9 +22,10 @@ from coec_lab.experiments.rig_evidence import (
 )
 
 AT_S, UNTIL_S = 100.0, 1000.0
-DRIVES = 12
+DRIVES = 4
 
 
+@cache
 def driven(number: int) -> tuple[Happening, list[TimedEvidence], list[TimedEvidence]]:
     """One whose front camera is knocked by 1°: what happens, the looks, and the windows."""
     rng = np.random.default_rng([41, number])

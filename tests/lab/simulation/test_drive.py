@@ -68,13 +68,15 @@ def pixels(frame: CameraFrame) -> NDArray[np.uint8]:
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
-    assert fingerprint(small().messages()) == fingerprint(plain())
-    other = fingerprint(small(seed=5).messages())
-    assert all(a != b for a, b in zip(other, fingerprint(plain()), strict=True))
+    whole = fingerprint(plain())
+    again, other = (fingerprint(small(seed=seed).messages([0, 3])) for seed in (4, 5))
+    assert len(again) > 4
+    assert all(entry in whole for entry in again)
+    assert not [entry for entry in other if entry in whole]
 
 
 def test_another_lens_sees_the_same_drive_as_one_drawn_for_it_alone() -> None:
-    first, alone = small(seconds=0.5), small(seconds=0.5, camera="pinhole160x120@60", half_view_deg=50.0)
+    first, alone = small(seconds=0.3), small(seconds=0.3, camera="pinhole160x120@60", half_view_deg=50.0)
     through = first.through("pinhole160x120@60", 50.0)
     drawn = [(message, through.part(number, number + 1)[0]) for number, message in enumerate(first.messages())]
     seen = [other if isinstance(one, CameraFrame) else one for one, other in drawn]
@@ -85,12 +87,13 @@ def test_another_lens_sees_the_same_drive_as_one_drawn_for_it_alone() -> None:
 
 
 def test_several_processes_give_the_same_bytes_in_the_same_order() -> None:
-    config = small(camera_hz=2.0, lidar_hz=2.0, ego_hz=200.0).config
+    faults = ("tunnel:0.4", "open_road:0-0.3", "night:0.6")
+    config = small(*faults, camera_hz=3.0, lidar_hz=3.0, ego_hz=200.0).config
     assert fingerprint(messages_by(config, 2)) == fingerprint(SimulatedDrive(config).messages())
 
 
 def test_nothing_more_is_drawn_when_nobody_waits_for_it() -> None:
-    config, left = small().config, multiprocessing.get_context("spawn").Event()
+    config, left = small(seconds=0.3).config, multiprocessing.get_context("spawn").Event()
     parallel._open(config, left)
     whole = SimulatedDrive(config).messages()
     assert fingerprint(parallel._part(0)) == fingerprint(islice(whole, parallel.PART))
@@ -169,17 +172,15 @@ def test_the_truth_follows_the_faults_and_the_rig_knows_nothing_of_them() -> Non
 
 
 def test_a_knocked_camera_sees_something_else_from_then_on() -> None:
-    before, after = pictures(plain()), pictures(small("step:0.5:rx=3").messages())
-    same = [a.image == b.image for a, b in zip(before, after, strict=True)]
+    knocked = tuple(small("step:0.5:rx=3").messages())
+    same = [a.image == b.image for a, b in zip(pictures(plain()), pictures(knocked), strict=True)]
     assert same == [True, True, True, False, False]
-    lidar = zip(sweeps(plain()), sweeps(small("step:0.5:rx=3").messages()), strict=True)
-    assert all(np.array_equal(a.xyz_m, b.xyz_m) for a, b in lidar)
+    assert all(np.array_equal(a.xyz_m, b.xyz_m) for a, b in zip(sweeps(plain()), sweeps(knocked), strict=True))
 
 
 def test_dirt_blurs_and_darkness_is_dark() -> None:
-    clean, dirty, dark = (
-        pixels(pictures(small(*f, seconds=0.1).messages())[0]) for f in ((), ("dirt:0",), ("dark:0",))
-    )
+    clean = pixels(pictures(plain())[0])
+    dirty, dark = (pixels(pictures(small(fault).messages([0]))[0]) for fault in ("dirt:0", "dark:0"))
     assert dark.mean() < 0.6 * clean.mean()
     assert 0.1 < (np.abs(clean.astype(int) - dirty).max(axis=2) > 25).mean() < 0.6
 
@@ -219,7 +220,7 @@ def test_in_stop_and_go_traffic_the_vehicle_stands_between_two_drives() -> None:
 
 
 def test_dead_beams_lost_motion_late_stamps_and_loss() -> None:
-    dead = sweeps(small("beams:0:share=0.5", seconds=0.1).messages())[0]
+    dead = sweeps(small("beams:0:share=0.5", seconds=0.1).messages([0]))[0]
     assert dead.ring is not None
     assert 4 <= len(set(dead.ring.tolist())) <= 12
     plan = small("no-ego:0.2-0.6", "offset:0.3:seconds=0.05", "loss:0.8:share=1")

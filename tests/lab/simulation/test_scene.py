@@ -12,7 +12,6 @@ from coec_lab.simulation.street import GROUND_HALF_M, STRETCH_M
 
 def test_a_place_does_not_depend_on_the_way_there() -> None:
     there = Town(5, 400.0)
-    there.scene(0.0)
     there.scene(310.0)
     again, straight = there.scene(100.0), Town(5, 400.0).scene(100.0)
     np.testing.assert_array_equal(again.origin_m, straight.origin_m)
@@ -23,7 +22,7 @@ def test_a_place_does_not_depend_on_the_way_there() -> None:
 
 def test_only_what_is_near_is_kept() -> None:
     town = Town(2, 2000.0)
-    for at_m in (0.0, 3 * STRETCH_M, 20 * STRETCH_M):
+    for at_m in (0.0, 20 * STRETCH_M):
         scene = town.scene(at_m)
         assert town.stretch_count == BEHIND + AHEAD + 1
         assert len(scene.colour) < 600_000
