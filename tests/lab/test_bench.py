@@ -60,6 +60,7 @@ def test_the_fused_solve_that_is_timed_ends_at_the_truth() -> None:
     assert figures["solve_25deg_6dof_error_deg"] < report.OFF_DEG
 
 
+@pytest.mark.slow
 def test_a_worker_is_measured(tmp_path: Path) -> None:
     steps: list[str] = []
     solves = {"mi": processes.SOLVES["mi"]}
@@ -71,13 +72,8 @@ def test_a_worker_is_measured(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("measure", "prefix"),
-    [
-        pytest.param(daemon.measure_native, "", marks=pytest.mark.slow),
-        (daemon.measure_ros, "ros_"),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("measure", "prefix"), [(daemon.measure_native, ""), (daemon.measure_ros, "ros_")])
 def test_a_daemon_is_measured_under_load(tmp_path: Path, measure: Callable[..., dict[str, Any]], prefix: str) -> None:
     document = measure(tmp_path, lambda _: None, daemon.Timing(settle=1.0, measured=1.5))
     names = (prefix,) if prefix else ("io", "query")
@@ -141,7 +137,10 @@ def test_a_process_is_read() -> None:
         child.kill()
 
 
-@pytest.mark.parametrize("model", scene.CAMERAS)
+@pytest.mark.parametrize(
+    "model",
+    ["pinhole", *(pytest.param(model, marks=pytest.mark.slow) for model in scene.CAMERAS if model != "pinhole")],
+)
 def test_the_scene_is_seen_best_from_the_truth(model: str) -> None:
     box = SearchBox(np.radians(10.0), 0.0)
     objective = scene.objective_of(scene.CAMERAS[model], 2, scene.T_TRUE, box, POINTS)

@@ -3,7 +3,6 @@ right mounts stay healthy. `tests/campaign` plays the same on rendered drives in
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -42,12 +41,6 @@ def moved(xi: Sequence[float], share: Callable[[float], float] = lambda _: 1.0) 
 
 
 STILL = moved((0.0,) * 6)
-
-
-@pytest.fixture(autouse=True)
-def _unsynchronised(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing here is about the disk, and each check waits for it several times."""
-    monkeypatch.setattr(os, "fsync", lambda _: None)
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def brought_to(situation: str, folder: Path) -> PairBench:
     if situation == "suspect":
         bench.drive(STEP_S, STEP_S + 11)
     if situation in ("corrected", "held", "pending"):
-        bench.drive(BEGIN_S + 43, DRIVE_END_S)
+        bench.drive(STEP_S - 20, STEP_S + 60)
     if situation == "held":
         bench.do("hold")
     if situation == "degraded":

@@ -143,11 +143,15 @@ class Watched:
         }
 
 
-def undisturbed(folder: Path) -> dict[str, Any]:
-    watched = Watched(folder, OracleWorker)
-    for frame in sorted(chain(*streams().values()), key=lambda frame: frame.stamp_ns):
-        watched.push(frame)
-    watched.finish()
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Of the drive in the order of its stamps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(time, "monotonic", Clock())
+        watched = Watched(tmp_path_factory.mktemp("calm") / "state", OracleWorker)
+        for frame in sorted(chain(*streams().values()), key=lambda frame: frame.stamp_ns):
+            watched.push(frame)
+        watched.finish()
     return watched.told
 
 
@@ -212,11 +216,10 @@ def wait_in_silence(watched: Watched, clock: Clock) -> None:
 @pytest.mark.fault(
     "streams late and out of step, a slow worker, a stalling clock", "the same windows and checks, to the byte"
 )
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_whatever_the_machine_does_the_same_frames_make_the_same_decisions(
-    tmp_path: Path, seed: int, clock: Clock, record_property: Callable[[str, object], None]
+    tmp_path: Path, calm: dict[str, Any], seed: int, clock: Clock, record_property: Callable[[str, object], None]
 ) -> None:
-    calm = undisturbed(tmp_path / "calm")
     told = disturbed(tmp_path / "disturbed", seed, clock)
     record_property("figure", f"{len(calm['looked'])} pairs, {len(calm['checks'])} checks, all equal")
     assert len(calm["checks"]) > 20
