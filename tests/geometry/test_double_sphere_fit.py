@@ -24,7 +24,15 @@ def test_a_pinhole_is_met_exactly() -> None:
 
 
 @pytest.mark.parametrize(
-    ("xi", "alpha"), [(-0.2, 0.59), (0.1, 0.6), (-0.3, 0.52), (0.6, 0.75), (-0.05, 0.3), (0.0, 0.65)]
+    ("xi", "alpha"),
+    [
+        (-0.2, 0.59),
+        (0.6, 0.75),
+        *(
+            pytest.param(*lens, marks=pytest.mark.slow)
+            for lens in ((0.1, 0.6), (-0.3, 0.52), (-0.05, 0.3), (0.0, 0.65))
+        ),
+    ],
 )
 def test_a_double_sphere_is_found_again(xi: float, alpha: float) -> None:
     source = cameras.build("double_sphere", **SMALL, xi=xi, alpha=alpha)
@@ -35,7 +43,7 @@ def test_a_double_sphere_is_found_again(xi: float, alpha: float) -> None:
     assert fit.camera == pytest.approx(source, rel=1e-4, abs=1e-4)
 
 
-@pytest.mark.parametrize("xi", [0.4, 0.9])
+@pytest.mark.parametrize("xi", [0.9, pytest.param(0.4, marks=pytest.mark.slow)])
 def test_the_unified_model_without_distortion_is_a_double_sphere(xi: float) -> None:
     """It is one twice: with alpha = 0 and the same xi, and with xi = 0, alpha = xi/(1 + xi) and fx/(1 + xi)."""
     fit = fit_double_sphere(cameras.build("mei", **SMALL, xi=xi, k1=0.0, k2=0.0, p1=0.0, p2=0.0))
@@ -101,7 +109,11 @@ REAL: list[tuple[Camera, float, float]] = [
 ]
 
 
-@pytest.mark.parametrize(("source", "rms_px", "max_px"), REAL, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize(
+    ("source", "rms_px", "max_px"),
+    [*(pytest.param(*lens, marks=pytest.mark.slow) for lens in REAL[:-1]), REAL[-1]],
+    ids=lambda value: type(value).__name__,
+)
 def test_what_is_left_of_a_real_lens_is_reported(source: Camera, rms_px: float, max_px: float) -> None:
     fit = fit_double_sphere(source)
     assert fit.residual_rms_px == pytest.approx(rms_px, rel=0.02)

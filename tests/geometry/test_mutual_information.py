@@ -28,6 +28,8 @@ CAMERAS = {
     "eucm": build("eucm", **SENSOR, alpha=0.6, beta=1.1),
     "double_sphere": build("double_sphere", **SENSOR, xi=-0.2, alpha=0.6),
 }
+MODELS = [pytest.param(model, marks=pytest.mark.slow) if model == "radtan" else model for model in CAMERAS]
+"""A kernel is compiled for each, before the tests but for this one, of which no other test has need."""
 POSE = se3.perturbation(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
 
 
@@ -67,7 +69,7 @@ def by_oracle(frames: BinnedFrames, pose: NDArray[np.float64]) -> list[tuple[flo
     ]
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", MODELS)
 def test_every_camera_model_agrees_with_the_plain_form(model: str) -> None:
     frames = frames_of(CAMERAS[model], (5000, 1, 3001), 32, 32)
     found = mutual_information(frames, POSE)
@@ -77,7 +79,11 @@ def test_every_camera_model_agrees_with_the_plain_form(model: str) -> None:
     assert found.mi == pytest.approx([mi for mi, _ in expected], abs=1e-9)
 
 
-@pytest.mark.parametrize(("depth_bins", "range_bins"), [(2, 2), (7, 64), (255, 16), (256, 300), (1000, 5)])
+OF_TWO_BYTES = (pytest.param(256, 300, marks=pytest.mark.slow), pytest.param(1000, 5, marks=pytest.mark.slow))
+"""So many bins have kernels of their own."""
+
+
+@pytest.mark.parametrize(("depth_bins", "range_bins"), [(2, 2), (7, 64), (255, 16), *OF_TWO_BYTES])
 def test_any_number_of_bins(depth_bins: int, range_bins: int) -> None:
     frames = frames_of(CAMERAS["double_sphere"], (4000, 2500), depth_bins, range_bins)
     assert mutual_information(frames, POSE).mi == pytest.approx([mi for mi, _ in by_oracle(frames, POSE)], abs=1e-9)

@@ -23,6 +23,8 @@ CAMERAS = {
     "eucm": build("eucm", **SENSOR, alpha=0.6, beta=1.1),
     "double_sphere": build("double_sphere", **SENSOR, xi=-0.2, alpha=0.6),
 }
+MODELS = [pytest.param(model, marks=pytest.mark.slow) if model == "radtan" else model for model in CAMERAS]
+"""A kernel is compiled for each, before the tests but for this one, of which no other test has need."""
 POSE = se3.perturbation(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
 
 
@@ -47,30 +49,30 @@ def cloud(seed: int, points: int, scale_m: float) -> NDArray[np.float32]:
     return np.random.default_rng(seed).normal(scale=scale_m, size=(3, points)).astype(np.float32)
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("scale_m", [0.3, 3.0, 30.0, 3e4])
 def test_what_single_precision_is_sure_of_is_right(model: str, scale_m: float) -> None:
     camera = CAMERAS[model]
-    xyz = cloud(1, 300_000, scale_m)
+    xyz = cloud(1, 60_000, scale_m)
     found, expected = single_precision(camera, POSE, xyz), double_precision(camera, POSE, xyz)
     sure = found != UNSURE
     np.testing.assert_array_equal(found[sure], expected[sure])
-    assert (found[sure] >= 0).sum() > 5000
+    assert (found[sure] >= 0).sum() > 1000
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", MODELS)
 def test_it_is_sure_of_nearly_everything(model: str) -> None:
     assert (single_precision(CAMERAS[model], POSE, cloud(2, 100_000, 30.0)) == UNSURE).mean() < 0.004
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", MODELS)
 def test_double_precision_settles_the_rest(model: str) -> None:
     camera, xyz = CAMERAS[model], cloud(3, 2000, 5.0)
     found = [exact_pixel(camera, POSE, float(x), float(y), float(z)) for x, y, z in xyz.T]
     np.testing.assert_array_equal(found, double_precision(camera, POSE, xyz))
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", MODELS)
 def test_points_laid_on_the_borders_of_pixels_are_left_open(model: str) -> None:
     """Points whose projection is a border to the last bit: no answer of single precision would be more than a guess."""
     camera = CAMERAS[model]
@@ -90,7 +92,7 @@ def test_what_is_no_number_or_too_far_is_left_open_or_outside(bad: float) -> Non
             assert ((found == UNSURE) | (found == expected)).all()
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", MODELS)
 def test_the_optical_axis_has_a_pixel_in_single_precision_too(model: str) -> None:
     camera = CAMERAS[model]
     axis = np.array([[0.0, 1e-21, -1e-30, 0.0], [0.0, 1e-22, 1e-25, 0.0], [5.0, 2.0, 7.0, -3.0]], np.float32)

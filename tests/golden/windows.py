@@ -50,9 +50,6 @@ class Case:
 def _cases() -> dict[str, Case]:
     fast = {
         ("pinhole", "fused", 3),
-        ("radtan", "mi", 6),
-        ("rational", "intensity", 3),
-        ("kannala_brandt", "fused", 6),
         ("mei", "mi", 3),
         ("eucm", "intensity", 6),
         ("double_sphere", "fused", 6),
