@@ -38,7 +38,14 @@ def error_deg(estimate: Estimate) -> NDArray[np.float64]:
     return np.degrees(estimate.correction[:3])
 
 
-@pytest.mark.parametrize("start", [(5, 0, 0), (0, 5, 0), (0, 0, 5), (3, -3, 3), (-4, 4, 2)])
+@pytest.mark.parametrize(
+    "start",
+    [
+        (3, -3, 3),
+        (0, 5, 0),
+        *(pytest.param(start, marks=pytest.mark.slow) for start in ((5, 0, 0), (0, 0, 5), (-4, 4, 2))),
+    ],
+)
 def test_starts_around_the_truth_come_back_to_it(street: Window, stereo: DepthModel, start: tuple[float, ...]) -> None:
     estimate = solve(from_start(street, *start), stereo)
     assert np.abs(error_deg(estimate)).max() < 0.3
@@ -165,7 +172,7 @@ def test_sigma_covers_the_error(street: Window, stereo: DepthModel) -> None:
 def test_frames_that_are_one_look_claim_less_of_where_the_camera_is(
     sharp_street: Window, stereo: DepthModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = CalibrationConfig(search=SearchConfig(dof=6))
+    config = CalibrationConfig(search=SearchConfig(dof=6, reach_deg=5.0))
     several = solve(sharp_street, stereo, config).sigma
     monkeypatch.setattr(
         covariance,

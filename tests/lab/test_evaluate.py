@@ -23,7 +23,8 @@ from coec.calibration import commissioning
 from coec.calibration.types import LidarFrame
 from coec.geometry import se3
 from coec.io.recordings.recording_source import FramewiseRecording
-from coec_lab.experiments import mount_steps, solve_experiments
+from coec_lab.experiments import evaluation_pictures, mount_steps, plots, solve_experiments
+from coec_lab.experiments.evaluation_pictures import EvaluationBlocks
 from coec_lab.experiments.evaluation_schema import ClosureReport, ComparisonReport, EvaluationReport
 from coec_lab.experiments.solve_experiments import perturbations
 from coec_lab.experiments.solve_statistics import SolveOutcome
@@ -32,6 +33,12 @@ from support.simulated_drives import rendered_drive
 CONTRACT = {
     "starts", "hits", "hit_rate", "rotation_deg", "translation_m", "bias", "std", "solve_s", "classified_correctly",
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody looks at them."""
+    monkeypatch.setattr(plots, "DPI", 20)
 
 
 def without_intensity(recording: FramewiseRecording) -> FramewiseRecording:
@@ -122,7 +129,9 @@ def test_output_folder_holds_table_report_and_pictures(
     assert sum(int(row["hit"]) for row in rows) == outcome.document["hits"]
 
 
-def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
+def test_methods_side_by_side(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the pictures of all; those of each are the same as of one alone."""
+    monkeypatch.setattr(evaluation_pictures, "write", lambda *_: EvaluationBlocks((), ()))
     arguments = (
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--frames", "2",
         "--objective", "all",
@@ -137,7 +146,6 @@ def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
         assert method["objective"] == name
         assert set(method) >= CONTRACT
         assert json.loads((tmp_path / "out" / name / "report.json").read_text()) == method
-        assert (tmp_path / "out" / name / "profiles.png").is_file()
         assert (tmp_path / "out" / name / "report.html").is_file()
         assert f'href="{name}/report.html"' in (tmp_path / "out" / "report.html").read_text()
     assert json.loads((tmp_path / "out" / "report.json").read_text()) == report

@@ -640,7 +640,7 @@ CHECKS = [HealthCheck.too_slow, HealthCheck.filter_too_much]
 
 @pytest.mark.fault("any sequence of crashes, deadlines and floods of jobs", "every job ends exactly once")
 def test_whatever_happens_every_job_ends_once(record_property: Callable[[str, object], None]) -> None:
-    short = settings(max_examples=150, stateful_step_count=40, deadline=None, derandomize=True, database=None)
+    short = settings(max_examples=75, stateful_step_count=40, deadline=None, derandomize=True, database=None)
     run_state_machine_as_test(QueueMachine, settings=short)
     record_property("figure", f"{short.max_examples} sequences of {short.stateful_step_count} steps")
 

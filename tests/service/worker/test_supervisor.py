@@ -299,8 +299,15 @@ IN_A_JOB = {
 }
 
 
+SHORT = ("crash", "half", "hang", "grow", "other", "noise", "wrong-types")
+"""One of each kind. What else may be wrong with an answer is tried without a process in test_answers.py."""
+
+
 @pytest.mark.fault("a worker that crashes, hangs, grows too large or sends rubbish", "another one solves the window")
-@pytest.mark.parametrize(("fault", "counted"), IN_A_JOB.items())
+@pytest.mark.parametrize(
+    ("fault", "counted"),
+    [pytest.param(*one, marks=() if one[0] in SHORT else pytest.mark.slow) for one in IN_A_JOB.items()],
+)
 def test_after_one_fault_another_worker_solves_the_window(
     tmp_path: Path, fault: str, counted: Fault, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -315,7 +322,13 @@ def test_after_one_fault_another_worker_solves_the_window(
         assert it.faults() == {counted: 1}
 
 
-@pytest.mark.parametrize("fault", ["crash", "half-and-die", "drop", "other", "empty", "wrong-types", "missing"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "crash", "empty",
+        *(pytest.param(f, marks=pytest.mark.slow) for f in ("half-and-die", "drop", "other", "wrong-types", "missing")),
+    ],
+)  # fmt: skip
 def test_a_check_on_which_the_worker_fails_is_answered_once_and_the_next_one_is_made(
     tmp_path: Path, fault: str
 ) -> None:
@@ -330,7 +343,12 @@ def test_a_check_on_which_the_worker_fails_is_answered_once_and_the_next_one_is_
 
 @pytest.mark.fault("a window that kills every worker", "it is given up, and the service goes on")
 @pytest.mark.parametrize(
-    ("fault", "word"), [("crash", "signal 9"), ("drop", "no answer"), ("other", "another question")]
+    ("fault", "word"),
+    [
+        ("crash", "signal 9"),
+        pytest.param("drop", "no answer", marks=pytest.mark.slow),
+        pytest.param("other", "another question", marks=pytest.mark.slow),
+    ],
 )
 def test_a_window_that_no_worker_survives_is_given_up_and_the_service_goes_on(
     tmp_path: Path, fault: str, word: str
