@@ -172,7 +172,7 @@ def test_what_is_asked_outside_of_the_connection_is_refused(endpoint: str) -> No
         with pytest.raises(UsageError, match="async with"):
             await vehicle.extrinsic(PAIR)
         async with vehicle:
-            with pytest.raises(UsageError, match="connected already"):
+            with pytest.raises(UsageError, match="already connected"):
                 await vehicle.__aenter__()
         with pytest.raises(UsageError, match="async with"):
             await vehicle.extrinsic(PAIR)

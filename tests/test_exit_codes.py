@@ -382,9 +382,7 @@ def test_a_signal_during_the_start_is_a_stop(tmp_path: Path) -> None:
     path, log = written(tmp_path, zenoh={"connect": [f"tcp/127.0.0.1:{free_port()}"]}), tmp_path / "log"
     process = started("run", "--config", path, log=log)
     try:
-        wait_until(
-            lambda: "the worker starts" in log.read_text() or process.poll() is not None, "the start", PATIENCE_S
-        )
+        wait_until(lambda: "worker starting" in log.read_text() or process.poll() is not None, "the start", PATIENCE_S)
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == ExitCode.SUCCESS, log.read_text()
     finally:

@@ -122,7 +122,7 @@ class Vehicle:
             UsageError: an endpoint is malformed.
         """
         if self._connection is not None:
-            raise UsageError("the vehicle is connected already: a second connection is a second Vehicle")
+            raise UsageError("the vehicle is already connected: create another Vehicle for a second connection")
         connection = connected_by(self._way, self._timeout_s)
         opening = asyncio.get_running_loop().run_in_executor(None, connection.__enter__)
         try:

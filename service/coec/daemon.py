@@ -220,7 +220,7 @@ class Daemon:
         ):
             thread.start()
         self._ros_outputs.start(self._ros_status)
-        _log.info("the worker starts: where it has not run before it compiles its kernels, once, for about a minute")
+        _log.info("worker starting; on the first start on a machine it compiles its kernels for about a minute")
         self._worker.start()
         self._answers.declare(self._bus)
         self._metrics_server.reconfigure(self._config.metrics)
@@ -266,7 +266,7 @@ class Daemon:
         self._command_handler.reconfigure(self._rules)  # for the commands of new pairs, too
         self._shown = self._shown_now()
         fields = {"pairs": list(discovered), "config_hash": config_hash(self._config)}
-        _log.info("pairs that were awaited are served", extra={"fields": fields})
+        _log.info("discovered pairs are served", extra={"fields": fields})
 
     def _tick(self) -> int:
         """Runs once a second: looks at every thread, renews what is served, and returns unused memory to the system.
@@ -369,7 +369,7 @@ class Daemon:
         """On SIGHUP: reads the configuration again and takes over what can change without a restart. A file with which
         the service could not start changes nothing."""
         if reread is None:
-            _log.warning("no configuration file to read again")
+            _log.warning("no configuration file to reload")
             return
         self._notifier.reloading()
         previous = self._configuration
@@ -379,7 +379,10 @@ class Daemon:
         except Exception as error:  # whatever is wrong with the file, the running service goes on
             self._configuration = previous.model_copy(update={"read_ns": time.time_ns(), "refused": str(error)})
             expected = isinstance(error, CoecError)
-            _log.error(f"the configuration on the disk is refused, the old one stays: {error}", exc_info=not expected)
+            _log.error(
+                f"the changed configuration is invalid, the previous one remains in force: {error}",
+                exc_info=not expected,
+            )
         else:
             taken = fresh.taken
             if rules.digest != self._rules.digest and CERTIFICATE not in taken:

@@ -201,7 +201,7 @@ def _present_text(path: Path) -> str | None:
     try:
         return read_bytes(path, MAX_EXPORT_BYTES).decode()
     except UnicodeDecodeError as error:
-        raise SourceError(f"{path} is no text in UTF-8: it cannot be changed") from error
+        raise SourceError(f"{path} is not UTF-8 text: it cannot be changed") from error
 
 
 Pose = Literal["result", "start", "nominal"]

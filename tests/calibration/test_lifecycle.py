@@ -472,7 +472,7 @@ def test_hold_freezes_everything_but_the_estimates() -> None:
 
 
 def test_nothing_pending_is_refused() -> None:
-    with pytest.raises(CommandRefusedError, match="No candidate"):
+    with pytest.raises(CommandRefusedError, match="There is no candidate"):
         apply_pending(HEALTHY, RULES)
 
 

@@ -182,9 +182,9 @@ def test_whatever_is_fetched_is_metered_and_waited_for(
 @pytest.mark.parametrize(
     ("arguments", "status", "said"),
     [
-        (("../x",), UsageError.exit_code, "is no name of a vehicle"),
-        ((VEHICLE, "../../etc/passwd"), UsageError.exit_code, "is no red event"),
-        ((VEHICLE, "front-1"), NotFoundError.exit_code, "has no such red event"),
+        (("../x",), UsageError.exit_code, "is not a valid name of a vehicle"),
+        ((VEHICLE, "../../etc/passwd"), UsageError.exit_code, "is not the id of an incident"),
+        ((VEHICLE, "front-1"), NotFoundError.exit_code, "has no such incident"),
         (("nobody", "latest"), NotFoundError.exit_code, "nobody answered"),
     ],
 )

@@ -125,12 +125,12 @@ def no_event(_: str) -> Sequence[Route]:
         (("nonsense",), "known: extrinsic, health"),
         (("health", "--param", "limit"), "NAME=VALUE"),
         (("command/calibrate", "--payload", "{"), "not JSON"),
-        (("health", "--to", "x"), "health is no command"),
-        (("health", "--payload", "{}"), "health is no command"),
+        (("health", "--to", "x"), "health is not a command"),
+        (("health", "--payload", "{}"), "health is not a command"),
         (("command/hold", "--to", "x"), "It takes --release: "),
         (("command/apply", "--release"), "It takes --candidate: "),
         (("command/rollback", "--to", "x", "--sensor", "roof"), "command/rollback of the rig does not take it"),
-        (("command/hold", "--release", "--payload", "{}"), "leave --release out, or --payload"),
+        (("command/hold", "--release", "--payload", "{}"), "omit --release, or --payload"),
         (("command/explode", "--release"), "known: calibrate, apply"),
         (("overlay",), "--output FILE.jpg"),
         (("overlay", "--output", "o.png"), "o.png: the picture is a JPEG, its name must end in .jpg"),
@@ -177,7 +177,7 @@ def test_what_is_typed_comes_before_the_configuration(coec: Coec, vehicle: str, 
 def test_an_endpoint_that_is_none_is_a_usage_error(coec: Coec) -> None:
     outcome = coec("query", "health", "--connect", "localhost")
     assert outcome.status == 2
-    assert "'localhost' is no endpoint of a router: write PROTOCOL/ADDRESS" in outcome.err
+    assert "'localhost' is not a router endpoint: write PROTOCOL/ADDRESS" in outcome.err
 
 
 def test_without_a_router_it_says_what_to_start(coec: Coec, endpoint: str) -> None:

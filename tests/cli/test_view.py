@@ -307,7 +307,7 @@ def test_what_is_not_there_is_said(coec: Coec, tmp_path: Path, router: Router) -
     assert (outcome.status, "coec calibrate --json" in outcome.err) == (SourceError.exit_code, True)
     result_file(tmp_path, rendered_source(SMALL).rig, np.diag([2.0, 1.0, 1.0, 1.0]))
     outcome = coec("view", SMALL, "--result", rubbish)
-    assert (outcome.status, "no rotation" in outcome.err) == (SourceError.exit_code, True)
+    assert (outcome.status, "not a rigid transform" in outcome.err) == (SourceError.exit_code, True)
     path = configuration(tmp_path, router.endpoint)
     assert coec("view", "--config", path, "--pair", "rear").status == UsageError.exit_code
     with socket.create_server(("127.0.0.1", 0)) as taken:

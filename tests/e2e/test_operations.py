@@ -183,7 +183,7 @@ def _reload(running: Service, path: Path, endpoint: str, port: int) -> None:
     refused = running.until(running.status, lambda status: status["configuration"]["refused"], "the refusal")
     assert refused["config_hash"] == status["config_hash"]
     assert refused["configuration"]["taken"] == status["configuration"]["taken"]
-    assert "is refused, the old one stays" in running.log.read_text()
+    assert "is invalid, the previous one remains in force" in running.log.read_text()
     assert page(port, "/metrics")[0] == 200
 
 

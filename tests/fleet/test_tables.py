@@ -191,7 +191,7 @@ def test_what_cannot_be_read_or_written_is_told(tmp_path: Path) -> None:
         begun_batch.add(row)
     (table,) = (tmp_path / "batch").glob("date=*/vehicle=*/*.parquet")
     table.write_bytes(b"PAR1 rubbish PAR1")
-    with pytest.raises(SourceError, match="judged again"):
+    with pytest.raises(SourceError, match="evaluated again"):
         BatchFolder(tmp_path / "batch", ReplaySettings(), resume=True)
     (tmp_path / "batch" / batch.SETTINGS_FILE).write_text("[")
     with pytest.raises(UsageError, match="another folder"):

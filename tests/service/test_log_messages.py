@@ -136,7 +136,7 @@ def test_the_rate_of_a_stream_is_logged_once(caplog: pytest.LogCaptureFixture) -
     log = StreamLog("camera", "in/camera", Clock())
     for number in range(3 * RATE_FRAMES):
         log.push(camera(number * NS_PER_S // 10))
-    assert lines(caplog)[1:] == ["camera frames come at 10.0 Hz by their stamps"]
+    assert lines(caplog)[1:] == ["camera frames arrive at 10.0 Hz by their stamps"]
 
 
 def test_a_stream_that_is_lost_and_comes_back_is_logged_at_a_bounded_rate(caplog: pytest.LogCaptureFixture) -> None:
@@ -154,7 +154,7 @@ def test_a_stream_that_is_lost_and_comes_back_is_logged_at_a_bounded_rate(caplog
     log.push(sweep)
     told = lines(caplog)
     silent = [line for line in told if line.startswith("no lidar frames for")]
-    again = [line for line in told if line.startswith("lidar frames come again after")]
+    again = [line for line in told if line.startswith("lidar frames arrive again after")]
     assert told[1] == "no lidar frames for 5 s: check the sensor and the network"
     assert 0 < len(silent) <= 20 * 2 * SILENT_S / QUIET_S + 1
     assert len(again) == len(silent)

@@ -66,7 +66,7 @@ class Seed:
 
 
 def waiting_state() -> PairState:
-    """A candidate waits that contradicts what is served."""
+    """A no candidate that contradicts what is served."""
     state = after_estimate(initial_state(ESTIMATE_RIG), estimate(1), 0, rules())
     never = type(rules())(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())
     state = after_estimate(state, estimate(2), 0, never)

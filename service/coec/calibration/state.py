@@ -570,7 +570,7 @@ def apply_pending(state: PairState, rules: PairRules) -> PairState:
     """
     _refuse_if_held(state)
     if state.pending is None:
-        raise CommandRefusedError("nothing_pending", "No candidate waits.")
+        raise CommandRefusedError("nothing_pending", "There is no candidate.")
     pose, estimate, track = state.pending.T_camera_lidar, state.pending.estimate, state.track
     if track is None or not np.array_equal(track.T_camera_lidar, pose):
         track = Track.initial(pose, prior_sigma(rules.tracker), estimate.data_stamp_ns)

@@ -98,11 +98,11 @@ def fetch(
     from coec.schemas.keys import Keys
 
     if not VEHICLE.fullmatch(vehicle):
-        raise UsageError(f"{vehicle!a} is no name of a vehicle")
+        raise UsageError(f"{vehicle!a} is not a valid name of a vehicle")
     if pair is not None and not VEHICLE.fullmatch(pair):
-        raise UsageError(f"{pair!a} is no name of a pair")
+        raise UsageError(f"{pair!a} is not a valid name of a pair")
     if event not in (None, LATEST) and not OF_PAIR.fullmatch(str(event)):
-        raise UsageError(f"{event!a} is no red event: `coec fetch {vehicle}` lists them")
+        raise UsageError(f"{event!a} is not the id of an incident: `coec fetch {vehicle}` lists them")
     address = service_address(None, vehicle, prefix, connect, zenoh)
     keys = Keys(address.prefix, address.vehicle)
     with connected_by(address.way, timeout_s) as session:
@@ -185,7 +185,7 @@ def _select(events: Sequence[EvidenceEvent], event_id: str, vehicle: str) -> Evi
         return events[-1]
     match = next((event for event in events if event.event_id == event_id), None)
     if match is None:
-        raise NotFoundError(f"{vehicle} has no such red event: `coec fetch {vehicle}` lists them")
+        raise NotFoundError(f"{vehicle} has no such incident: `coec fetch {vehicle}` lists them")
     return match
 
 
@@ -217,7 +217,7 @@ class Download:
         keys, pair = self.keys, self.pair
         event = self._document(EvidenceEvent, keys.evidence_of(pair, event_id))
         if event.event_id != event_id or not _is_of(event, keys.vehicle, pair):
-            raise RemoteError("malformed", f"the answer for {event_id} is about another event")
+            raise RemoteError("malformed", f"the reply to {event_id} concerns another incident")
         self._store("event.json", to_json(event))
         history = self._optional("history.json", HistoryReply, _around(keys.history(pair), event))
         health = self._optional("health.json", HealthReply, keys.health(pair))

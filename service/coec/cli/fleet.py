@@ -146,7 +146,7 @@ def commission(
             raise UsageError(f"{path} holds no baseline: `coec commission`, or the command `commission`, makes them")
     shared = sorted(set.intersection(*(set(pairs) for pairs in vehicles)))
     if not shared:
-        raise UsageError("there is no pair that all of the vehicles have")
+        raise UsageError("no pair is common to all vehicles")
     models = [model_baseline([pairs[name] for pairs in vehicles]) for name in shared]
     for model in models:
         save_baseline(output, model)

@@ -176,7 +176,9 @@ def _coec(
 ) -> None:
     # Without a callback, Typer would treat an application with one command as that command itself.
     if as_json:
-        raise UsageError("--json before a command belongs to --version; of a command, write it behind its name")
+        raise UsageError(
+            "--json before a command belongs to --version; for a command, write it after the command's name"
+        )
 
 
 def main() -> int:

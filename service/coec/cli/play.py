@@ -155,11 +155,11 @@ def play(
         _report(published, pace, "messages", as_json=as_json)
         return 0
     if topics or domain is not None:
-        raise UsageError("--topics and --domain are of ROS 2: add --middleware rmw_zenoh or ros2dds")
+        raise UsageError("--topics and --domain apply to ROS 2: add --middleware rmw_zenoh or ros2dds")
     spec = parse_spec(source)
     if is_rig(spec):
         if config is not None or pair is not None:
-            raise UsageError(f"{source} is all sensors of a rig: leave --config and --pair out, or add &pair=...")
+            raise UsageError(f"{source} contains all sensors of a rig: omit --config and --pair, or add &pair=...")
         programme = _rig_frames(spec)
     else:
         programme = _frames(source, pair, target, encoding)

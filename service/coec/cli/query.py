@@ -331,11 +331,11 @@ def _payload(request: Request, arguments: Mapping[str, str | bool | None], paylo
     if command is None:
         unfit = [*(f"--{name}" for name in given), *([] if payload is None else ["--payload"])]
         if unfit:
-            raise UsageError(f"{', '.join(unfit)}: {request.key} is no command, and takes none")
+            raise UsageError(f"{', '.join(unfit)}: {request.key} is not a command and takes no payload")
         return None
     if payload is not None:
         if given:
-            raise UsageError(f"--payload is the whole payload: leave --{', --'.join(given)} out, or --payload")
+            raise UsageError(f"--payload is the complete payload: omit --{', --'.join(given)}, or --payload")
         try:
             return json.dumps(json.loads(payload), separators=(",", ":")).encode()
         except ValueError as error:
@@ -417,8 +417,9 @@ def _json(reply: Reply) -> Any:
     except DecodeError as error:
         raise DecodeError(
             error.reason,
-            f"the reply of {Untrusted(reply.key)} is {error}, although its sender calls it JSON ({len(reply.payload)} "
-            "bytes): see the log of the service for a fault, or forbid other programs its keys with the router's rules",
+            f"the reply of {Untrusted(reply.key)} is {error}, although its encoding is declared as JSON "
+            f"({len(reply.payload)} bytes): see the log of the service for a fault, or forbid other programs its keys "
+            "with the router's rules",
         ) from error
 
 
@@ -442,7 +443,7 @@ def _save_picture(request: Request, way: RouterAddress, keys: Keys, path: Path, 
             key = keys.evidence_of(_pair_of(session, request, keys, argument), argument)
         reply = query_one(session, _selector(single_key(key), request.params), request.timeout_s)
     if reply.encoding != JPEG:
-        raise UsageError("the answer is no picture: give --param overlay=before or overlay=after")
+        raise UsageError("the reply contains no picture: give --param overlay=before or overlay=after")
     files.replace_output(path, reply.payload)
     if as_json:
         console.print_json({"path": str(path), "size_bytes": len(reply.payload)})

@@ -209,7 +209,7 @@ def load_yaml(path: Path) -> Any:
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError as error:
-        detail = f"byte {error.start} is no text in UTF-8"
+        detail = f"byte {error.start} is not UTF-8 text"
         raise ConfigError(f"{path} is not valid YAML: {detail}; is it the right file?") from error
     try:
         return parse_yaml(text)

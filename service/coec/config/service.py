@@ -236,8 +236,8 @@ class MetricsConfig(ConfigModel):
             raise ValueError(f"http: {self.http!r} is no HOST:PORT: write 127.0.0.1:9464")
         if self.is_open and not self.insecure:
             raise ValueError(
-                f"http: whoever reaches {self.http} would read the metrics, without a certificate: listen on loopback, "
-                "as 127.0.0.1:9464, or set `metrics.insecure: true`, and health will say so"
+                f"http: any host that can reach {self.http} could read the metrics without a certificate: "
+                "listen on loopback, as 127.0.0.1:9464, or set `metrics.insecure: true`, and health will say so"
             )
         return self
 

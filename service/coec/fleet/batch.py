@@ -107,7 +107,9 @@ class BatchFolder:
             document = {"fingerprint": settings.fingerprint, "terms": settings.model_dump(mode="json")}
             user_files.replace_output(path, json.dumps(document, sort_keys=True, indent=1).encode())
         elif not resume:
-            raise UsageError(f"{self._folder} holds a batch: --resume goes on with it, another folder begins anew")
+            raise UsageError(
+                f"{self._folder} holds a batch: --resume goes on with it, choose another folder to start a new batch"
+            )
         elif stored != settings.fingerprint:
             raise UsageError(
                 f"{self._folder} holds a batch of another configuration, rig, network or version of coec: its rows "

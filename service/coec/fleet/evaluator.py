@@ -168,7 +168,7 @@ class WindowEvaluator:
         except CoecError as error:
             return failed_row(row, error.reply_code, str(error))
         except Exception as error:  # a fault of coec; the other windows are judged all the same
-            _log.exception("a window could not be judged", extra={"fields": {"url": job.url}})
+            _log.exception("a window could not be evaluated", extra={"fields": {"url": job.url}})
             return failed_row(row, CoecError.reply_code, f"{type(error).__name__}: {error}")
         return row.model_copy(update=update)
 

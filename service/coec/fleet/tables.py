@@ -118,7 +118,7 @@ def tabulated_urls(folder: Path) -> set[str]:
         try:
             known.update(parquet.ParquetFile(path).read(["url"])["url"].to_pylist())
         except (OSError, ValueError, KeyError) as error:
-            raise SourceError(f"{path} is damaged ({error}): remove it, and its windows are judged again") from error
+            raise SourceError(f"{path} is damaged ({error}): remove it, and its windows are evaluated again") from error
     return known
 
 

@@ -290,7 +290,7 @@ class WorkerPool:
                 yield from self._stop_late(queue)
                 self._check_available()
             if queue.unjudged:
-                raise self._error(f"{queue.unjudged} of {len(jobs)} windows could not be judged")
+                raise self._error(f"{queue.unjudged} of {len(jobs)} windows could not be evaluated")
         finally:  # also if the caller stops before the end
             for worker in self._slots:
                 worker.close()
@@ -344,13 +344,13 @@ class WorkerPool:
                 raise FleetError(event.text)
             self._start()
         else:
-            _log.warning("a process for judging windows could not start", extra={"fields": {"reason": event.text}})
+            _log.warning("an evaluation process could not start", extra={"fields": {"reason": event.text}})
         jobs = slot.jobs.values()
         if event.blame:
             yield from queue.retry_alone(jobs, event.code, event.text)
         else:
             fields = {"reason": event.text, "windows": [job.url for job in jobs]}
-            _log.warning("windows of a lost process are judged by others", extra={"fields": fields})
+            _log.warning("windows of a lost evaluation process are assigned to others", extra={"fields": fields})
             yield from queue.requeue_lost(jobs, event.text)
 
     def _retire(self, worker: PoolWorker, row: WindowRow, queue: WindowQueue) -> None:
@@ -359,7 +359,7 @@ class WorkerPool:
         worker.close()
         queue.requeue(slot.jobs.values())
         _log.warning(
-            "a process for judging windows fails every window and gets no more",
+            "an evaluation process fails on every window and receives no more",
             extra={"fields": {"code": row.error_code, "reason": row.error}},
         )
 
@@ -385,7 +385,7 @@ class WorkerPool:
             raise self._error("the batch stops early")
         if not self._slots or waited_s > START_S:
             raise FleetError(
-                f"no process for judging windows has started within {START_S:g} s: each needs a core and "
+                f"no evaluation process has started within {START_S:g} s: each needs a core and "
                 f"{self._bounds.bytes >> 20} MiB (--memory); finished rows are kept, and --resume continues"
             )
 

@@ -404,7 +404,7 @@ def _imdecode(image: EncodedImage, mode: int, limits: LimitsConfig) -> NDArray[n
     # The header is read again here, so that no caller can pass bytes whose size was not checked.
     header = probe(image.data, limits)
     if (header.format, header.width, header.height) != (image.format, image.width, image.height):
-        raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, "the image is not what its description says")
+        raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, "the image does not match its description")
     try:
         pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), mode | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:

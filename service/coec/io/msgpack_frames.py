@@ -176,7 +176,7 @@ def _image(wire: frames.Image, limits: LimitsConfig) -> EncodedImage:
         return raw_image(form, wire.width, wire.height, wire.data, limits)
     image = probe(wire.data, limits)
     if image.format is not form or wire.width not in (None, image.width) or wire.height not in (None, image.height):
-        raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, "the image is not what the message says it is")
+        raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, "the image does not match the message's description")
     return image
 
 

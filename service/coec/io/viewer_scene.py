@@ -294,7 +294,7 @@ def picture_of(
         DecodeError: viewers cannot hold the stamp, or the raw pixels do not have the size that they claim.
     """
     if not 0 <= pair.stamp_ns < STAMP_END_NS:
-        raise DecodeError(Refusal.STAMP_INVALID, "viewers know stamps from 1970 to 2106")
+        raise DecodeError(Refusal.STAMP_INVALID, "a viewer's stamps lie between 1970 and 2106")
     overlaid = {pose: one for pose, one in extrinsics.items() if POINTS_TOPICS[pose] in requested}
     xyz_m = compensate(pair, rig, enabled=compensated) if overlaid or CLOUD_TOPIC in requested else NO_POINTS
     silhouette = silhouettes_of(pair.lidar) if overlaid else NO_FLAGS

@@ -278,7 +278,7 @@ def _rings(seen: Fitness) -> Notice | None:
     return Notice(
         "warn",
         "constant_ring",
-        "The field `ring` holds one number and is ignored: beams are told apart by their elevation.",
+        "The field `ring` holds one number and is ignored: beams are distinguished by their elevation.",
     )
 
 

@@ -70,14 +70,14 @@ def decode_heartbeat(key: str, payload: bytes) -> LastWord:
             than its key.
     """
     if len(payload) > MAX_HEARTBEAT_BYTES:
-        raise DecodeError("word_too_large", f"a last word of more than {MAX_HEARTBEAT_BYTES} bytes")
+        raise DecodeError("word_too_large", f"a heartbeat of more than {MAX_HEARTBEAT_BYTES} bytes")
     try:
         document = msgpack.unpackb(
             payload, max_map_len=MAX_NESTING, max_array_len=MAX_NESTING, max_str_len=MAX_HEARTBEAT_BYTES, max_bin_len=0
         )
         heartbeat = LastWord.model_validate(document)
     except (ValueError, RecursionError, msgpack.UnpackException, ValidationError) as error:
-        raise DecodeError("word_malformed", "no last word in msgpack") from error
+        raise DecodeError("word_malformed", "not a heartbeat in msgpack") from error
     if not key.endswith(f"/{VERSION_CHUNK}/{heartbeat.vehicle}/{LAST}/{heartbeat.pair}"):
-        raise DecodeError("word_of_another", "a last word under the key of another")
+        raise DecodeError("word_of_another", "a heartbeat under the key of another pair")
     return heartbeat

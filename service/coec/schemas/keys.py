@@ -281,7 +281,7 @@ def parse_command_selector(parameters: str) -> CommandSelector:
     timeout_ms = _integer(given, "timeout_ms", COMMAND_TIMEOUT_MS, 1, MAX_COMMAND_TIMEOUT_MS)
     conversation = given.get("tls")
     if conversation is not None and not re.fullmatch("[0-9a-f]{32}", conversation):
-        raise UsageError("parameter `tls` must be 32 hexadecimal digits, drawn anew for each command")
+        raise UsageError("parameter `tls` must be 32 hexadecimal digits, random for each command")
     return CommandSelector(timeout_ms, conversation, _format(given))
 
 

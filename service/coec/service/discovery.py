@@ -373,7 +373,7 @@ class DiscoveryStore:
         self._file = StateFile(folder / NOMINAL_FILE)
         loaded = self._file.load()
         for damage in loaded.damage:
-            _log.warning(f"nominal calibrations that were kept cannot be used: {damage}")
+            _log.warning(f"stored nominal calibrations cannot be used: {damage}")
         self._pairs: dict[str, StoredDiscovery] = {}
         self._documents: dict[str, dict[str, Any]] = {}
         pairs = (loaded.body or {}).get("pairs")
@@ -383,7 +383,7 @@ class DiscoveryStore:
                 self._documents[name] = document
             except ValidationError:
                 self._file.reject()
-                _log.warning("a nominal calibration that was kept has another form", extra={"fields": {"pair": name}})
+                _log.warning("a stored nominal calibration has another form", extra={"fields": {"pair": name}})
 
     def load(self, config: Config) -> dict[str, DiscoveredPair]:
         """What was found earlier, by pair, for the pairs that this configuration awaits and for which it still asks the
@@ -406,7 +406,7 @@ class DiscoveryStore:
             complete = PairConfig.model_validate(document)
             rig_of(complete)  # may fail, because the mask may have changed on the disk
         except (ConfigError, ValidationError) as error:
-            _log.warning(f"a nominal calibration that was kept cannot be used: {error}")
+            _log.warning(f"a stored nominal calibration cannot be used: {error}")
             return None
         since = datetime.fromtimestamp(stored.found_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         return DiscoveredPair(

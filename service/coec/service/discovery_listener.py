@@ -197,7 +197,7 @@ class DiscoveryListener:
             each.built, each.discovered = True, outcome
             for place, origin in outcome.origins.items():
                 fields = {"pair": each.pair.name, "place": place, "from": origin}
-                _log.info("found what the configuration leaves out", extra={"fields": fields})
+                _log.info("discovered what the configuration omits", extra={"fields": fields})
         else:
             each.refused = outcome
 

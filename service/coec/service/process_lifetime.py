@@ -55,7 +55,7 @@ def locked(folder: Path) -> Iterator[FolderLock]:
             raise ConfigError(f"{what}: {permission_denied(existing, 'rwx')}") from error
         if error.errno in NO_DIRECTORY:
             raise ConfigError(f"{what}: {error.strerror}; name another directory") from error
-        raise UnavailableError(f"{what}: {error.strerror}; see to its disk") from error
+        raise UnavailableError(f"{what}: {error.strerror}; check its disk") from error
     try:
         tightened = close_to_others(folder)
         if tightened:

@@ -50,13 +50,13 @@ class DeferredCall(Generic[T]):
             return self._future.result(timeout_s)
         except TimeoutError:
             if self._future.cancel():
-                raise BusyError("The service is busy; nothing was done. Ask again.") from None
+                raise BusyError("The service is busy; nothing was done. Retry.") from None
         except CancelledError:
             raise BusyError("The service is stopping; nothing was done.") from None
         try:
             return self._future.result(timeout_s)
         except TimeoutError:
-            raise BusyError("The work was begun and has not ended; `history` will say how it went.") from None
+            raise BusyError("The work was started and has not finished; see `history` for its result.") from None
 
 
 COMMANDS_WAITING = 16
@@ -88,7 +88,7 @@ class TaskQueue:
         call = DeferredCall(work)
         with self._condition:
             if self._commands >= COMMANDS_WAITING:
-                raise BusyError("Too many commands wait; nothing was done. Ask again.")
+                raise BusyError("Too many commands are queued; nothing was done. Retry.")
             self._commands += 1
             self._items.append(call.run)
             self._condition.notify()

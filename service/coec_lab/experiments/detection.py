@@ -150,10 +150,10 @@ def interval(hits: int, of: int) -> tuple[float, float]:
     and for hits alone.
 
     Raises:
-        ValueError: no draw was seen.
+        ValueError: no sample was evaluated.
     """
     if of < 1:
-        raise ValueError("no draw was seen")
+        raise ValueError("no sample was evaluated")
     z = normal_quantile(0.5 + 0.5 * CONFIDENCE)
     share, shrink = hits / of, 1.0 + z * z / of
     middle = (share + 0.5 * z * z / of) / shrink

@@ -135,7 +135,7 @@ def try_mount_steps(
         CalibrationError: fewer than two pairs, or there is no estimate even without a knock.
     """
     if len(window.pairs) < 2:
-        raise CalibrationError(f"a knock lies between two pairs of a window, there are {len(window.pairs)}")
+        raise CalibrationError(f"a step lies between two pairs of a window, there are {len(window.pairs)}")
     pairs, between = (_compensated(of, window, config) for of in (window.pairs, window.between))
     still = replace(window, pairs=pairs, between=between, start_known_to_rad=MOUNT_RAD)
     config = config.model_copy(update={"motion_compensation": False})

@@ -80,7 +80,7 @@ def test_a_certificate_that_is_not_to_be_trusted_proves_nothing(
     other = foreign.credentials("operator")
     stranger = Credentials(other.certificate, other.private_key, authority.root)
     for credentials, why in ((expired, "expired"), (servers, "purpose"), (stranger, "issuer")):
-        with pytest.raises(NotProvenError, match=f"not taken: .*{why}"):
+        with pytest.raises(NotProvenError, match=f"rejected: .*{why}"):
             said(listener, credentials)
 
 

@@ -229,7 +229,7 @@ def test_where_queries_are_forbidden_tokens_count(monkeypatch: pytest.MonkeyPatc
     config = ZenohConfig(connect=(endpoint,))
     with open_session(ZenohConfig(file=file), LIMITS), open_session(config, LIMITS) as here:
         wait_until(lambda: bool(list(here.info.routers_zid())), "the router is there")
-        for key, said in ((FAKED, "by another daemon"), (KEYS.alive("front"), "somebody holds the token")):
+        for key, said in ((FAKED, "by another daemon"), (KEYS.alive("front"), "another session holds the token")):
             one = SingletonGuard(here, config, LIMITS, KEYS, STARTED_NS)
             with held(here, key), pytest.raises(UnavailableError, match=said):
                 one.claim(threading.Event())

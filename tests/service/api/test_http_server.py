@@ -165,7 +165,7 @@ def test_many_at_once_are_all_answered(server: HttpServer) -> None:
 
 
 def test_a_port_that_is_taken_is_told() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(UnavailableError, match="nobody can listen"):
+    with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(UnavailableError, match="cannot listen"):
         HttpServer("127.0.0.1", other.getsockname()[1], find)
 
 

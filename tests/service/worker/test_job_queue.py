@@ -344,14 +344,14 @@ def test_at_a_stop_everything_is_answered_and_nothing_more_is_done() -> None:
 def test_the_worker_has_one_thing_at_a_time() -> None:
     queue = asked([a_job("a"), a_job("b")])
     queue.take(0.0)
-    with pytest.raises(ValueError, match="something to do"):
+    with pytest.raises(ValueError, match="the worker is not idle"):
         queue.take(0.0)
     queue.sent(0.0)
-    with pytest.raises(ValueError, match="answered with something"):
+    with pytest.raises(ValueError, match="finished without a result"):
         queue.answered(None, 0.0)
-    with pytest.raises(ValueError, match="nothing is with the worker"):
+    with pytest.raises(ValueError, match="internal error: no job is assigned to the worker"):
         asked([a_job("a")]).sent(0.0)
-    with pytest.raises(ValueError, match="nothing is with the worker"):
+    with pytest.raises(ValueError, match="internal error: no job is assigned to the worker"):
         asked([a_job("a")]).answered(ANSWER, 0.0)
 
 

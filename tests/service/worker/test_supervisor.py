@@ -346,8 +346,8 @@ def test_a_check_on_which_the_worker_fails_is_answered_once_and_the_next_one_is_
     ("fault", "word"),
     [
         ("crash", "signal 9"),
-        pytest.param("drop", "no answer", marks=pytest.mark.slow),
-        pytest.param("other", "another question", marks=pytest.mark.slow),
+        pytest.param("drop", "did not reply", marks=pytest.mark.slow),
+        pytest.param("other", "another request", marks=pytest.mark.slow),
     ],
 )
 def test_a_window_that_no_worker_survives_is_given_up_and_the_service_goes_on(

@@ -135,7 +135,9 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
     detected = [range_edges(pair.lidar.xyz_m, pair.lidar.ring) for pair in pairs]
     first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in detected])]).astype(np.int64)
     if first_point[-1] == 0:
-        raise CalibrationError("no sweep has a jump in range: there is nothing to lay onto the edges of the images")
+        raise CalibrationError(
+            "no depth discontinuity in any sweep: the edge objective has nothing to align with the images' edges"
+        )
     # The shift is not compensated: motion compensation turns this tenth of a degree by two degrees at most.
     xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(detected)])
     weight = np.concatenate([edges.weight for edges in detected])

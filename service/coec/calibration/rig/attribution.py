@@ -142,7 +142,7 @@ def served(state: RigState, edge: str, T_a_b: Matrix4, sigma: NDArray[np.float64
         ValueError: there is no such edge.
     """
     if edge not in state.histories:
-        raise ValueError(f"{edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
+        raise ValueError(f"{edge}: not an edge of this rig; its edges are {', '.join(sorted(state.histories))}")
     return replace(state, histories={**state.histories, edge: EdgeHistory.served(T_a_b, sigma)})
 
 
@@ -189,7 +189,9 @@ def after_window(state: RigState, graph: RigGraph, observation: EdgeObservation)
 def _with(state: RigState, observation: EdgeObservation) -> RigState:
     """The state with one more look, before anybody asks who moved."""
     if observation.edge not in state.histories:
-        raise ValueError(f"{observation.edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
+        raise ValueError(
+            f"{observation.edge}: not an edge of this rig; its edges are {', '.join(sorted(state.histories))}"
+        )
     history = state.histories[observation.edge].after(observation, state.calm)
     return replace(state, histories={**state.histories, observation.edge: history})
 

@@ -101,10 +101,10 @@ def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):
         determined = np.flatnonzero(np.isfinite(variances) & (variances < MOST_SIGMA**2))
     if not len(determined):
-        raise ValueError("a covariance says nothing about any axis: every variance is missing or beyond all use")
+        raise ValueError("a covariance determines no axis: every variance is missing or too large")
     block = covariance[np.ix_(determined, determined)]
     if not np.isfinite(block).all() or (variances[determined] < LEAST_SIGMA**2).any():
-        raise ValueError("a covariance is not finite, or smaller than anything can be known to")
+        raise ValueError("a covariance is not finite, or smaller than the resolution of any sensor")
     if np.abs(block - block.T).max() > 1e-6 * np.abs(block).max():
         raise ValueError("a covariance is not symmetric")
     # Scaled to a unit diagonal: radians and metres differ by powers of ten.

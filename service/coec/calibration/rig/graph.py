@@ -203,4 +203,4 @@ def _known(edges: Sequence[Edge], links: Sequence[RigidLink]) -> tuple[KnownTran
 
 def _once(what: str, names: Sequence[str]) -> None:
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"{what} of a rig need names of their own; these are given twice: {', '.join(twice)}")
+        raise ValueError(f"{what} of a rig need names of their own; duplicates: {', '.join(twice)}")

@@ -374,10 +374,10 @@ def estimate_jointly(
         ValueError: no window determines anything; one is of no edge; a pose is not rigid, or a covariance is invalid.
     """
     if strange := sorted(set(windows) - set(graph.edge)):
-        raise ValueError(f"{', '.join(strange)}: no edge of this rig, it has {', '.join(graph.edge)}")
+        raise ValueError(f"{', '.join(strange)}: not an edge of this rig; its edges are {', '.join(graph.edge)}")
     measured = tuple(name for name in graph.edge if name in windows and windows[name].determined_axes())
     if not measured:
-        raise ValueError("no window says anything about this rig")
+        raise ValueError("no window constrains this rig")
     measurements = {name: windows[name] for name in measured}
     system = (
         System.of(graph, measurements)

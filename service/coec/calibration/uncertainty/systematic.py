@@ -55,7 +55,7 @@ def require_fit(camera: Camera, fit: DoubleSphereFit, max_sigma_deg: float) -> N
     name = name_of(camera)
     raise LensError(
         f"double_sphere does not fit this {name} lens: it is off by {fit.residual_max_px:.1f} px at most "
-        f"({fit.residual_rms_px:.2f} px rms), by which a rotation may be {error_deg:.2f}° wrong; a result is accepted "
+        f"({fit.residual_rms_px:.2f} px rms), so a rotation may be wrong by {error_deg:.2f}°; a result is accepted "
         f"up to {max_sigma_deg:g}°. Calibrate with the lens's own model: leave --camera-model out",
         {
             "camera_fit": {

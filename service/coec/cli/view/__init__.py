@@ -104,7 +104,7 @@ def listen_address(text: str, *, insecure: bool) -> ListenAddress:
     host = match[1].removeprefix("[").removesuffix("]")
     if not insecure and not is_loopback(host):
         raise UsageError(
-            f"--listen {text}: whoever reaches it would see what the camera sees, without a certificate: listen on "
+            f"--listen {text}: any host that can reach it could see the camera images without a certificate: listen on "
             "loopback and forward the port (`ssh -L 8765:localhost:8765 VEHICLE`), or give --insecure"
         )
     return ListenAddress(host, int(match[2]))

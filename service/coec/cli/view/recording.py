@@ -85,7 +85,7 @@ def load_candidate(path: Path) -> Candidate:
         raise SourceError(f"{path} is not the result of `coec calibrate --json`: {error}") from error
     T_camera_lidar = matrix_of(result.camera_from_lidar)
     if not is_rigid(T_camera_lidar):
-        raise SourceError(f"{path}: camera_from_lidar is no rotation and translation")
+        raise SourceError(f"{path}: camera_from_lidar is not a rigid transform")
     return Candidate(result, T_camera_lidar)
 
 

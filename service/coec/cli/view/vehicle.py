@@ -350,7 +350,7 @@ def _directly(callback: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
 def _rigid(transform: Transform) -> Matrix4:
     T_camera_lidar = matrix_of(transform)
     if not is_rigid(T_camera_lidar):
-        raise DecodeError("message_fields", "a matrix that is no rotation and translation")
+        raise DecodeError("message_fields", "the matrix is not a rigid transform")
     return T_camera_lidar
 
 

@@ -180,7 +180,7 @@ def first_positive_root(polynomial: NDArray[np.float64]) -> float:
     trimmed = np.trim_zeros(polynomial, "b")
     with np.errstate(over="ignore", invalid="ignore"):
         if not np.isfinite(trimmed / trimmed[-1]).all():
-            raise ValueError("the distortion coefficients are of too different sizes")
+            raise ValueError("the magnitudes of the distortion coefficients differ too much")
     roots = np.polynomial.polynomial.polyroots(trimmed)
     # A root counts as real if its imaginary part is rounding only (eigenvalues of the companion matrix, relative).
     real = np.sort(roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)])

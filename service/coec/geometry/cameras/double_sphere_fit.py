@@ -66,7 +66,7 @@ def fit_double_sphere(camera: Camera) -> DoubleSphereFit:
     """
     uv_px, rays = _seen(camera, _cell_centres_px(camera))
     if len(uv_px) < _PARAMETERS:
-        raise ValueError(f"the camera sees only {len(uv_px)} of its pixels: nothing to fit to")
+        raise ValueError(f"only {len(uv_px)} pixels of the camera have a ray: too few to fit a model")
     problem = _Problem(camera.width, camera.height, uv_px, rays)
     _, xi, alpha = min(_descend(problem, np.array(start)) for start in _STARTS)
     fitted = problem.camera(xi, alpha)

@@ -136,7 +136,7 @@ def fit_kannala_brandt(camera: CameraFields, ray_of: RayOf) -> KannalaBrandtFit:
     """
     uv_px, rays = _seen(camera, ray_of)
     if len(uv_px) < _PARAMETERS:
-        raise ValueError(f"the camera sees only {len(uv_px)} of its pixels: nothing to fit to")
+        raise ValueError(f"only {len(uv_px)} pixels of the camera have a ray: too few to fit a model")
     theta, sides = _polar(rays)
     powers = theta[:, None] ** np.array(_POWERS)
     focal = np.array([camera.fx, camera.fy])
@@ -149,7 +149,7 @@ def fit_kannala_brandt(camera: CameraFields, ray_of: RayOf) -> KannalaBrandtFit:
     solution = np.linalg.lstsq(design / scale, uv_px.reshape(-1), rcond=None)[0] / scale
     first, *higher = (float(value) for value in solution[: len(_POWERS)])
     if not first > 0.0:
-        raise ValueError("no Kannala-Brandt camera comes near this one")
+        raise ValueError("no Kannala-Brandt model approximates this camera")
     k1, k2, k3, k4 = (value / first for value in higher)
     fitted = build(
         width=camera.width,

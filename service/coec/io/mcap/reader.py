@@ -184,7 +184,7 @@ class MessageReader:
             self._stream.seek(chunk_at)
             opcode, span = _PREFIX.unpack(_read(self._stream, _PREFIX.size, chunk_at, self._size))
             if opcode != Opcode.CHUNK:
-                raise McapDamagedError(f"byte {chunk_at}: there is no chunk here any more: the file has changed")
+                raise McapDamagedError(f"byte {chunk_at}: the chunk is missing: the file has changed")
             body_at = chunk_at + _PREFIX.size
             self._chunk = _unpack_chunk(_read(self._stream, span, body_at, self._size), body_at)
             self._chunk_at = chunk_at

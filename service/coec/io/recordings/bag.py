@@ -89,7 +89,7 @@ def open_bag(spec: SourceSpec) -> RecordingSource:
         motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
         motion = motions[0] if motions else None
     if not isinstance(camera, CameraFrame) or not isinstance(motion, EgoMotion | None):
-        raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion where it was said to be")
+        raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion on the topic named for it")
     lidar_frame = query.get("lidar_frame", cloud.frame_id)
     T_cloud_lidar = index.transform(cloud.frame_id, lidar_frame)
     if T_cloud_lidar is None:

@@ -76,7 +76,7 @@ def _open_path(spec: SourceSpec) -> RecordingSource:
         folder = spec.path.with_suffix("") if spec.path.suffix == ROS_1 else spec.path / "ros2"
         made = shlex.quote(str(folder))
         raise SourceError(
-            f"{spec.path} is a bag of ROS 1, and bags of ROS 2 are read: `rosbags-convert --src {given} --dst {made}` "
+            f"{spec.path} is a bag of ROS 1, only ROS 2 bags are read: `rosbags-convert --src {given} --dst {made}` "
             f"(installed with coec) writes one; then give {made}"
         )
     if is_bag(spec):

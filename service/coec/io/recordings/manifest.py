@@ -93,7 +93,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         raise SourceError(str(error)) from error
     if info_of_yaml(text) is not None:
         raise SourceError(
-            f"{path} is the calibration of a camera in ROS's form, no list of frames: name it as `camera: {path.name}` "
+            f"{path} is a ROS camera calibration, not a list of frames: name it as `camera: {path.name}` "
             f"in a {FILE_NAME}, or behind a bag as BAG?intrinsics={path.name}"
         )
     try:

@@ -396,7 +396,7 @@ def _answer_from(
         try:
             answer(query, routes, received_s)
         except zenoh.ZError:  # the client is gone
-            _log.debug("a reply found no receiver")
+            _log.debug("a reply could not be delivered")
 
 
 def _direct(callback: Callable[..., None]) -> zenoh.handlers.Callback[object]:

@@ -95,7 +95,7 @@ class _TlsEndpoint:
         except ssl.SSLWantReadError:
             return False
         except ssl.SSLError as error:
-            raise NotProvenError(f"the certificate was not taken: {_why(error)}") from None
+            raise NotProvenError(f"the certificate was rejected: {_why(error)}") from None
         return True
 
     def peer(self) -> str:
@@ -112,12 +112,12 @@ class _TlsEndpoint:
         try:
             return self._tls.read(MAX_PAYLOAD_BYTES)
         except ssl.SSLError as error:
-            raise NotProvenError(f"what was said cannot be read: {_why(error)}") from None
+            raise NotProvenError(f"the message cannot be decrypted: {_why(error)}") from None
 
     def write(self, text: bytes) -> None:
         """Say something, in one record."""
         if len(text) > MAX_PAYLOAD_BYTES:
-            raise NotProvenError(f"more than {MAX_PAYLOAD_BYTES} bytes cannot be said")
+            raise NotProvenError(f"more than {MAX_PAYLOAD_BYTES} bytes cannot be sent")
         self._tls.write(text)
 
     def outgoing(self) -> bytes:
@@ -171,7 +171,7 @@ class CommandListener:
         if endpoint is None:
             return self._begin(handshake_id, received, now_s)
         if not endpoint.handshake(received):
-            raise NotProvenError("the conversation was broken off")
+            raise NotProvenError("the TLS session was aborted")
         return AuthenticatedCommand(endpoint.peer(), endpoint.read(), _sealer(endpoint))
 
     def _begin(self, handshake_id: str, received: bytes, now_s: float) -> bytes:
@@ -179,13 +179,13 @@ class CommandListener:
             # Conversations that have begun get time to go on, so that a flood of new ones makes others wait but ends
             # none.
             if next(iter(self._pending.values()))[1] > now_s + SECOND_QUERY_S - MIN_HANDSHAKE_AGE_S:
-                raise TooManyHandshakesError("too many conversations have begun; begin again in a moment")
+                raise TooManyHandshakesError("too many TLS handshakes are in progress; retry in a moment")
             self._pending.popitem(last=False)
         endpoint = _TlsEndpoint(self._context, server_side=True)
         endpoint.handshake(received)
         flight = endpoint.outgoing()
         if not flight:
-            raise NotProvenError("this is no beginning of a TLS conversation")
+            raise NotProvenError("not a TLS ClientHello")
         self._pending[handshake_id] = endpoint, now_s + SECOND_QUERY_S
         return flight
 
@@ -216,7 +216,7 @@ class CommandSender:
             NotProvenError: it has another name or no proof; nothing of the text was sent.
         """
         if not self._endpoint.handshake(received):
-            raise NotProvenError("the answer holds no certificate")
+            raise NotProvenError("the reply contains no certificate")
         name = self._endpoint.peer()
         if name != self._to:
             raise NotProvenError(f"who answered has the certificate of {name!a}, not that of {self._to!r}")

@@ -61,7 +61,7 @@ class Endpoint:
         """
         match = _FORM.fullmatch(text)
         if match is None:
-            raise ConfigError(f"{redacted(text)!r} is no endpoint: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447")
+            raise ConfigError(f"{redacted(text)!r} is not an endpoint: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447")
         endpoint = cls(match["protocol"], match["address"], match["metadata"] or "", match["settings"] or "")
         if endpoint.protocol in WITH_PORT:
             parts = _HOST_PORT.fullmatch(endpoint.address)
@@ -69,7 +69,7 @@ class Endpoint:
                 raise ConfigError(f"{redacted(text)!r} names no host and port: write tcp/127.0.0.1:7447")
         elif endpoint.protocol not in OF_THIS_COMPUTER | OTHERS:
             known = ", ".join(sorted(WITH_PORT | OF_THIS_COMPUTER | OTHERS))
-            raise ConfigError(f"{redacted(text)!r} is of no protocol that Zenoh knows: {known}")
+            raise ConfigError(f"{redacted(text)!r} has a protocol unknown to Zenoh: {known}")
         return endpoint
 
     @property
@@ -159,7 +159,7 @@ def read_settings(path: Path) -> zenoh.Config:
     except OSError as error:
         raise ConfigError(cannot_read(path, error)) from None
     except UnicodeDecodeError:
-        raise ConfigError(f"{path} is no text in UTF-8") from None
+        raise ConfigError(f"{path} is not UTF-8 text") from None
     brackets = text.count("{") + text.count("[")
     if len(data) > MAX_SETTINGS_BYTES or brackets > MAX_BRACKETS:
         raise ConfigError(
@@ -331,7 +331,7 @@ def shake_hands(endpoint: Endpoint, material: TlsFiles, timeout_s: float) -> Cer
                 tls.recv(1)
             return _certificate(seen)
     except ssl.SSLCertVerificationError as error:
-        raise CertificateError(f"this end does not take its certificate: {error.verify_message}") from error
+        raise CertificateError(f"the peer's certificate is rejected: {error.verify_message}") from error
     except ssl.SSLError as error:
         raise CertificateError(_alert(error)) from error
 

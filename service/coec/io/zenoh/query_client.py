@@ -118,7 +118,7 @@ def connected_by(
     for endpoint in router.endpoints:
         if not ENDPOINT.fullmatch(endpoint):
             raise UsageError(
-                f"{redacted(endpoint)!r} is no endpoint of a router: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447"
+                f"{redacted(endpoint)!r} is not a router endpoint: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447"
             )
     zenoh.init_log_from_env_or("off")
     settings.insert_json5("mode", '"client"')
@@ -438,7 +438,7 @@ def send_authenticated(
     sealed = _exchange(session, conversation, timeout_s, speaker.send(flight, to_json(command)))
     answer = speaker.reply(sealed)
     if not answer:
-        raise NotProvenError("the service broke the conversation off")
+        raise NotProvenError("the service aborted the TLS session")
     return Reply(key, answer, encoding)
 
 

@@ -326,7 +326,7 @@ def open_router(file: Path) -> zenoh.Session:
     doors = unguarded(settings)
     if doors:
         raise ConfigError(
-            f"{file}: whoever reaches {', '.join(doors)} would be let in, to read, to send frames and to command: "
+            f"{file}: whoever reaches {', '.join(doors)} could read, send frames and give commands: "
             "listen on loopback, or on tls with enable_mtls and a root_ca_certificate"
         )
     try:

@@ -190,7 +190,7 @@ class SingletonGuard:
             unproven = self._unproven(seen, rivals)
             if silent and unproven and self._forbidden:
                 raise UnavailableError(
-                    f"vehicle {self._keys.vehicle!r} is served already: somebody holds the token {unproven[0]!a}"
+                    f"vehicle {self._keys.vehicle!r} is already served: another session holds the token {unproven[0]!a}"
                 )
             if step == "serve" and (silent or not unproven):
                 self._report(unproven)
@@ -279,11 +279,11 @@ class SingletonGuard:
         deadline_s = time.monotonic() + SEEN_S
         while not (seen := self._query_router()).own:
             if not seen.routed and not list(self._session.info.routers_zid()):
-                _log.warning("no router answers yet: whether another daemon serves the vehicle is seen when one does")
+                _log.warning("no router answers yet; other daemons of the vehicle are checked once one does")
                 break
             if time.monotonic() > deadline_s or stop.wait(POLL_S):
                 self.hidden = seen.routed
-                _log.warning("the liveliness tokens of this vehicle cannot be seen: two daemons may serve it")
+                _log.warning("the liveliness tokens of this vehicle cannot be queried; two daemons may serve it")
                 break
         return seen
 

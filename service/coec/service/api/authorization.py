@@ -71,7 +71,7 @@ class Authority:
                 return
             why = f"other computers may reach the service: {external_access}"
         raise NotAllowedError(
-            f"`{command}` needs a sender who proves his name: {why}. Give it with a certificate that "
+            f"`{command}` needs an authenticated sender: {why}. Give it with a certificate that "
             "`authority.senders` names (`coec query --zenoh FILE`)"
         )
 
@@ -235,7 +235,7 @@ class CommandHandler:
         call = from_json(ProvenCommand, authenticated.payload)
         key, _, parameters = call.selector.partition("?")
         if key != request.key:
-            raise UsageError("what was said in the conversation is not the command that was asked for")
+            raise UsageError("the authenticated message is not the requested command")
         selector = parse_command_selector(parameters)
         sender = proven_sender(authenticated.sender)
         done = self._execute(

@@ -190,7 +190,7 @@ class Commands:
             late = time.monotonic() >= deadline_s and not started.is_set()
             code, text = ("expired", EXPIRED) if late else (error.reply_code, str(error))
             fields = {"pair": self._pair.name, "command": name, "sender": sender, "code": code}
-            _log.warning(f"a command was not carried out in time: {text}", extra={"fields": fields})
+            _log.warning(f"a command was not executed in time: {text}", extra={"fields": fields})
             acknowledged = self._acknowledge(name, code, text, accepted=False)
         with self._lock:
             self._counts[f"{name}_{'accepted' if acknowledged.accepted else 'refused'}"] += 1
@@ -205,7 +205,7 @@ class Commands:
             count = self._counts[f"{known}_not_allowed"]
         if count & (count - 1) == 0:
             fields = {"pair": self._pair.name, "command": known, "sender": sender, "code": why.reply_code}
-            _log.warning(f"a command was not allowed: {why}", extra={"fields": {**fields, "count": count}})
+            _log.warning(f"a command was denied: {why}", extra={"fields": {**fields, "count": count}})
 
     def _noted(self, done: Acknowledgement, sender: str, reason: str | None) -> Acknowledgement:
         """Has a command that was carried out written into the history, and waits a limited time for that."""
@@ -239,7 +239,7 @@ class Commands:
 
     def _write_down(self, done: Acknowledgement, sender: str, reason: str | None) -> None:
         fields = {"pair": self._pair.name, "command": done.command, "sender": sender, "reason": reason}
-        _log.info("a command came", extra={"fields": {**fields, "accepted": done.accepted, "code": done.code}})
+        _log.info("command received", extra={"fields": {**fields, "accepted": done.accepted, "code": done.code}})
         self._store.note_command(done.command, done.code, done.text, sender, accepted=done.accepted, reason=reason)
         self._store.save()
         self._manager.publish()
@@ -254,7 +254,7 @@ class Commands:
             if waits is not None and name is not None and not _is_named(waits, name):
                 raise lifecycle.CommandRefusedError(
                     "other_candidate",
-                    f"Another candidate waits, {str(waits.sha256)[:16]} from window {waits.window_id}; nothing was "
+                    f"There is another candidate, {str(waits.sha256)[:16]} from window {waits.window_id}; nothing was "
                     "done. Look at it (`extrinsic`), and name it.",
                 )
             return after

@@ -153,7 +153,7 @@ class HttpServer:
         try:
             page = self._find(HttpRequest(path, _values(headers, b"accept")))
         except Exception:
-            _log.exception("a page could not be made", extra={"fields": {"path": path[:64]}})
+            _log.exception("a page could not be rendered", extra={"fields": {"path": path[:64]}})
             page = _plain(500, "The service failed on this page; its log says why.\n")
         return _response_bytes(page or _plain(404, "There is no such page.\n"), with_body=method != b"HEAD")
 
@@ -163,7 +163,7 @@ def _listening(host: str, port: int) -> socket.socket:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         made = socket.create_server((host, port), family=family, backlog=MAX_CONNECTIONS)
     except OSError as error:
-        raise UnavailableError(f"nobody can listen on {host}:{port}: {error.strerror or error}") from error
+        raise UnavailableError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
     made.setblocking(False)
     return made
 

@@ -127,7 +127,7 @@ class Overlays:
         try:
             picture = rendered.result(OVERLAY_TIMEOUT_S)
         except TimeoutError as error:
-            raise OverlayUnavailableError("the worker is busy with a window; ask again") from error
+            raise OverlayUnavailableError("the worker is busy with a window; retry") from error
         if isinstance(picture, Reason):
             raise OverlayUnavailableError(picture.text)
         with self._lock:

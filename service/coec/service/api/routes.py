@@ -148,7 +148,7 @@ class VehicleRoutes:
             return []
         address = self._keys.parse(key)
         if address.resource != "command":
-            raise UsageError("the rig takes commands; what all pairs say together is `rig` itself")
+            raise UsageError("the rig takes commands; the estimate of the whole rig is at `rig`")
         command = Route(key, partial(self._command_handler.handle, RIG, str(address.argument)), QueryLane.COMMANDS)
         return [self._timed(command, "command")]
 

@@ -511,7 +511,7 @@ class RigEstimatorThread:
             self._after(report.pair, report.due_ns, report.what)
         except ValueError as error:  # unusable numbers, from an estimate that went wrong
             self._losses["refused"] += 1
-            _log.warning(f"what {report.pair} reported is left out of the rig: {error}")
+            _log.warning(f"what {report.pair} reported is excluded from the rig estimate: {error}")
         with self._condition:
             self._notify_pairs(before, report.due_ns)
             self._schedule.finish(report)
@@ -590,7 +590,7 @@ class RigEstimatorThread:
         sensors = " and ".join(correction.sensors)
         text = f"{sensors} moved: all its pairs, {', '.join(correction.pairs)}, are put right by the windows of all."
         _log.info(
-            "a move of a sensor is put right", extra={"fields": {"sensors": sensors, "pairs": [*correction.pairs]}}
+            "a displaced sensor is corrected", extra={"fields": {"sensors": sensors, "pairs": [*correction.pairs]}}
         )
         for name, joint_pose in correction.pairs.items():
             self._corrections.setdefault(name, deque(maxlen=MOST_CORRECTIONS)).append(

@@ -410,7 +410,7 @@ class Decoder:
 
     @property
     def contested(self) -> bool:
-        """Whether several senders send at the same time."""
+        """Whether several publishers send at the same time."""
         return bool(self._senders.taking_turns)
 
     def overrun(self, sample: InputSample) -> None:
@@ -442,7 +442,7 @@ class Decoder:
             if sender is not None:
                 self._senders.took(sender)
             if self.contested:
-                raise DecodeError(TWO_SENDERS, "several senders send at the same time")
+                raise DecodeError(TWO_SENDERS, "several publishers send at the same time")
         except DecodeError as error:
             if error.reason in OTHERS:
                 self._own.append(False)
@@ -506,14 +506,14 @@ class Decoder:
             return
         self._moved_otherwise += 1
         if self._moving_frame is not None and self._moved_otherwise < RECENT:
-            raise DecodeError("frame_id", "not the frame id of the messages before")
+            raise DecodeError("frame_id", "differs from the frame id of earlier messages")
         self._moving_frame, self._moved_otherwise = motion.frame_id, 0
 
     def _from_origin(self, cloud: LidarFrame, lidar: LidarConfig) -> LidarFrame:
         """The sweep in the LiDAR's own frame, after checking that its ranges were measured from the origin of that
         frame."""
         if cloud.frame_id != (lidar.cloud_frame_id or lidar.frame_id):
-            raise DecodeError("frame_id", "not the frame id of the configuration")
+            raise DecodeError("frame_id", "differs from the frame id in the configuration")
         sweep = from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
         contradiction = self._contradiction(sweep)
         if contradiction is not None:
@@ -548,6 +548,6 @@ class Decoder:
 
 def _check_camera(frame: CameraFrame, camera: CameraConfig) -> None:
     if frame.frame_id != camera.frame_id:
-        raise DecodeError("frame_id", "not the frame id of the configuration")
+        raise DecodeError("frame_id", "differs from the frame id in the configuration")
     if (frame.image.width, frame.image.height) != (camera.intrinsics.width, camera.intrinsics.height):
-        raise DecodeError("image_size", "not the size of the intrinsics")
+        raise DecodeError("image_size", "differs from the size in the intrinsics")

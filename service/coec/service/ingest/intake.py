@@ -213,11 +213,11 @@ class StreamLog:
             _log.info(f"first {self._kind} frame: {_shape(frame)}", extra={"fields": self._fields})
         elif self._frames == RATE_FRAMES and frame.stamp_ns > self._first_ns:
             rate_hz = (RATE_FRAMES - 1) * NS_PER_S / (frame.stamp_ns - self._first_ns)
-            _log.info(f"{self._kind} frames come at {rate_hz:.1f} Hz by their stamps", extra={"fields": self._fields})
+            _log.info(f"{self._kind} frames arrive at {rate_hz:.1f} Hz by their stamps", extra={"fields": self._fields})
         if self._silent_since_s is not None:
             silent_s = self._latest_s - self._silent_since_s
             self._silent_since_s = None
-            _log.info(f"{self._kind} frames come again after {silent_s:.0f} s", extra={"fields": self._fields})
+            _log.info(f"{self._kind} frames arrive again after {silent_s:.0f} s", extra={"fields": self._fields})
 
     def tick(self) -> None:
         """Time has passed."""

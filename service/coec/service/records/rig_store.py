@@ -214,7 +214,7 @@ def _sound_event(event: StoredEvent) -> StoredEvent:
             raise ValueError("a pose is no rigid transform")
         information_of(measured.uncertainty.noise)
         if any(abs(value) >= MOST_SIGMA for shift in known.systematic.values() for value in shift):
-            raise ValueError("a shift is larger than any that is estimated")
+            raise ValueError("a shift exceeds the largest that is estimated")
     return event
 
 

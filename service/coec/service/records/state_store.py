@@ -246,7 +246,7 @@ def _read_estimate(value: Any, _: object) -> Estimate:
         raise _BeyondMeasureError("a variance is negative")
     shifts = np.abs([estimate.correction, *estimate.uncertainty.systematic.values()])
     if (shifts > LARGEST_CORRECTION).any() or (np.abs(estimate.uncertainty.noise) > LARGEST_CORRECTION**2).any():
-        raise _BeyondMeasureError("a correction or its uncertainty is larger than any that is estimated")
+        raise _BeyondMeasureError("a correction or its uncertainty exceeds the largest that is estimated")
     return estimate
 
 

@@ -261,7 +261,7 @@ class Child:
         try:
             return self._link.receive(MAX_ANSWER_BYTES)
         except MalformedMessageError as error:
-            raise ChildError(Fault.MALFORMED_ANSWER, f"sent something that is not a message: {error}") from error
+            raise ChildError(Fault.MALFORMED_ANSWER, f"sent an invalid message: {error}") from error
         except (OSError, EOFError) as error:
             raise self._broken(error) from error
 
@@ -271,7 +271,7 @@ class Child:
         try:
             self._process.wait(KILL_S)
         except subprocess.TimeoutExpired:
-            _log.error("a killed worker does not end and is left behind", extra={"fields": {"pid": self.pid}})
+            _log.error("a killed worker process does not exit and is abandoned", extra={"fields": {"pid": self.pid}})
         self._link.close()
 
     def _read_processor_time(self) -> None:

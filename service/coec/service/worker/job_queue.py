@@ -153,7 +153,7 @@ class JobQueue:
             ValueError: some work is in hand already.
         """
         if self._in_hand is not None:
-            raise ValueError("the worker has something to do")
+            raise ValueError("internal error: the worker is not idle")
         self.expire(now_s)
         work = self._next(now_s)
         if work is None:
@@ -178,7 +178,7 @@ class JobQueue:
             self._causes["prefetch_refused"] += isinstance(answer, Reason)
             return
         if answer is None:
-            raise ValueError("a job is answered with something")
+            raise ValueError("internal error: a job finished without a result")
         self._check_was_fatal &= work.job.kind is not Kind.CHECK
         if work.settled:
             self._causes["late_answer"] += 1
@@ -303,7 +303,7 @@ class JobQueue:
 
     def _hand(self) -> _InHand:
         if self._in_hand is None:
-            raise ValueError("nothing is with the worker")
+            raise ValueError("internal error: no job is assigned to the worker")
         return self._in_hand
 
     def _is_full(self, lane: Lane, pair: str) -> bool:

@@ -259,7 +259,7 @@ class Worker:
                 with self._condition:
                     self._done_raised += 1
                 fields = {"kind": job.kind.value, "pair": job.pair, "subject": job.subject, "fate": outcome.fate.value}
-                _log.exception("the outcome of a job could not be taken", extra={"fields": fields})
+                _log.exception("the result of a job could not be processed", extra={"fields": fields})
 
     # --- on the supervisor's thread ---------------------------------------------------------------------------------
 
@@ -326,13 +326,13 @@ class Worker:
                 if not self._was_ready:
                     self._unusable = Reason(code, text)
                 raise ChildError(Fault.UNUSABLE, f"cannot work with this configuration: {text}")
-        raise ChildError(Fault.MALFORMED_ANSWER, "sent something other than that it is ready")
+        raise ChildError(Fault.MALFORMED_ANSWER, "sent an unexpected message instead of ready")
 
     def _take_turn(self, child: Child) -> bool:
         """Checks the worker, then gives it the next job, if there is one. Returns whether it has answered a job."""
         self._watch(child)
         if child.has_message(0.0) and not self._compilation.take(child.receive()):  # raises if the process has ended
-            raise ChildError(Fault.STRAY_ANSWER, "answered though nothing was asked")
+            raise ChildError(Fault.STRAY_ANSWER, "sent a reply without a request")
         if self._sent_settings != self._settings:
             self._await_ready(child)
         ticket = self._take()
@@ -372,7 +372,7 @@ class Worker:
             case {"kind": "warmed", "more": bool(more)}:
                 self._is_warm = not more
                 return
-        raise ChildError(Fault.MALFORMED_ANSWER, "sent something other than how far its warm-up is")
+        raise ChildError(Fault.MALFORMED_ANSWER, "sent an unexpected message during its warm-up")
 
     def _log_progress(self, pair: str, reached: Underway) -> None:
         """Logs how far a commissioning is, once per stage."""
@@ -421,7 +421,7 @@ class Worker:
                     text = f"made no progress in the compilation of its kernels within {STALLED_S:g} s"
                     raise ChildError(Fault.TIMED_OUT, text)
                 if self._now_s() > deadline_s:
-                    raise ChildError(Fault.TIMED_OUT, f"gave no answer within {timeout_s:g} s")
+                    raise ChildError(Fault.TIMED_OUT, f"did not reply within {timeout_s:g} s")
             message = child.receive()
             if not self._compilation.take(message):
                 self._compilation.end()
@@ -476,7 +476,7 @@ def _checked_answer(message: Mapping[str, Any], number: int, kind: Kind | None) 
     """
     try:
         if number_of(message) != number:
-            raise ChildError(Fault.STRAY_ANSWER, "answered another question than it was asked")
+            raise ChildError(Fault.STRAY_ANSWER, "replied to another request")
         return read_answer(message, kind)
     except MalformedAnswerError as error:
-        raise ChildError(Fault.MALFORMED_ANSWER, f"gave a malformed answer: {error}") from error
+        raise ChildError(Fault.MALFORMED_ANSWER, f"sent a malformed reply: {error}") from error

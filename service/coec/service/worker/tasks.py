@@ -198,7 +198,7 @@ class Solver:
         try:
             return self._render(window.rig, configuration, pose, window.pairs[-1], title).jpeg
         except DecodeError as error:
-            _log.warning(f"the result is not drawn: {error}", extra={"fields": {"window": window.window_id}})
+            _log.warning(f"the result cannot be drawn: {error}", extra={"fields": {"window": window.window_id}})
             return None
 
     def observe(
@@ -427,7 +427,7 @@ def _answer_once(solver: Solver, message: dict[str, Any]) -> Answer | Underway |
             case worker_jobs.PREFETCH:
                 solver.prefetch(message["pair"], message["frame"])
                 return None
-        raise ValueError(f"there is no work of the kind {message['kind']!r}")
+        raise ValueError(f"unknown kind of job: {message['kind']!r}")
     except (CoecError, MemoryError):
         raise
     except Exception as error:

@@ -426,7 +426,7 @@ def read_answer(message: Mapping[str, Any], kind: Kind | None) -> Answer | Under
     if kind is not None:
         return _read(ANSWERS[kind], content["result"])
     if content["result"] is not None:
-        raise MalformedAnswerError("it is a result where none was asked for")
+        raise MalformedAnswerError("it is a result for a job that has none")
     return None
 
 
