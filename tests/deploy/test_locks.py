@@ -8,7 +8,8 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from importlib import metadata
+from collections.abc import Iterable, Sequence
+from importlib.metadata import Distribution, distribution
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -89,26 +90,25 @@ def test_what_lists_the_packages_of_an_image_is_pinned(project: Any) -> None:
     assert missing(project["dependency-groups"]["release"], RELEASE) == []
 
 
-def needed(name: str, extras: frozenset[str] = frozenset()) -> set[NormalizedName]:
-    """Canonical names of a package and of all that it needs on this machine."""
-    names, waiting = set[NormalizedName](), [(name, extras)]
-    visited = set(waiting)
+def needed(requirements: Iterable[str], extras: Sequence[str] = ("",)) -> dict[NormalizedName, Distribution]:
+    """The installed distributions that these requirements come to on this machine, by name. `extras` are those of the
+    package that states them."""
+    found: dict[NormalizedName, Distribution] = {}
+    waiting = [(Requirement(line), tuple(extras)) for line in requirements]
+    visited = set[tuple[NormalizedName, tuple[str, ...]]]()
     while waiting:
-        name, extras = waiting.pop()
-        names.add(canonicalize_name(name))
-        for line in metadata.requires(name) or ():
-            requirement = Requirement(line)
-            conditions = [
-                requirement.marker is None or requirement.marker.evaluate({"extra": extra}) for extra in ("", *extras)
-            ]
-            found = requirement.name, frozenset(requirement.extras)
-            if any(conditions) and found not in visited:
-                visited.add(found)
-                waiting.append(found)
-    return names
+        requirement, stated_by = waiting.pop()
+        if requirement.marker is not None and not any(requirement.marker.evaluate({"extra": e}) for e in stated_by):
+            continue
+        name, asked = canonicalize_name(requirement.name), ("", *sorted(requirement.extras))
+        if (name, asked) not in visited:
+            visited.add((name, asked))
+            found[name] = distribution(name)
+            waiting += [(Requirement(line), asked) for line in found[name].requires or ()]
+    return found
 
 
-def test_the_table_of_licences_is_that_of_the_lock_file() -> None:
+def test_the_table_of_licences_is_that_of_the_lock_file(project: Any) -> None:
     """docs/licences.md is written by `deploy/bill-of-materials` from an environment with what coec needs alone."""
     if (sys.version_info[:2], platform.machine(), sys.platform) != ((3, 11), "x86_64", "linux"):
         pytest.skip("the table is of the image: CPython 3.11 on x86-64 Linux")
@@ -116,7 +116,7 @@ def test_the_table_of_licences_is_that_of_the_lock_file() -> None:
         r"^\| (\S+) +\| (\S+) +\| (.+?) +\|$", (REPOSITORY / "docs" / "licences.md").read_text(), re.MULTILINE
     )
     shown = {canonicalize_name(name): version for name, version, _ in rows if version[0].isdigit()}
-    assert shown.keys() == needed("coec") - {"coec"}
+    assert shown.keys() == needed(project["project"]["dependencies"]).keys()
     assert shown.items() <= pinned_hashes(LOCK).keys()
     assert all(licence not in ("", "UNKNOWN") for _, _, licence in rows)
 

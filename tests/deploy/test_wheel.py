@@ -8,16 +8,15 @@ import os
 import subprocess
 import venv
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import Distribution, distribution, packages_distributions
+from collections.abc import Iterable
+from importlib.metadata import Distribution, packages_distributions
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
 
 from cli.conftest import SMALL
 from deploy.test_archives import built
+from deploy.test_locks import needed
 from e2e.processes import Router, service, write_configuration
 from support.fleet import recorded_windows
 from support.simulated_drives import rendered_source
@@ -43,24 +42,6 @@ print(json.dumps([coec.__file__, errors]))
 """
 
 
-def needed(requirements: Iterable[str], extras: Sequence[str] = ("",)) -> dict[str, Distribution]:
-    """The installed distributions that these requirements come to on this machine, by name. `extras` are those of the
-    package that states them."""
-    found: dict[str, Distribution] = {}
-    waiting = [(Requirement(line), tuple(extras)) for line in requirements]
-    visited = set()
-    while waiting:
-        requirement, stated_by = waiting.pop()
-        if requirement.marker is not None and not any(requirement.marker.evaluate({"extra": e}) for e in stated_by):
-            continue
-        name, asked = canonicalize_name(requirement.name), ("", *sorted(requirement.extras))
-        if (name, asked) not in visited:
-            visited.add((name, asked))
-            found[name] = distribution(name)
-            waiting += [(Requirement(line), asked) for line in found[name].requires or ()]
-    return found
-
-
 class Environment:
     """A virtual environment with links to what is installed in this one.
 
@@ -80,9 +61,9 @@ class Environment:
         (metadata,) = self._packages.glob("coec-*.dist-info/METADATA")
         return email.message_from_string(metadata.read_text()).get_all("Requires-Dist") or []
 
-    def link(self, distributions: Mapping[str, Distribution]) -> None:
-        """Adds what is installed here under these names."""
-        for package in distributions.values():
+    def link(self, distributions: Iterable[Distribution]) -> None:
+        """Adds distributions that are installed here."""
+        for package in distributions:
             for file in package.files or ():
                 # Folders that several distributions share, as `google` is, are made of links to what is in them.
                 depth = 2 if len(self._owners.get(file.parts[0], ())) > 1 else 1
@@ -119,7 +100,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def vehicle(wheel: Path, tmp_path: Path) -> Environment:
     """The wheel, and what it requires without extras."""
     environment = Environment(tmp_path / "vehicle")
-    environment.link(needed(environment.unpack(wheel)))
+    environment.link(needed(environment.unpack(wheel)).values())
     return environment
 
 
@@ -156,6 +137,6 @@ def test_the_wheel_alone_serves_calibrates_replays_and_evaluates_many(
         assert [pair["name"] for pair in status["pairs"]] == [running.pair]
         assert running.terminate() == 0
 
-    vehicle.link(needed(vehicle.unpack(wheel), ("", "fleet")))
+    vehicle.link(needed(vehicle.unpack(wheel), ("", "fleet")).values())
     batch = ("batch", windows / "one", "--output", tmp_path / "tables", "--jobs", 1, "--json")
     assert json.loads(vehicle.coec(*batch, cwd=tmp_path))["differing"] == 0
