@@ -44,9 +44,10 @@ LONGEST_FIRST = (
 """Files and folders whose tests start processes, and those that calibrate. A parallel run hands out one file after the
 other: a long one that comes last is waited for by a core that has nothing to do."""
 
-# The same examples in every run, and no verdict from the speed of the machine.
-hypothesis.settings.register_profile("coec", derandomize=True, deadline=None, database=None)
-hypothesis.settings.load_profile("coec")
+# The same examples in every run, and no verdict from the speed of the machine. The long run tries twice as many.
+for profile, examples in (("short", 50), ("long", 100)):
+    hypothesis.settings.register_profile(profile, derandomize=True, deadline=None, database=None, max_examples=examples)
+hypothesis.settings.load_profile("short")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -59,6 +60,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """The process that hears of all tests writes the table, not the workers of a parallel run."""
+    if not config.getoption("markexpr"):
+        hypothesis.settings.load_profile("long")
     table: Path | None = config.getoption("faults")
     if table is not None and not hasattr(config, "workerinput"):
         config.pluginmanager.register(FaultTable(table))

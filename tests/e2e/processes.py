@@ -95,7 +95,7 @@ def coec_here(*arguments: object) -> subprocess.CompletedProcess[str]:
             status = main()
     finally:
         sys.argv = before
-    said = [stream.buffer.getvalue().decode() for stream in (out, err)]  # type: ignore[attr-defined]
+    said = [stream.buffer.getvalue().decode() for stream in (out, err)]
     return subprocess.CompletedProcess(command, status, *said)
 
 
