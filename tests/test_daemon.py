@@ -314,7 +314,6 @@ def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None
     assert b"in use by another daemon" in second.stdout
 
 
-@pytest.mark.slow
 @pytest.mark.fault("`insecure: true`", "health and status say so, and no key is shown")
 def test_a_door_for_everybody_is_said_and_keys_are_hidden(tmp_path: Path, drive: Drive, router: Router) -> None:
     path = configured(tmp_path, drive, router)
@@ -350,7 +349,6 @@ def test_a_second_daemon_of_the_vehicle_leaves_and_says_who_is_there(idle: Servi
     assert idle.status()["pairs"], "the first goes on"
 
 
-@pytest.mark.slow
 @pytest.mark.fault("a damaged state at the start", "health says so, and nominal is served")
 def test_a_damaged_state_is_said_and_nominal_is_served(tmp_path: Path, drive: Drive, router: Router) -> None:
     (tmp_path / "state").mkdir()
