@@ -23,7 +23,7 @@ from coec.schemas import replies
 from coec_lab.demo import pair_drive, pair_report
 from coec_lab.demo.pair import BARS, Screen, curve, view
 from coec_lab.demo.pair_client import Moment, PairOutcome, Snapshot, outcome_of, with_alarm
-from coec_lab.demo.pair_drive import LEAD_NS, NS_PER_S, STEP_NS, Pace, at_rest, paced
+from coec_lab.demo.pair_drive import LEAD_NS, NS_PER_S, STEP_NS, Pace, PairVehicle, at_rest, paced
 from coec_lab.demo.pair_report import demo_page
 from reports.pages import MADE
 from support.messages import status_reply
@@ -234,16 +234,49 @@ def test_there_is_something_to_look_at_before_the_service_says_anything(tmp_path
     assert page.name == pair_drive.REPORT, "the report takes its place"
 
 
-def check_files(document: Any) -> Path:
-    """What the demonstration left; the window that it fetched."""
+def check_files(document: Any) -> list[Path]:
+    """What the demonstration left. Returns the window that it fetched, if one was accepted, which it then pictures."""
     written = [Path(path) for path in document["files"]]
     assert all(path.stat().st_size > 0 for path in written)
     assert (written[0].parent / f"{pair_report.PICTURE}.png").stat().st_size > 0
-    assert {"timeline.png", "overlay_before.png", "overlay_after.png", "report.html"} <= {path.name for path in written}
-    (window,) = (path for path in written if path.suffix == ".mcap")
-    return window
+    windows = [path for path in written if path.suffix == ".mcap"]
+    pictures = {"overlay_before.png", "overlay_after.png"} if windows else set()
+    assert {"timeline.png", "report.html"} | pictures <= {path.name for path in written}
+    return windows
 
 
+def test_a_drive_that_ends_before_the_first_window_ends_as_one_that_did_not_come_true(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The service, the vehicle, the view, the pictures, the page: all but a calibration."""
+    pytest.importorskip("embreex", reason="needs ray casting")
+    from coec_lab.simulation.drive import DriveConfig
+
+    brief = DriveConfig(
+        seed=pair_drive.SEED, seconds=4.0, camera="fisheye160", lidar="16", camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
+        workshop=pair_drive.WORKSHOP,
+    )  # fmt: skip
+    monkeypatch.setattr(pair_drive, "drive_config", lambda: brief)
+    monkeypatch.setattr(pair_drive, "RENDERERS", 1)
+    monkeypatch.setattr(pair_drive, "CLOSE_UP_PX", tuple(value * 160 // 700 for value in pair_drive.CLOSE_UP_PX))
+    vehicles: list[PairVehicle] = []
+
+    class Watched(PairVehicle):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            vehicles.append(self)
+
+    monkeypatch.setattr("coec_lab.demo.pair.PairVehicle", Watched)
+    outcome = coec("demo", "--json", "--output", tmp_path / "demo")
+    assert outcome.status == 1
+    assert [vehicle.pictures for vehicle in vehicles] == [4]
+    document = outcome.document
+    assert document["objections"] == ["The service never detected the displacement."]
+    assert {(moment["health"], moment["provenance"]) for moment in document["timeline"]} == {("unknown", "nominal")}
+    assert check_files(document) == []
+
+
+@pytest.mark.slow
 def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_not_come_true(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -269,7 +302,7 @@ def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_no
     assert (first["health"], first["provenance"]) == ("unknown", "nominal")
     assert (last["health"], last["provenance"], last["status"]) == ("healthy", "estimated", "accepted")
     assert last["error_deg"] < MAX_ERROR_DEG < first["error_deg"]
-    assert last["window_id"] == check_files(document).stem
+    assert [path.stem for path in check_files(document)] == [last["window_id"]]
 
 
 @pytest.mark.slow
@@ -285,7 +318,8 @@ def test_the_knock_is_noticed_and_repaired(coec: Coec, tmp_path: Path) -> None:
     assert states[0] == "unknown"
     assert states[-1] == "healthy"
     assert "miscalibrated" in states
-    assert coec("replay", check_files(document)).status == 0
+    (window,) = check_files(document)
+    assert coec("replay", window).status == 0
 
 
 def seen_with(worker: str, t_s: float) -> Snapshot:

@@ -41,6 +41,12 @@ def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plots, "DPI", 20)
 
 
+@pytest.fixture
+def without_pictures_of_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `test_output_folder_holds_table_report_and_pictures` has them."""
+    monkeypatch.setattr(evaluation_pictures, "write", lambda *_: EvaluationBlocks((), ()))
+
+
 def without_intensity(recording: FramewiseRecording) -> FramewiseRecording:
     """The recording of a LiDAR that tells no reflectance."""
 
@@ -129,9 +135,8 @@ def test_output_folder_holds_table_report_and_pictures(
     assert sum(int(row["hit"]) for row in rows) == outcome.document["hits"]
 
 
-def test_methods_side_by_side(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the pictures of all; those of each are the same as of one alone."""
-    monkeypatch.setattr(evaluation_pictures, "write", lambda *_: EvaluationBlocks((), ()))
+@pytest.mark.usefixtures("without_pictures_of_starts")
+def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
     arguments = (
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--frames", "2",
         "--objective", "all",
@@ -299,6 +304,7 @@ def test_a_recording_too_short_for_detection_is_refused_before_the_work(coec: Co
     assert "needs 9 pairs" in outcome.err
 
 
+@pytest.mark.usefixtures("without_pictures_of_starts")
 def test_normalised_errors_of_windows_and_halves(coec: Coec, tmp_path: Path) -> None:
     outcome = coec(
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--objective", "mi",

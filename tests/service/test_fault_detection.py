@@ -107,6 +107,10 @@ def stop_and_go(second: int) -> float:
 
 
 STANDING = 0.0
+SPEEDS = (STANDING, 5.0, stop_and_go)
+IN_TRAFFIC = pytest.mark.parametrize(
+    "speed_mps", [*(pytest.param(speed_mps, marks=pytest.mark.slow) for speed_mps in SPEEDS[:2]), stop_and_go]
+)
 AXES = ((3.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -3.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.12, 0.0))
 
 
@@ -117,8 +121,14 @@ AXES = ((3.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -3.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0
     "the mount steps by 3° or 12 cm while the vehicle stands, drives, or stops and goes",
     "`healthy` for three periods at most while wrong",
 )
-@pytest.mark.parametrize("xi", AXES)
-@pytest.mark.parametrize("speed_mps", [STANDING, 5.0, stop_and_go])
+@pytest.mark.parametrize(
+    ("speed_mps", "xi"),
+    [
+        pytest.param(speed_mps, xi, marks=() if number == axis else pytest.mark.slow)
+        for number, speed_mps in enumerate(SPEEDS)
+        for axis, xi in enumerate(AXES)
+    ],
+)
 def test_a_step(tmp_path: Path, xi: tuple[float, ...], speed_mps: float | Callable[[int], float]) -> None:
     bench = settled(tmp_path, moved(xi))
     if speed_mps == STANDING:
@@ -131,7 +141,7 @@ def test_a_step(tmp_path: Path, xi: tuple[float, ...], speed_mps: float | Callab
     "the mount was turned by 3° while the service was off, and the vehicle stands, drives, or stops and goes",
     "it is never healthy over that extrinsic",
 )
-@pytest.mark.parametrize("speed_mps", [STANDING, 5.0, stop_and_go])
+@IN_TRAFFIC
 def test_a_step_while_the_service_is_off(tmp_path: Path, speed_mps: float | Callable[[int], float]) -> None:
     bench = settled(tmp_path, moved(TURNED))
     bench.restart()
@@ -140,7 +150,7 @@ def test_a_step_while_the_service_is_off(tmp_path: Path, speed_mps: float | Call
 
 
 @pytest.mark.fault("`rollback` to a wrong extrinsic, standing or in traffic", "it is never healthy over that extrinsic")
-@pytest.mark.parametrize("speed_mps", [STANDING, 5.0, stop_and_go])
+@IN_TRAFFIC
 def test_a_rollback_to_a_wrong_pose(tmp_path: Path, speed_mps: float | Callable[[int], float]) -> None:
     bench = settled(tmp_path, moved(TURNED))
     first = bench.answers.history(0, 2**63 - 1, 10).results[0].window_id
@@ -158,8 +168,17 @@ def test_a_rollback_to_a_wrong_pose(tmp_path: Path, speed_mps: float | Callable[
     "a check that flags the extrinsic, after a restart, a rollback, or a time without checks",
     "it does not make healthy",
 )
-@pytest.mark.parametrize("after", ["restart", "rollback", "overdue"])
-@pytest.mark.parametrize("speed_mps", [STANDING, 5.0])
+@pytest.mark.parametrize(
+    ("speed_mps", "after"),
+    [
+        (5.0, "restart"),
+        (STANDING, "rollback"),
+        (5.0, "overdue"),
+        pytest.param(STANDING, "restart", marks=pytest.mark.slow),
+        pytest.param(5.0, "rollback", marks=pytest.mark.slow),
+        pytest.param(STANDING, "overdue", marks=pytest.mark.slow),
+    ],
+)
 def test_a_flagged_check_does_not_make_healthy(tmp_path: Path, after: str, speed_mps: float) -> None:
     bench = settled(tmp_path, moved(TURNED))
     driven(bench, range(1), speed_mps)  # the last check of pairs before the step
@@ -220,11 +239,8 @@ def swinging(swing_deg: float) -> Callable[[int], Matrix4]:
     return moved((swing_deg, 0.0, 0.0, 0.0, 0.0, 0.0), lambda since_s: float(np.sin(np.pi * since_s + 0.9)))
 
 
-LOOSE = pytest.mark.parametrize(("swing_deg", "limit_s"), [(0.8, 60), (1.5, LIMIT_S)])
-
-
 @pytest.mark.fault("a loose mount that swings by 0.8° or 1.5°, which windows refuse", "not healthy after 60 s or 15 s")
-@LOOSE
+@pytest.mark.parametrize(("swing_deg", "limit_s"), [(0.8, 60), (1.5, LIMIT_S)])
 def test_a_loose_mount(tmp_path: Path, swing_deg: float, limit_s: int) -> None:
     bench = settled(tmp_path, swinging(swing_deg))
     bench.worker.window_fault = Reason("overlap", "The edges do not lie on each other.")
@@ -232,7 +248,7 @@ def test_a_loose_mount(tmp_path: Path, swing_deg: float, limit_s: int) -> None:
     assert max(moment.second for moment in moments if moment.health == "healthy") <= limit_s, changes(moments)
 
 
-@LOOSE
+@pytest.mark.parametrize(("swing_deg", "limit_s"), [pytest.param(0.8, 60, marks=pytest.mark.slow), (1.5, LIMIT_S)])
 def test_a_loose_mount_whose_windows_are_accepted(tmp_path: Path, swing_deg: float, limit_s: int) -> None:
     bench = settled(tmp_path, swinging(swing_deg))
     moments = driven(bench, range(240))
@@ -308,7 +324,7 @@ def test_a_right_mount_through_poor_stretches(tmp_path: Path) -> None:
     bench = settled(tmp_path)
     bench.worker.scatter = rng = np.random.default_rng(3)
     moments, second = [], 0
-    for number in range(6):
+    for number in range(4):
         poor, good = int(rng.integers(5, 60)), int(rng.integers(10, 90))
         bench.worker.cause = ("open_field", "dark")[number % 2]
         moments += driven(bench, range(second, second + poor))

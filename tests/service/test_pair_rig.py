@@ -209,16 +209,13 @@ def test_a_pair_that_suspects_nothing_has_its_window_as_soon_as_its_sensor_is_na
         update={"pairs": tuple(pair.model_copy(update={"window": window}) for pair in config.pairs)}
     )
     bench = RigBench(tmp_path / "one", config=config, dim="rear")
-    bench.drive(STEP_S - 45, STEP_S + 100)
+    bench.drive(STEP_S - 45, STEP_S + 60)
     correction = bench.reply.correction
     assert correction is not None
     assert set(correction.pairs) == set(CAMERAS)
     came_s = correction.stamp_ns / NS_PER_S - STEP_S
     record_property("figure", f"{came_s:.0f} s after the knock")
     assert came_s < 60.0
-    again = RigBench(tmp_path / "two", 1, config, dim="rear")
-    again.drive(STEP_S - 45, STEP_S + 100)
-    assert again.told() == bench.told()
 
 
 def test_where_people_decide_the_correction_waits_for_them(tmp_path: Path) -> None:

@@ -260,7 +260,7 @@ def assert_restarts(root: Path, safe: int) -> None:
     "a disk that refuses writes for a while",
     "no entry of the history is lost, and nothing is called tampered with",
 )
-@pytest.mark.parametrize("length", [1, 2, 4, 30])
+@pytest.mark.parametrize("length", [1, 4, *(pytest.param(length, marks=pytest.mark.slow) for length in (2, 30))])
 def test_a_disk_that_refuses_for_a_while_loses_nothing_and_is_no_tampering(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int
 ) -> None:

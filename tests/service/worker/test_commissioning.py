@@ -76,10 +76,11 @@ def slices(solver: Solver, street: Window, paths: list[Path], run: int = 1) -> I
 def test_a_baseline_learned_between_checks_is_the_one_learned_without_a_pause(
     solver: Solver, street: Window, paths: list[Path], tmp_path: Path
 ) -> None:
-    checked = pack_pairs(street.pairs[:5])
-    stages = []
+    checked = pack_pairs(street.pairs[:4])
+    stages: list[str] = []
     for told in slices(solver, street, paths):
-        solver.observe(street.rig.pair, CONFIG, street.T_camera_lidar_start.tolist(), checked)
+        if len(stages) % 5 == 0:
+            solver.observe(street.rig.pair, CONFIG, street.T_camera_lidar_start.tolist(), checked)
         if isinstance(told, Underway):
             stages.append(str(told))
     assert isinstance(told, Commissioned)
