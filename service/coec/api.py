@@ -1,7 +1,5 @@
 """The functions of `coec`: open a recording, calibrate it, and what other packages add."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from os import PathLike, fspath
 from typing import Any, Unpack

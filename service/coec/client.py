@@ -14,8 +14,6 @@
 Replies are the pydantic models of `coec.schemas.replies`, which CONTRACT and `schemas/v1` describe.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math
@@ -34,22 +32,10 @@ from pydantic import BaseModel
 
 from coec.config import Config, ZenohConfig
 from coec.errors import UsageError
+from coec.io.zenoh import query_client
 from coec.io.zenoh.bus import MSGPACK
 from coec.io.zenoh.command_auth import CommandSender
 from coec.io.zenoh.endpoints import credentials_in, read_settings
-from coec.io.zenoh.query_client import (
-    GRACE_S,
-    Replies,
-    Reply,
-    RouterAddress,
-    connected_by,
-    myself,
-    no_reply_error,
-    patience_ms,
-    send_authenticated,
-    single_key,
-    too_late,
-)
 from coec.io.zenoh.session import connected_of
 from coec.io.zenoh.subscriptions import PairUpdate, subscribed
 from coec.schemas.commands import COMMAND_NAMES, CommandName
@@ -99,13 +85,13 @@ class Vehicle:
         """
         fields = Config.model_fields
         self._keys = Keys(fields["prefix"].default if prefix is None else prefix, name)
-        single_key(self._keys.status)  # every other key is below it
+        query_client.single_key(self._keys.status)  # every other key is below it
         self._timeout_s = _seconds(timeout_s)
         file = None if settings is None else Path(settings)
         read = None if file is None else read_settings(file)
         given = (connect,) if isinstance(connect, str) else tuple(connect or ())
         endpoints = given or (() if read is None else connected_of(read)) or ZenohConfig().router
-        self._way = RouterAddress(tuple(endpoints), file)
+        self._way = query_client.RouterAddress(tuple(endpoints), file)
         self._credentials = None if read is None else credentials_in(read)
         self._connection: AbstractContextManager[zenoh.Session] | None = None
         self._open: zenoh.Session | None = None
@@ -123,7 +109,7 @@ class Vehicle:
         """
         if self._connection is not None:
             raise UsageError("the vehicle is already connected: create another Vehicle for a second connection")
-        connection = connected_by(self._way, self._timeout_s)
+        connection = query_client.connected_by(self._way, self._timeout_s)
         opening = asyncio.get_running_loop().run_in_executor(None, connection.__enter__)
         try:
             self._open = await asyncio.shield(opening)
@@ -221,17 +207,19 @@ class Vehicle:
             raise UsageError(f"no command {name!r}: known are {', '.join(COMMAND_NAMES)}")
         waits_s = self._timeout_s if timeout_s is None else _seconds(timeout_s)
         key = self._keys.command(await self._pair(pair), name)
-        selector = f"{single_key(key)}?timeout_ms={patience_ms(waits_s)};format=msgpack"
+        selector = f"{query_client.single_key(key)}?timeout_ms={query_client.patience_ms(waits_s)};format=msgpack"
         try:
             encoded = None if payload is None else json.dumps(dict(payload), allow_nan=False).encode()
         except (TypeError, ValueError) as error:
             raise UsageError(f"payload of {name}: {error}") from error
         if self._credentials is None:
-            return from_msgpack(Acknowledgement, (await self._query(selector, waits_s, encoded, myself())).payload)
+            return from_msgpack(
+                Acknowledgement, (await self._query(selector, waits_s, encoded, query_client.myself())).payload
+            )
         speaker = CommandSender(self._credentials, self._keys.vehicle)
         session = self._session
         reply = await asyncio.get_running_loop().run_in_executor(
-            None, lambda: send_authenticated(session, selector, encoded, waits_s, speaker, MSGPACK)
+            None, lambda: query_client.send_authenticated(session, selector, encoded, waits_s, speaker, MSGPACK)
         )
         return from_msgpack(Acknowledgement, reply.payload)
 
@@ -249,7 +237,7 @@ class Vehicle:
             UsageError: the name cannot be part of a key, or the vehicle is not connected.
         """
         if pair is not None:
-            single_key(pair)
+            query_client.single_key(pair)
         queue = _ChangeQueue(asyncio.get_running_loop())
         subscription = subscribed(
             self._session, self._keys, pair or "*", self._timeout_s, queue.push, queue.count_invalid
@@ -272,20 +260,20 @@ class Vehicle:
 
     async def _pair(self, pair: str | None) -> str:
         if pair is not None:
-            return single_key(pair)
+            return query_client.single_key(pair)
         names = await self.pairs()
         if len(names) != 1:
             raise UsageError(f"the vehicle serves {len(names)} pairs, name one: {', '.join(names)}")
         return names[0]
 
     async def _reply(self, model: type[M], selector: str, timeout_s: float | None) -> M:
-        single_key(selector.partition("?")[0])
+        query_client.single_key(selector.partition("?")[0])
         waits_s = self._timeout_s if timeout_s is None else _seconds(timeout_s)
         return from_msgpack(model, (await self._query(selector, waits_s)).payload)
 
     async def _query(
         self, selector: str, timeout_s: float, payload: bytes | None = None, attachment: bytes | None = None
-    ) -> Reply:
+    ) -> query_client.Reply:
         loop = asyncio.get_running_loop()
         finished = asyncio.Event()
 
@@ -293,18 +281,18 @@ class Vehicle:
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(finished.set)
 
-        replies = Replies(selector, timeout_s, on_finished)
+        replies = query_client.Replies(selector, timeout_s, on_finished)
         try:
             replies.query(self._session, payload, attachment)
-            async with asyncio.timeout(timeout_s + GRACE_S):
+            async with asyncio.timeout(timeout_s + query_client.GRACE_S):
                 await finished.wait()
         except TimeoutError:
-            raise too_late(selector, timeout_s) from None
+            raise query_client.too_late(selector, timeout_s) from None
         finally:
             replies.close()
         answers = replies.result()
         if not answers:
-            raise no_reply_error(selector)
+            raise query_client.no_reply_error(selector)
         return answers[0]
 
 

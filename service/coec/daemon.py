@@ -5,8 +5,6 @@ service never goes on with a part missing.
 If any thread dies, `health` says why and the process ends, so that the service never goes on with a part missing.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

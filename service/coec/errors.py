@@ -2,8 +2,6 @@
 statuses of all commands: what each means, and whether a service manager starts the service again.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from enum import IntEnum

@@ -4,8 +4,6 @@ A name in a group stands for an object, `module:function`, or for a module. The 
 user types, with a dot before that of a subcommand of a group of coec's own (`models.assess`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import metadata
 from typing import Any

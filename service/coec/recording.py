@@ -4,8 +4,6 @@ A `Recording` gives `Window`s; `solve` calibrates a window, and `Result` shows a
 calls `solve` too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Metadata of the laboratory's wheel that depend on the version: it needs exactly the coec of the same checkout."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from hatchling.metadata.plugin.interface import MetadataHookInterface

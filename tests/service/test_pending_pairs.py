@@ -139,7 +139,7 @@ def test_a_restart_has_what_was_found(stack: ExitStack, tmp_path: Path) -> None:
     assert PendingPairs(elsewhere, tmp_path).complete(elsewhere).pairs == (), "of other topics nothing is known"
 
 
-@pytest.mark.fault("the discovered calibration of a pair cannot be used", "it is awaited until something else is heard")
+@pytest.mark.fault("what was found of a pair cannot be used", "it is awaited until something else is heard")
 def test_a_pair_that_cannot_be_built_is_awaited_again(stack: ExitStack, tmp_path: Path) -> None:
     room, line, world = opened(stack, configured(tmp_path), tmp_path)
     line.put(*SAMPLES)

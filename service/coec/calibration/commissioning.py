@@ -9,8 +9,6 @@ blocks of time that were left out when the bias was learned: a limit from the sa
 where the rig has been. Moves are seeded, so the same windows give the same baseline.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -19,21 +17,7 @@ from math import degrees, inf, radians, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.baseline import (
-    FLOOR,
-    PRIOR_SPREAD_POSE,
-    PRIOR_SPREAD_ROTATION,
-    Accuracy,
-    Baseline,
-    MonitorLimits,
-    PaperLimits,
-    beyond,
-    chi2_quantile,
-    distance2_quantile,
-    learned_hash,
-    normal_quantile,
-    pixel_floor,
-)
+from coec.calibration import baseline
 from coec.calibration.monitor.check import Check, CheckInput, DepthCue, Expected, check_at, depth_cue, gather
 from coec.calibration.monitor.check_edges import POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, Opinion, edges_per_pair, opinion
@@ -223,7 +207,7 @@ def commission(
     reference: Matrix4 | None = None,
     false_alarm_rate: float = FALSE_ALARM_RATE,
     progress: Progress | None = None,
-) -> Baseline:
+) -> baseline.Baseline:
     """The baseline of the rig of `windows`.
 
     Args:
@@ -260,7 +244,7 @@ def commission_in_steps(
     reference: Matrix4 | None = None,
     false_alarm_rate: float = FALSE_ALARM_RATE,
     progress: Progress | None = None,
-) -> Steps[Baseline]:
+) -> Steps[baseline.Baseline]:
     """The same, with a pause after every step, so that whoever commissions can do other work in between. The longest
     step is one calibration of half of the pairs, or the preparation of the edges of all of them. `depth` should keep
     `MAX_PAIRS` maps, because every pair is used many times. `progress` receives what happens within a step.
@@ -295,7 +279,7 @@ def commission_in_steps(
     accuracy = rotation if config.search.dof == ROTATION_DOF else pose
     expected = se3.perturb(right, accuracy.expected)
     limits = yield from verdict_limits(whole, right, expected, depth, images, config)
-    return Baseline(
+    return baseline.Baseline(
         pair=rig.pair,
         T_camera_lidar=right,
         rotation=rotation,
@@ -313,18 +297,22 @@ def commission_in_steps(
         },
         sensors={**sensors, "camera_frame": rig.camera_frame, "lidar_frame": rig.lidar_frame},
         depth_identity=depth.identity,
-        config_hash=learned_hash(config),
+        config_hash=baseline.learned_hash(config),
     )
 
 
-def learn_accuracy(evidence: CheckInput, right: Matrix4) -> tuple[Accuracy, Accuracy]:
+def learn_accuracy(evidence: CheckInput, right: Matrix4) -> tuple[baseline.Accuracy, baseline.Accuracy]:
     """How checks over three and over six degrees of freedom lie about the right pose (4, 4)."""
     return run_to_end(_accuracies(evidence, right), Silence())
 
 
 def learn_limits(
-    evidence: CheckInput, right: Matrix4, config: CalibrationConfig, accuracies: tuple[Accuracy, Accuracy], rate: float
-) -> MonitorLimits:
+    evidence: CheckInput,
+    right: Matrix4,
+    config: CalibrationConfig,
+    accuracies: tuple[baseline.Accuracy, baseline.Accuracy],
+    rate: float,
+) -> baseline.MonitorLimits:
     """The limits of checks for a false-alarm rate."""
     rotation, pose = accuracies
     checks = _Checks(evidence, right, config, Expected(rotation.expected, pose.expected))
@@ -356,7 +344,7 @@ def _merged(windows: Sequence[Window]) -> Window:
     return replace(windows[0], pairs=tuple(pairs))
 
 
-def _accuracies(evidence: CheckInput, right: Matrix4) -> Steps[tuple[Accuracy, Accuracy]]:
+def _accuracies(evidence: CheckInput, right: Matrix4) -> Steps[tuple[baseline.Accuracy, baseline.Accuracy]]:
     """The accuracies over three and six degrees of freedom: the bias from all pairs, the spread of one pair from checks
     of halves of them."""
     count = len(evidence.pairs)
@@ -372,10 +360,12 @@ def _accuracies(evidence: CheckInput, right: Matrix4) -> Steps[tuple[Accuracy, A
     share = np.array([1.0 / len(half) - 1.0 / count for half in halves])
     not_searched = np.array([0.0] * 3 + [np.nan] * 3)
     # Near edges determine translations, and a pixel matters little there: their floor is the same on every rig.
-    pixels = np.where(np.arange(6) < ROTATION_DOF, pixel_floor(evidence.rig.camera), 0.0)
+    pixels = np.where(np.arange(6) < ROTATION_DOF, baseline.pixel_floor(evidence.rig.camera), 0.0)
     return (
-        _accuracy(whole.offset_rotation + not_searched, at_rotation, share, PRIOR_SPREAD_ROTATION, count, pixels),
-        _accuracy(whole.offset_pose, at_pose, share, PRIOR_SPREAD_POSE, count, pixels),
+        _accuracy(
+            whole.offset_rotation + not_searched, at_rotation, share, baseline.PRIOR_SPREAD_ROTATION, count, pixels
+        ),
+        _accuracy(whole.offset_pose, at_pose, share, baseline.PRIOR_SPREAD_POSE, count, pixels),
     )
 
 
@@ -405,7 +395,7 @@ def _accuracy(
     prior: NDArray[np.float64],
     count: int,
     pixels: NDArray[np.float64],
-) -> Accuracy:
+) -> baseline.Accuracy:
     """The accuracy from a check of all pairs (6,), checks of halves of them (H, 6), and the spread on other rigs
     `prior`.
 
@@ -416,13 +406,13 @@ def _accuracy(
     known_by = _known_by(count)
     deviation = np.abs(of_halves - whole)
     # A single check that ended in another basin must not make the spread of the rig look huge.
-    deviation = np.minimum(deviation, OUTLIER * np.median(deviation, axis=0) + FLOOR)
+    deviation = np.minimum(deviation, OUTLIER * np.median(deviation, axis=0) + baseline.FLOOR)
     variance = (deviation**2 / share[:, None]).mean(axis=0)
     spread = np.sqrt((PRIOR_BLOCKS * prior**2 + (known_by - PRIOR_BLOCKS) * variance) / known_by)
-    return Accuracy(bias=whole, bias_sigma=np.sqrt(spread**2 / count + pixels**2), spread=spread)
+    return baseline.Accuracy(bias=whole, bias_sigma=np.sqrt(spread**2 / count + pixels**2), spread=spread)
 
 
-def _check(rotation: Accuracy) -> None:
+def _check(rotation: baseline.Accuracy) -> None:
     if float(np.max(np.abs(rotation.bias[:3]))) > MAX_BIAS_RAD:
         turned = ", ".join(f"{value:+.2f}" for value in np.degrees(rotation.bias[:3]))
         raise CalibrationError(
@@ -479,7 +469,9 @@ class _Checks:
             yield Step(name, number, count)
         return seen
 
-    def left_out(self, rotation: Accuracy, pose: Accuracy, name: str, count: int) -> Steps[list[_LeftOut]]:
+    def left_out(
+        self, rotation: baseline.Accuracy, pose: baseline.Accuracy, name: str, count: int
+    ) -> Steps[list[_LeftOut]]:
         """`count` checks at the right pose, equally many in every block of time, compared with the bias that the other
         blocks show. With too few pairs for that, the checks include pairs from which the bias was learned."""
         pairs = len(self._evidence.pairs)
@@ -503,7 +495,7 @@ class _Checks:
                 yield Step(name, len(results), count)
         return results
 
-    def _against(self, part: CheckInput, seen: Check, rotation: Accuracy, pose: Accuracy) -> _LeftOut:
+    def _against(self, part: CheckInput, seen: Check, rotation: baseline.Accuracy, pose: baseline.Accuracy) -> _LeftOut:
         return _LeftOut(
             seen,
             depth_cue(part, seen, self._right, self._config),
@@ -516,25 +508,27 @@ def _monitor_limits(
     left_out: Sequence[_LeftOut],
     moved: dict[str, list[Check]],
     far: Sequence[Check],
-    rotation: Accuracy,
-    pose: Accuracy,
+    rotation: baseline.Accuracy,
+    pose: baseline.Accuracy,
     rate: float,
     known_by: int,
-) -> MonitorLimits:
+) -> baseline.MonitorLimits:
     clean = [one.seen for one in left_out]
-    right_rotation = distance2_quantile(1.0 - rate / 2.0, ROTATION_DOF, known_by) * _times(
-        [one.distance2_rotation for one in left_out], chi2_quantile(0.5, ROTATION_DOF)
+    right_rotation = baseline.distance2_quantile(1.0 - rate / 2.0, ROTATION_DOF, known_by) * _times(
+        [one.distance2_rotation for one in left_out], baseline.chi2_quantile(0.5, ROTATION_DOF)
     )
-    right_pose = distance2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1, known_by) * _times(
-        [one.farthest2_pose for one in left_out], chi2_quantile(0.5 ** (1.0 / POSE_DOF), 1)
+    right_pose = baseline.distance2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1, known_by) * _times(
+        [one.farthest2_pose for one in left_out], baseline.chi2_quantile(0.5 ** (1.0 / POSE_DOF), 1)
     )
     turned = [rotation.distance2(seen.offset_rotation, seen.pairs) for seen in moved["0.5 deg"]]
     shifted = [pose.farthest2(seen.offset_pose, seen.pairs) for seen in moved["10 cm"]]
     edges = float(np.min([edges_per_pair(seen) for seen in clean]))
     lost = float(np.median([edges_per_pair(seen) for seen in far]))
-    of_paper = PaperLimits.learned([one.depth for one in left_out], rate)
-    agreement = beyond([one.depth.agreement_rad for one in left_out], normal_quantile(1.0 - rate / 3.0))
-    return MonitorLimits(
+    of_paper = baseline.PaperLimits.learned([one.depth for one in left_out], rate)
+    agreement = baseline.beyond(
+        [one.depth.agreement_rad for one in left_out], baseline.normal_quantile(1.0 - rate / 3.0)
+    )
+    return baseline.MonitorLimits(
         max_distance2_rotation=_between(right_rotation, min(turned)),
         max_farthest2_pose=_between(right_pose, min(shifted)),
         min_edges_per_pair=min(sqrt(edges * max(lost, LAYOUT_SHARE * edges)), POOREST_SHARE * edges),

@@ -3,8 +3,6 @@
 Verdicts word their reasons from this one table, and reports explain the figures with it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """From a window to an estimate: the pipeline of the paper on one page (Borer et al. 2023, METHOD section 1)."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

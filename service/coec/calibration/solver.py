@@ -2,8 +2,6 @@
 read. One line in `ESTIMATORS` adds another.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log1p, nan, radians
@@ -15,17 +13,9 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
+from coec.calibration.objective import mutual_information
 from coec.calibration.objective.edges import EdgeCue, build_edges, independent_samples_at
 from coec.calibration.objective.fused import Fusion
-from coec.calibration.objective.mutual_information import (
-    Divisible,
-    Features,
-    MutualInformation,
-    SearchBox,
-    build_mutual_information,
-    distance_and_depth,
-    distances,
-)
 from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins
 from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
 from coec.calibration.types import (
@@ -117,10 +107,10 @@ TELLING = 2.0
 """More points are spent on the depth witness only if it stands out by at least this many standard deviations. Below
 that its peak may be chance, and more points would not change that."""
 
-SETTLING = SearchBox(radians(8.0), 0.5)
+SETTLING = mutual_information.SearchBox(radians(8.0), 0.5)
 """How far from a settled pose these points are used at most: for its summits, and to measure how wide its hill is."""
 
-DISPLACED = SearchBox(SETTLING.rotation_rad + radians(2.0), SETTLING.translation_m + 3.0)
+DISPLACED = mutual_information.SearchBox(SETTLING.rotation_rad + radians(2.0), SETTLING.translation_m + 3.0)
 """The same for points before motion compensation: in half a sweep, 40 m/s and 40°/s displace them by the difference."""
 
 SAME_BASIN_RAD = radians(1.5)
@@ -209,7 +199,7 @@ def _masked(data: WindowData) -> WindowData:
 class Rivals:
     """Poses under one objective: the best (4, 4), and `others` (4, 4) that might be the true one."""
 
-    objective: Divisible
+    objective: mutual_information.Divisible
     best: Matrix4
     others: tuple[Matrix4, ...]
 
@@ -226,7 +216,7 @@ class EstimatorResult:
         edges: the edges of the window; None if it used none.
     """
 
-    objective: Divisible
+    objective: mutual_information.Divisible
     search: SearchResult
     metrics: tuple[Metric, ...]
     rivals: tuple[Rivals, ...] = ()
@@ -254,7 +244,7 @@ def by_intensity(data: WindowData, config: CalibrationConfig) -> EstimatorResult
         pixels = grey.astype(np.float32)
         while pixels.shape[1] > MAX_GREY_WIDTH_PX:
             pixels = halved(pixels)
-        frames.append(Features(data.points(index), pair.lidar.intensity, pixels))
+        frames.append(mutual_information.Features(data.points(index), pair.lidar.intensity, pixels))
     return _by_mutual_information(frames, data, config)
 
 
@@ -262,11 +252,13 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     """Edges and depth: finds every basin of the edge cue within reach, ranks them by both cues, polishes the best on
     both, chooses one by its posterior, and settles its summit on the sharpest edges."""
     window, start = data.window, data.window.T_camera_lidar_start
-    reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
+    reach = mutual_information.SearchBox(
+        radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0
+    )
     # Edges first: depth may be inferred meanwhile.
     edges = build_edges(window.pairs, data.points, data.greys(), window.rig)
     features = depth_features(data, start, LEADING_DEPTH_POINTS)
-    depth = build_mutual_information(features, window.rig, start, reach, config.objective)
+    depth = mutual_information.build_mutual_information(features, window.rig, start, reach, config.objective)
     basins = find_basins(edges, start, reach)
     data.progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
@@ -334,7 +326,9 @@ def rank_basins(fusion: Fusion, basins: Sequence[Matrix4]) -> RankedBasins:
     least = PLAUSIBLE * max((basin.rank for basin in ranked), default=0.0)
     plausible = tuple(basin.T_camera_lidar for basin in ranked[:POLISHED_BASINS] if basin.rank >= least)
     implausible = tuple(basin.T_camera_lidar for basin in ranked[len(plausible) :])
-    of_start = basin_next_to(fusion.edges, fusion.start, SearchBox(NEIGHBOURHOOD_RAD, fusion.reach.translation_m))
+    of_start = basin_next_to(
+        fusion.edges, fusion.start, mutual_information.SearchBox(NEIGHBOURHOOD_RAD, fusion.reach.translation_m)
+    )
     if fusion.rank(of_start) >= least:
         return RankedBasins(plausible, implausible, start_is_plausible=True)
     return RankedBasins(plausible, (*implausible, of_start), start_is_plausible=False)
@@ -476,7 +470,9 @@ def solve(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     return ESTIMATORS[config.objective.kind](data, config)
 
 
-def depth_features(data: WindowData, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:
+def depth_features(
+    data: WindowData, T_camera_lidar: Matrix4, at_most: int | None = None
+) -> list[mutual_information.Features]:
     """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4). Every sweep gives the
     same share of its points, so that about `at_most` are used in all.
 
@@ -486,7 +482,9 @@ def depth_features(data: WindowData, T_camera_lidar: Matrix4, at_most: int | Non
     counts = [len(pair.lidar.xyz_m) for pair in data.window.pairs]
     share = 1.0 if at_most is None else min(1.0, at_most / max(sum(counts), 1))
     return [
-        distance_and_depth(data.points(index, _share_of(counts[index], share)), depth, T_camera_lidar)
+        mutual_information.distance_and_depth(
+            data.points(index, _share_of(counts[index], share)), depth, T_camera_lidar
+        )
         for index, depth in enumerate(data.depths())
     ]
 
@@ -499,7 +497,9 @@ def _number(count: int, share: float) -> int:
     return count if share >= 1.0 else round(share * count)
 
 
-def _denser(data: WindowData, depth: MutualInformation, pose: Matrix4, config: CalibrationConfig) -> MutualInformation:
+def _denser(
+    data: WindowData, depth: mutual_information.MutualInformation, pose: Matrix4, config: CalibrationConfig
+) -> mutual_information.MutualInformation:
     """The depth witness with about `SEEN_DEPTH_POINTS` in view at `pose` (4, 4); unchanged if at least half as many are
     in view there already. At least one point must be in view there."""
     seen = depth.evaluate(pose).points_in_view
@@ -512,13 +512,15 @@ def _denser(data: WindowData, depth: MutualInformation, pose: Matrix4, config: C
         indices = thinned(count, _number(count, share))
         times.append(len(indices) / max(led, 1))
         indices = indices[depth.may_see(data.window.pairs[index].lidar.xyz_m[indices], pose, DISPLACED)]
-        points.append(distances(data.points(index, indices), pose))
+        points.append(mutual_information.distances(data.points(index, indices), pose))
     return depth.with_points(points, np.array(times), pose, SETTLING, config.objective)
 
 
-def _by_mutual_information(frames: list[Features], data: WindowData, config: CalibrationConfig) -> EstimatorResult:
+def _by_mutual_information(
+    frames: list[mutual_information.Features], data: WindowData, config: CalibrationConfig
+) -> EstimatorResult:
     start, progress = data.window.T_camera_lidar_start, data.progress
-    objective: MutualInformation = build_mutual_information(
+    objective: mutual_information.MutualInformation = mutual_information.build_mutual_information(
         frames, data.window.rig, start, box_of(config.search), config.objective
     )
     search = maximise(objective, start, config.search, progress)

@@ -5,8 +5,6 @@ extrinsic that a person holds does not move. Each function returns the whole nex
 survives a restart.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import degrees, fsum, sqrt

@@ -7,8 +7,6 @@ Each figure compares the window with itself. So one set of limits serves any sce
 rig is commissioned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import degrees, isfinite, radians
@@ -35,14 +33,8 @@ from coec.calibration.types import (
     Verdict,
     Window,
 )
+from coec.calibration.uncertainty import nuisance_parameters
 from coec.calibration.uncertainty.covariance import AssessedOptimum
-from coec.calibration.uncertainty.nuisance_parameters import (
-    CLOCKS_FREE,
-    HELD_FREE,
-    LENS,
-    LENS_FREE,
-    RelaxedAssumption,
-)
 from coec.config import VerdictConfig
 from coec.geometry import se3
 
@@ -60,7 +52,10 @@ SAME_SCENE = 0.5
 """A window saw one scene if its independent samples are fewer than this share of its frames. See docs/measured.md."""
 
 
-_CONTRADICTED = {HELD_FREE: "with the held centre", CLOCKS_FREE: "with the clocks"}
+_CONTRADICTED = {
+    nuisance_parameters.HELD_FREE: "with the held centre",
+    nuisance_parameters.CLOCKS_FREE: "with the clocks",
+}
 """With what a window disagrees if relaxing this assumption turns the camera."""
 
 
@@ -123,7 +118,9 @@ def repetition_metric(
     return (Metric("edges_once", independent_samples.significance, limits.min_edges_once, at_least=True),)
 
 
-def intrinsics_metric(relaxed: Sequence[RelaxedAssumption], limits: VerdictConfig) -> tuple[Metric, ...]:
+def intrinsics_metric(
+    relaxed: Sequence[nuisance_parameters.RelaxedAssumption], limits: VerdictConfig
+) -> tuple[Metric, ...]:
     """How certainly another lens explains the window better than that of the rig; empty if none was tried. A lens that
     hardly moves the edges (`RelaxedAssumption.matters`) counts as 0."""
     return tuple(
@@ -134,7 +131,7 @@ def intrinsics_metric(relaxed: Sequence[RelaxedAssumption], limits: VerdictConfi
             at_least=False,
         )
         for one in relaxed
-        if one.name == LENS_FREE
+        if one.name == nuisance_parameters.LENS_FREE
     )
 
 
@@ -158,7 +155,7 @@ def optimum_metrics(
 
 
 def reason_details(
-    relaxed: Sequence[RelaxedAssumption], moved: MovedWithin | None, window: Window
+    relaxed: Sequence[nuisance_parameters.RelaxedAssumption], moved: MovedWithin | None, window: Window
 ) -> Mapping[str, str]:
     """By the name of a metric, what its failure means in this window."""
     return {
@@ -168,7 +165,7 @@ def reason_details(
     }
 
 
-def _contradictions_text(relaxed: Sequence[RelaxedAssumption]) -> str:
+def _contradictions_text(relaxed: Sequence[nuisance_parameters.RelaxedAssumption]) -> str:
     """Which assumptions the window contradicts, and by how much the camera turns without each."""
     turns = [
         f"{_CONTRADICTED[one.name]} set free, it turns by {degrees(float(np.linalg.norm(one.shift[:3]))):.1f}°"
@@ -178,8 +175,8 @@ def _contradictions_text(relaxed: Sequence[RelaxedAssumption]) -> str:
     return f" ({'; '.join(turns)})" if turns else ""
 
 
-def _lens_text(relaxed: Sequence[RelaxedAssumption], window: Window) -> str:
-    lens = [one.deviation[LENS] for one in relaxed if one.name == LENS_FREE]
+def _lens_text(relaxed: Sequence[nuisance_parameters.RelaxedAssumption], window: Window) -> str:
+    lens = [one.deviation[nuisance_parameters.LENS] for one in relaxed if one.name == nuisance_parameters.LENS_FREE]
     if not lens:
         return ""
     (right, down, longer), camera = lens[0].tolist(), window.rig.camera

@@ -1,7 +1,5 @@
 """`coec models`: lists the known depth networks, and copies their files to where services load them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`coec replay`: computes the recorded decision again, from the file alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """`coec router`: runs the Zenoh router of a vehicle, in the version that the service uses."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """What every model of the configuration is built from: names, paths, matrices, and the base of all models."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -2,22 +2,13 @@
 of its calibration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, field_validator, model_validator
 
+from coec.config import stages
 from coec.config.model import IDENTITY, ConfigModel, FilePath, KeyExpression, Matrix4x4, Name
-from coec.config.stages import (
-    CalibrationConfig,
-    MonitorConfig,
-    PairingConfig,
-    PolicyConfig,
-    TrackerConfig,
-    WindowConfig,
-)
 
 ROS_NAMES = {
     "plumb_bob": "radtan",
@@ -288,12 +279,12 @@ class OpenPairConfig(ConfigModel):
     lidar: OpenLidarConfig
     ego: OpenEgoConfig | None = None
     T_camera_lidar: Matrix4x4 | None = Field(default=None, description="workshop calibration: LiDAR to camera")
-    pairing: PairingConfig = PairingConfig()
-    window: WindowConfig = WindowConfig()
-    calibration: CalibrationConfig = CalibrationConfig()
-    monitor: MonitorConfig = MonitorConfig()
-    policy: PolicyConfig = PolicyConfig()
-    tracker: TrackerConfig = TrackerConfig()
+    pairing: stages.PairingConfig = stages.PairingConfig()
+    window: stages.WindowConfig = stages.WindowConfig()
+    calibration: stages.CalibrationConfig = stages.CalibrationConfig()
+    monitor: stages.MonitorConfig = stages.MonitorConfig()
+    policy: stages.PolicyConfig = stages.PolicyConfig()
+    tracker: stages.TrackerConfig = stages.TrackerConfig()
 
     @property
     def streams(self) -> Mapping[str, AnyStreamConfig]:

@@ -4,8 +4,6 @@ Other modules import it inside the functions that read a pose, not at their top,
 a rig does not import NumPy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

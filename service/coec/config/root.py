@@ -14,23 +14,10 @@ from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+from coec.config import service
 from coec.config.model import ConfigModel, KeyExpression, Name, describe
 from coec.config.pair import OpenPairConfig, PairConfig
 from coec.config.rig import MAX_LINKS, MAX_SENSORS, LinkConfig, expand_rig, is_rig
-from coec.config.service import (
-    AuthorityConfig,
-    BudgetConfig,
-    LidarEdgesConfig,
-    LimitsConfig,
-    LogConfig,
-    MetricsConfig,
-    RosConfig,
-    SnippetsConfig,
-    StateConfig,
-    UplinkConfig,
-    WorkerConfig,
-    ZenohConfig,
-)
 from coec.errors import ConfigError, cannot_read
 from coec.schemas.keys import LAST, RIG, ros_name
 
@@ -42,25 +29,25 @@ class Config(ConfigModel):
 
     vehicle: Name = Field(default="vehicle", description="name of the vehicle, unique, part of every key")
     prefix: KeyExpression = Field(default="coec", description="beginning of all keys")
-    zenoh: ZenohConfig = ZenohConfig()
+    zenoh: service.ZenohConfig = service.ZenohConfig()
     middleware: Literal["native", "rmw_zenoh", "ros2dds"] = Field(
         default="native",
         description="what frames come on: native Zenoh keys, topics of ROS 2 nodes (rmw_zenoh) or a bridge (ros2dds)",
     )
-    ros: RosConfig = RosConfig()
-    authority: AuthorityConfig = AuthorityConfig()
-    state: StateConfig = StateConfig()
-    snippets: SnippetsConfig = SnippetsConfig()
-    worker: WorkerConfig = WorkerConfig()
-    budget: BudgetConfig = BudgetConfig()
-    lidar_edges: LidarEdgesConfig = LidarEdgesConfig()
-    limits: LimitsConfig = LimitsConfig()
+    ros: service.RosConfig = service.RosConfig()
+    authority: service.AuthorityConfig = service.AuthorityConfig()
+    state: service.StateConfig = service.StateConfig()
+    snippets: service.SnippetsConfig = service.SnippetsConfig()
+    worker: service.WorkerConfig = service.WorkerConfig()
+    budget: service.BudgetConfig = service.BudgetConfig()
+    lidar_edges: service.LidarEdgesConfig = service.LidarEdgesConfig()
+    limits: service.LimitsConfig = service.LimitsConfig()
     stale_after_s: float = Field(
         default=600.0, gt=0, description="age of the last completed check at which a pair is called stale, s"
     )
-    log: LogConfig = LogConfig()
-    metrics: MetricsConfig = MetricsConfig()
-    uplink: UplinkConfig = UplinkConfig()
+    log: service.LogConfig = service.LogConfig()
+    metrics: service.MetricsConfig = service.MetricsConfig()
+    uplink: service.UplinkConfig = service.UplinkConfig()
     pairs: tuple[PairConfig, ...] = Field(
         default=(), max_length=MAX_PAIRS, description="what is calibrated; each pair is a camera and a LiDAR"
     )

@@ -7,8 +7,6 @@ A finished row is on the disk before the next one is awaited. So a batch that is
 loses its power, loses only the windows under way. Rows wait in a journal until there are enough for a file of a table.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time

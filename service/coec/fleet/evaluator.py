@@ -3,8 +3,6 @@ evaluator, which works on one window at a time in a process of its own: a job in
 window.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

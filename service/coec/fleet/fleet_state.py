@@ -5,8 +5,6 @@ are counted by the watcher's own clock where possible. If a word was heard as it
 a word that was kept elsewhere, only its vehicle's clock is available.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The engine of this machine: a pool of processes, each on a core of its own."""
 
-from __future__ import annotations
-
 import multiprocessing
 import signal
 import threading
@@ -10,20 +8,9 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import cast
 
+from coec.fleet import worker_pool
 from coec.fleet.evaluator import ReplaySettings, WindowEvaluator
 from coec.fleet.jobs import Job
-from coec.fleet.worker_pool import (
-    PROCESS_DIED,
-    TOO_LARGE,
-    WINDOWS_PER_WORKER,
-    PoolWorker,
-    WindowEvaluated,
-    WorkerEvent,
-    WorkerLimits,
-    WorkerPool,
-    WorkerStarted,
-    WorkerStopped,
-)
 from coec.io.system import one_thread_each, resident_bytes
 from coec.schemas.fleet import WindowRow
 
@@ -51,7 +38,7 @@ class _Process:
         with suppress(OSError):  # the process has ended, which `received` will report
             self.link.send(job)
 
-    def received(self) -> WorkerEvent:
+    def received(self) -> worker_pool.WorkerEvent:
         """What has come through the pipe."""
         try:
             message = self.link.recv()
@@ -59,14 +46,18 @@ class _Process:
             self._process.join(STOP_TIMEOUT_S)
             status = self._process.exitcode
             if not self.ready:
-                return WorkerStopped(
-                    self, PROCESS_DIED, f"a process for judging windows ended at its start, with status {status}"
+                return worker_pool.WorkerStopped(
+                    self,
+                    worker_pool.PROCESS_DIED,
+                    f"a process for judging windows ended at its start, with status {status}",
                 )
-            return WorkerStopped(self, PROCESS_DIED, f"the process that judged it ended with status {status}")
+            return worker_pool.WorkerStopped(
+                self, worker_pool.PROCESS_DIED, f"the process that judged it ended with status {status}"
+            )
         if message == READY:
             self.ready = True
-            return WorkerStarted(self)
-        return WindowEvaluated(self, WindowRow.model_validate_json(message))
+            return worker_pool.WorkerStarted(self)
+        return worker_pool.WindowEvaluated(self, WindowRow.model_validate_json(message))
 
     @property
     def resident_bytes(self) -> int:
@@ -83,22 +74,22 @@ class _Process:
 class _Processes:
     """Starts processes on this machine, and bounds their memory."""
 
-    def __init__(self, settings: str, bounds: WorkerLimits) -> None:
+    def __init__(self, settings: str, bounds: worker_pool.WorkerLimits) -> None:
         self._settings = settings
         self._bounds = bounds
 
-    def start(self) -> PoolWorker:
+    def start(self) -> worker_pool.PoolWorker:
         """See `Workers`."""
         return _Process(self._settings)
 
-    def events(self, workers: Sequence[PoolWorker], timeout_s: float) -> Iterator[WorkerEvent]:
+    def events(self, workers: Sequence[worker_pool.PoolWorker], timeout_s: float) -> Iterator[worker_pool.WorkerEvent]:
         """See `Workers`."""
         processes = cast("Sequence[_Process]", workers)
         for process in processes:
             held = process.resident_bytes if process.ready else 0
             if held > self._bounds.bytes:
                 text = f"its process held {held >> 20} MiB, of {self._bounds.bytes >> 20} (--memory)"
-                yield WorkerStopped(process, TOO_LARGE, text)
+                yield worker_pool.WorkerStopped(process, worker_pool.TOO_LARGE, text)
         by_link = {process.link: process for process in processes if not process.link.closed}
         for link in wait(list(by_link), timeout_s):
             yield by_link[cast("Connection", link)].received()
@@ -108,13 +99,15 @@ class LocalEngine:
     """Runs a process on each core. A window that ends its process, or takes too long or too much memory, gets a row
     with that error; the others go on."""
 
-    def __init__(self, cores: int, bounds: WorkerLimits) -> None:
+    def __init__(self, cores: int, bounds: worker_pool.WorkerLimits) -> None:
         self.cores = cores
         self._bounds = bounds
 
     def rows(self, jobs: Sequence[Job], settings: ReplaySettings) -> Iterator[WindowRow]:
         """See `Engine`."""
-        yield from WorkerPool(_Processes(settings.model_dump_json(), self._bounds), self._bounds).rows(jobs, self.cores)
+        yield from worker_pool.WorkerPool(_Processes(settings.model_dump_json(), self._bounds), self._bounds).rows(
+            jobs, self.cores
+        )
 
     def close(self) -> None:
         """See `Engine`."""
@@ -139,7 +132,10 @@ def _worker_main(link: Connection, settings: str) -> None:
                 with send_lock:
                     link.send(row)
 
-    threads = [threading.Thread(target=evaluate_windows, name=f"judge-{index}") for index in range(WINDOWS_PER_WORKER)]
+    threads = [
+        threading.Thread(target=evaluate_windows, name=f"judge-{index}")
+        for index in range(worker_pool.WINDOWS_PER_WORKER)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -4,8 +4,6 @@ Each process is an actor on one core. It declares the memory that a window may t
 actors than it can hold.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import re
@@ -18,22 +16,9 @@ from typing import Any, cast
 
 from coec import __version__
 from coec.errors import SourceError
+from coec.fleet import worker_pool
 from coec.fleet.evaluator import ReplaySettings, WindowEvaluator
 from coec.fleet.jobs import Job, StoreCredentials, failed_row, is_path, stores_of
-from coec.fleet.worker_pool import (
-    NODE_LOST,
-    NOT_ON_NODE,
-    PROCESS_DIED,
-    WINDOWS_PER_WORKER,
-    FleetError,
-    PoolWorker,
-    WindowEvaluated,
-    WorkerEvent,
-    WorkerLimits,
-    WorkerPool,
-    WorkerStarted,
-    WorkerStopped,
-)
 from coec.io.system import ONE_THREAD
 from coec.schemas.fleet import WindowRow
 
@@ -109,21 +94,23 @@ class _Actor:
 class _Actors:
     """Starts actors on the cluster, and reports what happens to them."""
 
-    def __init__(self, ray: Any, settings: str, credentials: StoreCredentials, bounds: WorkerLimits) -> None:
+    def __init__(
+        self, ray: Any, settings: str, credentials: StoreCredentials, bounds: worker_pool.WorkerLimits
+    ) -> None:
         self._ray = ray
         self._arguments = (settings, credentials)
         self._options = {
             "num_cpus": 1,
             "memory": bounds.bytes,
-            "max_concurrency": WINDOWS_PER_WORKER + 1,  # one more for pings
+            "max_concurrency": worker_pool.WINDOWS_PER_WORKER + 1,  # one more for pings
             "runtime_env": {"env_vars": dict(ONE_THREAD)},
         }
 
-    def start(self) -> PoolWorker:
+    def start(self) -> worker_pool.PoolWorker:
         """See `Workers`."""
         return _Actor(self._ray.remote(_Judge).options(**self._options).remote(*self._arguments), self._ray)
 
-    def events(self, workers: Sequence[PoolWorker], timeout_s: float) -> Iterator[WorkerEvent]:
+    def events(self, workers: Sequence[worker_pool.PoolWorker], timeout_s: float) -> Iterator[worker_pool.WorkerEvent]:
         """See `Workers`."""
         actors = cast("Sequence[_Actor]", workers)
         pending = [one for actor in actors for one in actor.pending]
@@ -135,7 +122,7 @@ class _Actors:
         for actor in actors:
             yield from self._received(actor, set(done))
 
-    def _received(self, actor: _Actor, done: set[Any]) -> Iterator[WorkerEvent]:
+    def _received(self, actor: _Actor, done: set[Any]) -> Iterator[worker_pool.WorkerEvent]:
         """What an actor has answered, and whether it still does."""
         now_s = time.monotonic()
         try:
@@ -144,13 +131,13 @@ class _Actors:
                 actor.alive_s = now_s
                 event = self._started(actor, *answer)
                 yield event
-                if isinstance(event, WorkerStopped):
+                if isinstance(event, worker_pool.WorkerStopped):
                     return
             for row in [row for row in actor.rows if row in done]:
                 document = self._ray.get(row, timeout=GET_S)
                 actor.rows.remove(row)
                 actor.alive_s = now_s
-                yield WindowEvaluated(actor, _with_missing_file(WindowRow.model_validate_json(document)))
+                yield worker_pool.WindowEvaluated(actor, _with_missing_file(WindowRow.model_validate_json(document)))
             if actor.ping in done:
                 self._ray.get(actor.ping, timeout=GET_S)
                 actor.ping, actor.alive_s = None, now_s
@@ -160,28 +147,32 @@ class _Actors:
         if actor.versions is not None:
             return
         if now_s - actor.alive_s > SILENCE_S:
-            yield WorkerStopped(
-                actor, NODE_LOST, f"the node that had it has not answered for {SILENCE_S:g} s", blame=False
+            yield worker_pool.WorkerStopped(
+                actor, worker_pool.NODE_LOST, f"the node that had it has not answered for {SILENCE_S:g} s", blame=False
             )
         elif actor.ping is None and now_s - actor.pinged_s > PING_S:
             actor.ping, actor.pinged_s = actor.actor.ping.remote(), now_s
 
-    def _started(self, actor: _Actor, host: str, version: str) -> WorkerEvent:
+    def _started(self, actor: _Actor, host: str, version: str) -> worker_pool.WorkerEvent:
         if version == __version__:
-            return WorkerStarted(actor)
+            return worker_pool.WorkerStarted(actor)
         text = f"the node {host} has coec {version}, but this machine {__version__}"
-        return WorkerStopped(actor, PROCESS_DIED, _unusable_cluster(text))
+        return worker_pool.WorkerStopped(actor, worker_pool.PROCESS_DIED, _unusable_cluster(text))
 
-    def _stopped(self, actor: _Actor, error: Exception) -> WorkerEvent:
+    def _stopped(self, actor: _Actor, error: Exception) -> worker_pool.WorkerEvent:
         """Why an actor does not answer any more: its process ended, or its node was lost."""
         text = _COLOUR.sub("", str(error)).strip()
         if isinstance(error, (self._ray.exceptions.ActorUnavailableError, self._ray.exceptions.GetTimeoutError)) or (
             NODE_DIED in text
         ):
-            return WorkerStopped(actor, NODE_LOST, "the node that had it was lost", blame=False)
+            return worker_pool.WorkerStopped(actor, worker_pool.NODE_LOST, "the node that had it was lost", blame=False)
         if actor.versions is not None:
-            return WorkerStopped(actor, PROCESS_DIED, _unusable_cluster(text.rpartition("\n")[2].strip()))
-        return WorkerStopped(actor, PROCESS_DIED, f"the process that judged it ended: {type(error).__name__}")
+            return worker_pool.WorkerStopped(
+                actor, worker_pool.PROCESS_DIED, _unusable_cluster(text.rpartition("\n")[2].strip())
+            )
+        return worker_pool.WorkerStopped(
+            actor, worker_pool.PROCESS_DIED, f"the process that judged it ended: {type(error).__name__}"
+        )
 
 
 def _unusable_cluster(text: str) -> str:
@@ -195,7 +186,9 @@ def _with_missing_file(row: WindowRow) -> WindowRow:
     """The row of a window; if the node lacks a file that this machine has, the row says so."""
     if row.error is None or row.sha256 is not None or not is_path(row.url) or not Path(row.url).is_file():
         return row
-    return failed_row(row, NOT_ON_NODE, f"a node of the cluster cannot read {row.url}, which exists on this machine")
+    return failed_row(
+        row, worker_pool.NOT_ON_NODE, f"a node of the cluster cannot read {row.url}, which exists on this machine"
+    )
 
 
 def _probe(address: str) -> None:
@@ -216,7 +209,12 @@ class RayEngine:
     """Judges windows on a Ray cluster."""
 
     def __init__(
-        self, cores: int | None, bounds: WorkerLimits, address: str | None = None, *, send_credentials: bool = True
+        self,
+        cores: int | None,
+        bounds: worker_pool.WorkerLimits,
+        address: str | None = None,
+        *,
+        send_credentials: bool = True,
     ) -> None:
         """Connects to a cluster.
 
@@ -248,14 +246,14 @@ class RayEngine:
             )
             nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         except Exception as error:  # of Ray, of the system, or of a library in between
-            raise FleetError(
+            raise worker_pool.FleetError(
                 f"no Ray cluster at {address}: {_COLOUR.sub('', str(error)).strip()}",
                 f"{ADDRESS}=HOST:6379 or --ray-address names one that runs (`ray start --head` starts it); "
                 "--ray-address local starts one on this machine for this batch; --engine local needs none",
             ) from error
         available = sum(int(min(node.get("CPU", 0.0), node.get("memory", 0.0) // bounds.bytes)) for node in nodes)
         if available == 0:
-            raise FleetError(
+            raise worker_pool.FleetError(
                 f"no node of the Ray cluster at {address} has a core and {bounds.bytes >> 20} MiB for a process "
                 "(--memory)"
             )
@@ -270,7 +268,7 @@ class RayEngine:
         stores = stores_of(jobs) if self._send_credentials else ()
         credentials = StoreCredentials.from_environment(stores, os.environ)
         actors = _Actors(self._ray, settings.model_dump_json(), credentials, self._bounds)
-        yield from WorkerPool(actors, self._bounds).rows(jobs, self.cores)
+        yield from worker_pool.WorkerPool(actors, self._bounds).rows(jobs, self.cores)
 
     def close(self) -> None:
         """Leaves the cluster, or ends it if it was started here."""

@@ -2,8 +2,6 @@
 differences from another batch.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,18 +9,7 @@ from typing import Any, cast
 
 from coec.calibration.baseline import poisson_most
 from coec.fleet.tables import NAMELESS, WINDOWS_VIEW, connect, create_view
-from coec.schemas.fleet import (
-    AXES,
-    SEEN,
-    ChangedWindow,
-    DayOfPair,
-    FalseAlarms,
-    FigureOfFleet,
-    FleetChanges,
-    FleetNow,
-    FleetReport,
-    PairOfFleet,
-)
+from coec.schemas import fleet
 from coec.schemas.heartbeat import LastWord
 from coec.schemas.replies import Alarms, Maybe6
 
@@ -32,7 +19,7 @@ CONFIDENCE = 0.95
 """Confidence of the upper bound on the rate."""
 
 
-def false_alarms(heartbeats: Iterable[LastWord]) -> FalseAlarms:
+def false_alarms(heartbeats: Iterable[LastWord]) -> fleet.FalseAlarms:
     """False alarms of all pairs together. Pairs whose word has no counts, because they are awaited, are left out."""
     counted = [
         (f"{heartbeat.vehicle}/{heartbeat.pair}", heartbeat.alarms)
@@ -41,7 +28,7 @@ def false_alarms(heartbeats: Iterable[LastWord]) -> FalseAlarms:
     ]
     watched_h = sum(alarms.watched_s for _, alarms in counted) / S_PER_H
     withdrawn = sum(alarms.withdrawn for _, alarms in counted)
-    return FalseAlarms(
+    return fleet.FalseAlarms(
         pairs=len(counted),
         watched_h=watched_h,
         confirmed=sum(alarms.confirmed for _, alarms in counted),
@@ -71,20 +58,20 @@ MAX_CHANGED_WINDOWS = 50
 NS_PER_S = 1e9
 
 _OBSERVED_CORRECTIONS = ", ".join(
-    f"CASE WHEN observed[{index}] THEN {axis} END AS {axis}" for index, axis in enumerate(AXES, 1)
+    f"CASE WHEN observed[{index}] THEN {axis} END AS {axis}" for index, axis in enumerate(fleet.AXES, 1)
 )
 """The corrections; null for axes that a window does not observe."""
 
 _REPORT_COLUMNS = (
     "vehicle, pair, date, stamp_ns, window_id, url, sha256, accepted, observed, reason_codes, error_code, decision,"
-    f" figures, {', '.join(AXES)}"
+    f" figures, {', '.join(fleet.AXES)}"
 )
 """Columns that a report needs. They are copied into a table, so that each of thousands of files is opened only once."""
 
 _ACCEPTED = f"(SELECT vehicle, pair, date, stamp_ns, {_OBSERVED_CORRECTIONS} FROM {REPORT_TABLE} WHERE accepted)"
 
 
-def report(folder: Path, against: Path | None, fleet_now: FleetNow | None = None) -> FleetReport:
+def report(folder: Path, against: Path | None, fleet_now: fleet.FleetNow | None = None) -> fleet.FleetReport:
     """The report from the tables in a folder. `against`: folder of an earlier batch over the same windows. `now`: the
     last words of the vehicles, for their alarms.
 
@@ -98,7 +85,7 @@ def report(folder: Path, against: Path | None, fleet_now: FleetNow | None = None
         f"SELECT count(*), count(*) FILTER (accepted), min(stamp_ns), max(stamp_ns) FROM {REPORT_TABLE}"
     ).fetchone()
     pairs = _pairs(connection)
-    return FleetReport(
+    return fleet.FleetReport(
         vehicles=len({pair.vehicle for pair in pairs} - {NAMELESS}),
         pairs=pairs,
         windows=windows,
@@ -117,7 +104,7 @@ def _counts(connection: Any, codes: str) -> dict[str, int]:
     return dict(connection.execute(f"SELECT code, count(*) FROM ({codes}) GROUP BY ALL ORDER BY ALL").fetchall())
 
 
-def _pairs(connection: Any) -> tuple[PairOfFleet, ...]:
+def _pairs(connection: Any) -> tuple[fleet.PairOfFleet, ...]:
     days = _days(connection)
     ends = _ends(connection)
     counted = connection.execute(
@@ -128,10 +115,10 @@ def _pairs(connection: Any) -> tuple[PairOfFleet, ...]:
     for vehicle, pair, windows, accepted, errors, last_ns in counted:
         first, latest, slope = ends.get((vehicle, pair), (_UNKNOWN, _UNKNOWN, _UNKNOWN))
         drift = [None if a is None or b is None else b - a for a, b in zip(first, latest, strict=True)]
-        shares = [0.0 if d is None else abs(d) / seen for d, seen in zip(drift, SEEN, strict=True)]
+        shares = [0.0 if d is None else abs(d) / seen for d, seen in zip(drift, fleet.SEEN, strict=True)]
         urgency = max(shares)
         made.append(
-            PairOfFleet(
+            fleet.PairOfFleet(
                 vehicle=vehicle,
                 pair=pair or "",
                 windows=windows,
@@ -141,7 +128,7 @@ def _pairs(connection: Any) -> tuple[PairOfFleet, ...]:
                 latest=latest,
                 drift=_six(drift),
                 slope=slope,
-                worst=AXES[shares.index(urgency)] if urgency > 0.0 else None,
+                worst=fleet.AXES[shares.index(urgency)] if urgency > 0.0 else None,
                 urgency=urgency,
                 days=tuple(days[vehicle, pair]),
             )
@@ -161,7 +148,7 @@ def _ends(connection: Any) -> dict[tuple[str, str], tuple[Maybe6, Maybe6, Maybe6
     medians = ", ".join(
         f"median({axis}) FILTER (up <= {WINDOWS_AT_END}), median({axis}) FILTER (down <= {WINDOWS_AT_END}),"
         f" regr_slope({axis}, stamp_ns / {NS_PER_S}) * {MONTH_S}"
-        for axis in AXES
+        for axis in fleet.AXES
     )
     # Windows are ranked once for all axes, because ranking each axis by itself would take eighteen sorts. Nearly all
     # windows of a pair observe the same axes.
@@ -181,27 +168,27 @@ def _ends(connection: Any) -> dict[tuple[str, str], tuple[Maybe6, Maybe6, Maybe6
     }
 
 
-def _days(connection: Any) -> dict[tuple[str, str], list[DayOfPair]]:
-    spread = ", ".join(f"quantile_cont({axis}, [0.16, 0.5, 0.84])" for axis in AXES)
+def _days(connection: Any) -> dict[tuple[str, str], list[fleet.DayOfPair]]:
+    spread = ", ".join(f"quantile_cont({axis}, [0.16, 0.5, 0.84])" for axis in fleet.AXES)
     rows = connection.execute(
         f"SELECT vehicle, pair, date, count(*), {spread} FROM {_ACCEPTED} GROUP BY ALL ORDER BY vehicle, pair, date"
     ).fetchall()
-    made: dict[tuple[str, str], list[DayOfPair]] = defaultdict(list)
+    made: dict[tuple[str, str], list[fleet.DayOfPair]] = defaultdict(list)
     for vehicle, pair, date, windows, *spreads in rows:
         low, middle, high = zip(*(each or (None, None, None) for each in spreads), strict=True)
-        day = DayOfPair(date=date, windows=windows, low=_six(low), middle=_six(middle), high=_six(high))
+        day = fleet.DayOfPair(date=date, windows=windows, low=_six(low), middle=_six(middle), high=_six(high))
         made[vehicle, pair].append(day)
     return made
 
 
-def _figures(connection: Any) -> tuple[FigureOfFleet, ...]:
+def _figures(connection: Any) -> tuple[fleet.FigureOfFleet, ...]:
     rows = connection.execute(
         "SELECT figure.key, pair, count(DISTINCT vehicle), count(*), quantile_cont(figure.value, [0.005, 0.5, 0.995])"
         f" FROM (SELECT vehicle, pair, unnest(map_entries(figures)) AS figure FROM {REPORT_TABLE} WHERE accepted)"
         " WHERE figure.value IS NOT NULL GROUP BY ALL ORDER BY ALL"
     ).fetchall()
     return tuple(
-        FigureOfFleet(
+        fleet.FigureOfFleet(
             name=name, pair=pair, vehicles=vehicles, windows=windows, low=spread[0], middle=spread[1], high=spread[2]
         )
         for name, pair, vehicles, windows, spread in rows
@@ -213,10 +200,10 @@ def _unique_windows(name: str) -> str:
     return f"(SELECT * FROM {name} QUALIFY row_number() OVER (PARTITION BY sha256 ORDER BY url) = 1)"
 
 
-def _changes(connection: Any, against: Path) -> FleetChanges:
+def _changes(connection: Any, against: Path) -> fleet.FleetChanges:
     create_view(connection, EARLIER_VIEW, against)
-    rotation = "greatest(" + ", ".join(f"abs(now.{axis} - was.{axis})" for axis in AXES[:3]) + ")"
-    translation = "greatest(" + ", ".join(f"abs(now.{axis} - was.{axis})" for axis in AXES[3:]) + ")"
+    rotation = "greatest(" + ", ".join(f"abs(now.{axis} - was.{axis})" for axis in fleet.AXES[:3]) + ")"
+    translation = "greatest(" + ", ".join(f"abs(now.{axis} - was.{axis})" for axis in fleet.AXES[3:]) + ")"
     connection.execute(
         "CREATE TEMP TABLE changed AS SELECT now.vehicle, coalesce(now.window_id, was.window_id, now.url) AS window_id,"
         " coalesce(now.decision = was.decision, now.error_code = was.error_code, false) AS same,"
@@ -238,7 +225,7 @@ def _changes(connection: Any, against: Path) -> FleetChanges:
         " WHERE was_accepted <> now_accepted OR failing"
         f" ORDER BY rotation DESC NULLS LAST, vehicle, window_id LIMIT {MAX_CHANGED_WINDOWS}"
     ).fetchall()
-    return FleetChanges(
+    return fleet.FleetChanges(
         both=both,
         identical=identical,
         newly_accepted=gained,
@@ -247,7 +234,7 @@ def _changes(connection: Any, against: Path) -> FleetChanges:
         rotation_deg=rotation_deg,
         translation_m=translation_m,
         windows=tuple(
-            ChangedWindow(
+            fleet.ChangedWindow(
                 vehicle=vehicle,
                 window_id=window_id,
                 before="accepted" if was_accepted else was_why,

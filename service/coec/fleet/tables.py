@@ -2,8 +2,6 @@
 them, and queries them with SQL. The libraries for both are the optional extra `fleet`.
 """
 
-from __future__ import annotations
-
 import io
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence

@@ -16,8 +16,6 @@ counts as tried only if it was with a process that ran. What a process does to i
 | failed several times in succession for a common cause | are judged by others; this process gets no more |
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import Counter, deque

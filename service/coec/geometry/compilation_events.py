@@ -1,8 +1,6 @@
 """Tells listeners that kernels are being compiled, which happens once on a machine and takes about a minute. This
 module imports no compiler itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 

@@ -15,8 +15,6 @@ where the last bits do not matter.)
 Importing this module loads a compiler: 70 MB and a third of a second, which the process that serves queries avoids.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os

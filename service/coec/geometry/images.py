@@ -1,7 +1,5 @@
 """Sums, differences and grey levels over squares or blocks of an image, each in one pass."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

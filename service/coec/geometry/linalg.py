@@ -6,8 +6,6 @@ bit.
 is fast enough for some thousand of them, or for one with a hundred rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import copysign, fsum, hypot, sqrt
 

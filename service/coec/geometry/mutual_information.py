@@ -8,8 +8,6 @@ indices that stay the same for a whole search: the range of a point does not dep
 looked up without interpolation. So the inner loop is: transform, project, one 8-bit look-up, one increment.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -5,8 +5,6 @@ A stride would be as fast, but a sweep comes in the order in which its beams fir
 point belongs to the same eight beams. A random choice has no such period.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import TypeVar

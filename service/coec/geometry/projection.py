@@ -14,8 +14,6 @@ the bundle's axis. Seen from the camera, the cone is wider by their parallax. If
 of the points is in the image, and they are neither read nor projected.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -6,8 +6,6 @@ reference instant it has the coordinates exp(ξ·dt)·p, with ξ = (ω, v) the t
 section 3, "Motion compensation is visible").
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

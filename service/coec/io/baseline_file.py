@@ -4,8 +4,6 @@ History and reports refer to a baseline by the sha256 of its content. A field th
 versions before it refuse the whole document, because the first ones accept no field that they do not know.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import fields

@@ -6,8 +6,6 @@ flag. Numbers are finite, and an array has exactly its shape. Fields that a read
 that is missing takes the default of the dataclass, if there is one.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from math import inf, isfinite, nan

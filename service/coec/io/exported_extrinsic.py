@@ -8,8 +8,6 @@ Of YAML the library (ruamel) only finds the place of an entry, whose lines are r
 comments, quotes and numbers, but wraps, indents and spaces the lists of the whole document anew.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

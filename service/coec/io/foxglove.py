@@ -1,7 +1,5 @@
 """The WebSocket server for viewers; the only module that needs the library of the optional extra `foxglove`."""
 
-from __future__ import annotations
-
 import logging
 from typing import Literal
 

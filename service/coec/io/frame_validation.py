@@ -1,7 +1,5 @@
 """Checks that both encodings of frames share, made before a message becomes a value."""
 
-from __future__ import annotations
-
 import math
 from enum import StrEnum
 

@@ -18,8 +18,6 @@ by 10, because a deuteranope cannot distinguish its red from its green. Viridis 
 lost on trees.
 """
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from dataclasses import dataclass

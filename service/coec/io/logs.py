@@ -1,8 +1,6 @@
 """Logs on standard output, a line per record, as JSON or for people, and counters of losses that cannot flood the
 log."""
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

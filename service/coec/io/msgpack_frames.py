@@ -1,8 +1,6 @@
 """Decodes and encodes frames in the native encoding. Anybody may be the sender, so that sizes are bounded before
 anything is built from them."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 import msgpack

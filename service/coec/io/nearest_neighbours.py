@@ -1,8 +1,6 @@
 """The nearest points of a cloud, by the k-d tree of small_gicp (Koide 2024, MIT), on one thread so that every call
 gives the same bits."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import numpy as np

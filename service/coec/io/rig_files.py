@@ -1,7 +1,5 @@
 """The rig in its three forms: configuration, value, and JSON with a mask image (`rig.json`, `mask.png` of a window)."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -29,16 +27,7 @@ from coec.config import (
 )
 from coec.errors import ConfigError, DecodeError, WindowError, cannot_read, require_readable
 from coec.geometry import cameras, se3
-from coec.io.converter import (
-    POSE,
-    MalformedValueError,
-    bounded,
-    make_converter,
-    number,
-    register,
-    structured,
-    whole_number,
-)
+from coec.io import converter
 from coec.io.images import decode_bgr, encode_png, probe
 
 NOT_ALWAYS_THERE = ("sweep", "cloud")
@@ -209,9 +198,9 @@ def rig_from_json(document: object, mask_png: bytes | None) -> Rig:
         WindowError: not a valid document; says where.
     """
     try:
-        rig = structured(_FORM, document, Rig)
+        rig = converter.structured(_FORM, document, Rig)
         return rig if mask_png is None else replace(rig, mask=mask_from_image(mask_png, rig.camera))
-    except (MalformedValueError, DecodeError) as error:
+    except (converter.MalformedValueError, DecodeError) as error:
         raise WindowError(f"the rig is damaged: {error}") from error
 
 
@@ -241,23 +230,23 @@ def _sweep(sweep: SweepConfig) -> SweepTiming:
 def _rig_form() -> Converter:
     """The rules by which a `Rig` is written and read. The mask is a file of its own; a sweep or cloud that is not
     configured has no entry."""
-    form = make_converter()
+    form = converter.make_converter()
     # The fields of a camera depend on its model: they are those of the configuration.
     form.register_unstructure_hook_func(
         lambda one: one == cameras.Camera,
         lambda camera: intrinsics_config(camera).model_dump(mode="json", exclude_none=True),
     )
     form.register_structure_hook_func(lambda one: one == cameras.Camera, _read_camera)
-    period_s = bounded(number, lambda value: value > 0.0, "a number above 0")
-    sign = bounded(whole_number, lambda value: value in (-1, 1), "-1 or 1")
-    register(form, SweepTiming, required=["stamp_azimuth_rad"], period_s=period_s, sign=sign)
-    register(form, CloudFrame, T_cloud_lidar=POSE)
+    period_s = converter.bounded(converter.number, lambda value: value > 0.0, "a number above 0")
+    sign = converter.bounded(converter.whole_number, lambda value: value in (-1, 1), "-1 or 1")
+    converter.register(form, SweepTiming, required=["stamp_azimuth_rad"], period_s=period_s, sign=sign)
+    converter.register(form, CloudFrame, T_cloud_lidar=converter.POSE)
     elsewhere, not_always_there = override(omit=True), override(omit_if_default=True)
-    register(
+    converter.register(
         form,
         Rig,
-        T_camera_lidar_nominal=POSE,
-        T_lidar_ego=POSE,
+        T_camera_lidar_nominal=converter.POSE,
+        T_lidar_ego=converter.POSE,
         mask=elsewhere,
         sweep=not_always_there,
         camera_residual_px=elsewhere,
@@ -271,7 +260,9 @@ def _read_camera(value: Any, _: object) -> cameras.Camera:
         intrinsics = CameraIntrinsics.model_validate(value)
         return cameras.build(intrinsics.model, **intrinsics.parameters())
     except ValueError as error:
-        raise MalformedValueError(describe(error) if isinstance(error, ValidationError) else str(error)) from error
+        raise converter.MalformedValueError(
+            describe(error) if isinstance(error, ValidationError) else str(error)
+        ) from error
 
 
 _FORM = _rig_form()

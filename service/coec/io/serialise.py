@@ -1,8 +1,6 @@
 """Converts estimates to wire models and back. A round trip gives the same bytes, so that the result that one process
 solves is exactly the one that another serves, stores or replays."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterable

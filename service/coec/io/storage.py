@@ -22,8 +22,6 @@ the body carries versions of its own. A file of a later schema version, whose ch
 all the same, and is kept aside when it is replaced.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -2,8 +2,6 @@
 directory.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 import zipfile

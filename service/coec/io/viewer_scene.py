@@ -3,8 +3,6 @@ cloud, and lines of the timeline as JSON. Arrays in, values out: nothing here de
 `deploy/foxglove-layout.json` and all other layouts depend on the names of the topics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """The page of `coec commission`: how the estimator behaves on each pair of a vehicle, and the limits that follow."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import degrees, isfinite
 

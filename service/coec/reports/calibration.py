@@ -1,7 +1,5 @@
 """The result of `coec calibrate`: on the console, and as a page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -13,20 +11,9 @@ from coec.config import CalibrationConfig
 from coec.geometry import se3
 from coec.geometry.points import distinct_rings
 from coec.io.depth.depth_maps import STEREO
-from coec.reports import console
+from coec.reports import console, page_parts
 from coec.reports.formatting import count, number, percent, second, significant, size
 from coec.reports.page import AxesTable, Block, Facts, Page, Section, Text, VerdictBanner
-from coec.reports.page_parts import (
-    Provenance,
-    advice_of,
-    axes_table,
-    axis_value,
-    content_hash,
-    copies_of,
-    depth_items,
-    figures_block,
-    turn_and_shift,
-)
 from coec.schemas.replies import CalibrationReport, CalibrationResult, Transform, Vector6
 
 DIGITS = 9
@@ -184,7 +171,7 @@ def calibration_page(
     start: Vector6,
     pictures: Sequence[Block],
     remarks: Sequence[str],
-    made: Provenance,
+    made: page_parts.Provenance,
 ) -> Page:
     """The page of a result.
 
@@ -195,7 +182,7 @@ def calibration_page(
     """
     sections = (
         Section("Result", (_axes(report, start), *(Text((each,)) for each in remarks))),
-        Section("To copy", (copies_of(report.camera_from_lidar, report.camera_frame, report.lidar_frame),)),
+        Section("To copy", (page_parts.copies_of(report.camera_from_lidar, report.camera_frame, report.lidar_frame),)),
         *((Section("Pictures", tuple(pictures)),) if pictures else ()),
         Section(
             "Why it was " + ("accepted" if _accepted(report) else "refused"),
@@ -203,7 +190,7 @@ def calibration_page(
                 Text(
                     ("A result is accepted if every figure keeps its limit. None of them knows the truth.",), quiet=True
                 ),
-                figures_block("Figures of self-diagnosis", report.metrics),
+                page_parts.figures_block("Figures of self-diagnosis", report.metrics),
             ),
         ),
         Section("How it was found", (_search(report),)),
@@ -222,11 +209,10 @@ def _verdict(report: CalibrationReport) -> VerdictBanner:
         first = report.verdict.reasons[0].text if report.verdict.reasons else "no reason was given"
         more = len(report.verdict.reasons) - 1
         rest = f" (and {count(more, 'reason')} more, below)" if more > 0 else ""
-        advice = advice_of(report.verdict.reasons) or ("Take another window.",)
+        advice = page_parts.advice_of(report.verdict.reasons) or ("Take another window.",)
         return VerdictBanner("bad", "Refused:", f"{first}{rest}. Do not use this result.", advice)
-    sentence = (
-        f"The camera is {turn_and_shift(_solved(report))} from the recording’s own calibration{_known_to(report)}."
-    )
+    moved = page_parts.turn_and_shift(_solved(report))
+    sentence = f"The camera is {moved} from the recording’s own calibration{_known_to(report)}."
     return VerdictBanner("good", "Accepted.", sentence, USE)
 
 
@@ -249,14 +235,14 @@ def _axes(report: CalibrationReport, start: Vector6) -> AxesTable:
         for axis, solved in enumerate(report.solved)
         if not solved
     }
-    return axes_table(
+    return page_parts.axes_table(
         "Correction of the recording’s own calibration about and along the camera’s axes (x right, y down, z forward). "
         "“Not observable”: searched, but this window does not tell it, so it is kept as it was.",
         "Correction",
         report.correction,
         report.sigma,
         unsolved_labels,
-        {"Search began at": [axis_value(value, axis) for axis, value in enumerate(start)]},
+        {"Search began at": [page_parts.axis_value(value, axis) for axis, value in enumerate(start)]},
     )
 
 
@@ -289,7 +275,7 @@ def _origin(report: CalibrationReport, window: Window) -> tuple[tuple[str, str],
     return (
         ("Window", report.window_id),
         ("Sensor time", f"{second(first)} to {second(last)}"),
-        ("Window, sha256 of images, points and stamps", content_hash(window)),
-        *depth_items(report.depth_identity),
+        ("Window, sha256 of images, points and stamps", page_parts.content_hash(window)),
+        *page_parts.depth_items(report.depth_identity),
         ("Configuration, hash", report.config_hash),
     )

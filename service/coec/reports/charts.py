@@ -5,8 +5,6 @@ A chart is drawn twice, for a wide and for a narrow page, each at a size at whic
 sheet shows the one that fits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, floor, isfinite, log10

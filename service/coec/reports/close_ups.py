@@ -5,8 +5,6 @@ offset of a few pixels from the edge of a pole, which ten thousand coloured poin
 and Ito's palette (2008), distinct in any colour vision, and neither occurs in a grey image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees

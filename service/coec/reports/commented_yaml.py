@@ -5,8 +5,6 @@ The text is written here because the YAML library (ruamel), which edits document
 value, wraps none, and keeps no block on one line if it fits.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import textwrap

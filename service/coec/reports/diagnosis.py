@@ -2,8 +2,6 @@
 console, and as a page.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,21 +12,9 @@ from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.types import Reason as Found
 from coec.calibration.types import Window
 from coec.io.serialise import metric_of
-from coec.reports import console
+from coec.reports import console, page_parts
 from coec.reports.formatting import NONE, number, second
 from coec.reports.page import Page, Pictures, Section, Text, VerdictBanner
-from coec.reports.page_parts import (
-    Provenance,
-    advice_of,
-    axes_table,
-    axis_value,
-    content_hash,
-    depth_items,
-    figures_block,
-    file_picture,
-    finite_degrees,
-    turn_and_shift,
-)
 from coec.schemas.replies import Reason
 
 TELLING = 2.0
@@ -185,7 +171,7 @@ def check_page(
     depth_identity: str,
     config_hash: str,
     pictures: Sequence[Path],
-    made: Provenance,
+    made: page_parts.Provenance,
 ) -> Page:
     """The page of one check.
 
@@ -197,12 +183,12 @@ def check_page(
     Raises:
         OutputError: a picture can no longer be read.
     """
-    offset, sigma = finite_degrees(seen.offset), finite_degrees(seen.sigma)
+    offset, sigma = page_parts.finite_degrees(seen.offset), page_parts.finite_degrees(seen.sigma)
     slopes = {
         "f′": [number(float(value), sign=True) for value in seen.first_derivative],
         "f″": [number(float(value), sign=True) for value in seen.second_derivative],
     }
-    table = axes_table(
+    table = page_parts.axes_table(
         "From the extrinsic to where this check puts the camera, about and along its axes (x right, y down, z "
         "forward). f′ and f″ are the paper’s derivatives of mutual information, per radian or metre.",
         "Offset",
@@ -210,7 +196,7 @@ def check_page(
         sigma,
         more=slopes if measured is None else {"By a solve of all pairs": _by_axis(measured), **slopes},
     )
-    shown = tuple(file_picture(path) for path in pictures)
+    shown = tuple(page_parts.file_picture(path) for path in pictures)
     sections = (
         *((Section("Pictures", (Pictures(shown),)),) if shown else ()),
         Section("Where the check puts the camera", (table,)),
@@ -222,15 +208,17 @@ def check_page(
                      "an alarm.",),
                     quiet=True,
                 ),
-                figures_block("Figures of the check", {m.name: metric_of(m) for m in seen.metrics}, compared=OF_PAPER),
+                page_parts.figures_block(
+                    "Figures of the check", {m.name: metric_of(m) for m in seen.metrics}, compared=OF_PAPER
+                ),
             ),
         ),
         made.section(
             (
                 ("Window", window.window_id),
                 ("Sensor time", f"{second(seen.pair_stamps_ns[0])} to {second(seen.stamp_ns)}"),
-                ("Window, sha256 of images, points and stamps", content_hash(window)),
-                *depth_items(depth_identity),
+                ("Window, sha256 of images, points and stamps", page_parts.content_hash(window)),
+                *page_parts.depth_items(depth_identity),
                 ("Configuration, hash", config_hash),
             )
         ),
@@ -240,7 +228,9 @@ def check_page(
 
 def _by_axis(measured: SolvedOffset) -> list[str]:
     return [
-        NONE if sigma is None else f"{axis_value(value, axis)} ± {axis_value(sigma, axis, sign=False)}"
+        NONE
+        if sigma is None
+        else f"{page_parts.axis_value(value, axis)} ± {page_parts.axis_value(sigma, axis, sign=False)}"
         for axis, (value, sigma) in enumerate(zip(measured.offset, measured.sigma, strict=True))
     ]
 
@@ -249,7 +239,7 @@ def _verdict(seen: Observation, measured: SolvedOffset | None) -> VerdictBanner:
     if seen.causes:
         reasons = [_reason(cause.as_reason()) for cause in seen.causes]
         sentence = " ".join(cause.text for cause in seen.causes) + " Such a check says nothing of the extrinsic."
-        return VerdictBanner("poor", "Cannot tell:", sentence, advice_of(reasons))
+        return VerdictBanner("poor", "Cannot tell:", sentence, page_parts.advice_of(reasons))
     if seen.flagged:
         todo = (
             "See that the mount is tight.",
@@ -266,13 +256,14 @@ def _verdict(seen: Observation, measured: SolvedOffset | None) -> VerdictBanner:
 
 def _where(seen: Observation, measured: SolvedOffset | None) -> str:
     """How far the extrinsic is off, by the solve if it can tell, else by the check."""
-    near = f"The nearest place at which the edges fit is {turn_and_shift(finite_degrees(np.nan_to_num(seen.offset)))}"
+    offset = page_parts.finite_degrees(np.nan_to_num(seen.offset))
+    near = f"The nearest place at which the edges fit is {page_parts.turn_and_shift(offset)}"
     if measured is None:
         return f"{near}."
     if not measured.accepted:
         return f"{near}; a solve of all {measured.pairs} pairs is refused, so how far it is off is not sure."
     solved = [0.0 if s is None else value for value, s in zip(measured.offset, measured.sigma, strict=True)]
-    return f"A solve of all {measured.pairs} pairs puts it {turn_and_shift(solved)} from there."
+    return f"A solve of all {measured.pairs} pairs puts it {page_parts.turn_and_shift(solved)} from there."
 
 
 def _reason(reason: Found) -> Reason:

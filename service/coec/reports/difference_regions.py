@@ -10,8 +10,6 @@ A shift along an outline cannot be seen, and neither can a shift where there is 
 that outlines sweep from one extrinsic to the other.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import cos, radians
 

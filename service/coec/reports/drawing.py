@@ -4,8 +4,6 @@ A picture is (H, W, 3) uint8 BGR; places are its pixels (x, y) from the upper le
 an integer. A view `picture[rectangle.slices]` is a picture, too: what is drawn on it is cut off at its sides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """The board of `coec watch`: the fleet in a line, a row per pair, and a picture in half blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """The page of a fleet: one HTML file with everything in it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import datetime
 from math import inf

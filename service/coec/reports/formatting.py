@@ -5,8 +5,6 @@ Beside `coec.reports.console` this is the one place from which text goes to stan
 imports nothing heavy: the service itself uses it.
 """
 
-from __future__ import annotations
-
 import codecs
 import logging
 import sys

@@ -1,8 +1,6 @@
 """The page of a red event: what happened, what was seen, what was decided and why. Whatever a vehicle says is shown as
 text, never as markup."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -13,18 +11,8 @@ from coec.reports.formatting import NS_PER_S, count, second
 from coec.reports.page import Block, Cell, Charts, Page, Picture, Pictures, Section, Table, Text, Tone, VerdictBanner
 from coec.reports.page_parts import TONES, Provenance, advice_of, axis_value, title_of
 from coec.reports.replies import entry_text
+from coec.schemas import replies
 from coec.schemas.documents import Absent, FetchedWindow, IncidentReport
-from coec.schemas.replies import (
-    CalibrationResult,
-    ChainedEntry,
-    EvidenceEvent,
-    ExtrinsicReply,
-    HealthReply,
-    HistoryReply,
-    MetricsPoint,
-    Reason,
-    StatusReply,
-)
 
 MAX_PLOTS = 16
 """Most figures that are drawn, because a vehicle decides how many it sends."""
@@ -48,11 +36,11 @@ PICTURED = {
 class FetchedIncident:
     """What was fetched; None for what could not be."""
 
-    event: EvidenceEvent
-    history: HistoryReply | None
-    health: HealthReply | None
-    extrinsic: ExtrinsicReply | None
-    status: StatusReply | None
+    event: replies.EvidenceEvent
+    history: replies.HistoryReply | None
+    health: replies.HealthReply | None
+    extrinsic: replies.ExtrinsicReply | None
+    status: replies.StatusReply | None
     windows: tuple[FetchedWindow, ...]
     absent: tuple[Absent, ...]
     chain_holds: bool | None
@@ -134,7 +122,7 @@ def _verdict(incident: FetchedIncident) -> VerdictBanner:
     )
 
 
-def _reasons_text(reasons: Sequence[Reason]) -> str:
+def _reasons_text(reasons: Sequence[replies.Reason]) -> str:
     return " ".join(f"{reason.text} ({reason.code})" for reason in reasons) or "No reason was given."
 
 
@@ -154,7 +142,7 @@ def _pictures(pictures: Mapping[str, bytes]) -> tuple[Block, ...]:
 # --- figures --------------------------------------------------------------------------------------------------------
 
 
-def _timeline(event: EvidenceEvent) -> Iterable[Block]:
+def _timeline(event: replies.EvidenceEvent) -> Iterable[Block]:
     """All figures over the same time axis, with the states of health as background and the event as a line."""
     points = event.metrics
     if not points:
@@ -176,11 +164,11 @@ def _timeline(event: EvidenceEvent) -> Iterable[Block]:
         yield Text((f"{len(names) - MAX_PLOTS} figures more are in event.json.",), quiet=True)
 
 
-def _seconds(stamp_ns: int, event: EvidenceEvent) -> float:
+def _seconds(stamp_ns: int, event: replies.EvidenceEvent) -> float:
     return (stamp_ns - event.stamp_ns) / NS_PER_S
 
 
-def _grounds(points: Sequence[MetricsPoint], event: EvidenceEvent) -> Iterable[Ground]:
+def _grounds(points: Sequence[replies.MetricsPoint], event: replies.EvidenceEvent) -> Iterable[Ground]:
     ends = [*(point.stamp_ns for point in points[1:]), max(points[-1].stamp_ns, event.stamp_ns)]
     spans = [(point.state, point.stamp_ns, end) for point, end in zip(points, ends, strict=True)]
     for state, of_state in groupby(spans, key=lambda span: span[0]):
@@ -189,7 +177,7 @@ def _grounds(points: Sequence[MetricsPoint], event: EvidenceEvent) -> Iterable[G
 
 
 def _chart(
-    name: str, points: Sequence[MetricsPoint], event: EvidenceEvent, grounds: tuple[Ground, ...]
+    name: str, points: Sequence[replies.MetricsPoint], event: replies.EvidenceEvent, grounds: tuple[Ground, ...]
 ) -> Chart | None:
     samples = [
         (_seconds(point.stamp_ns, event), value) for point in points if (value := point.metrics.get(name)) is not None
@@ -211,8 +199,8 @@ def _chart(
 # --- documents ------------------------------------------------------------------------------------------------------
 
 
-def _results(results: Sequence[CalibrationResult], event: EvidenceEvent) -> Table:
-    def row(result: CalibrationResult) -> Sequence[str | Cell]:
+def _results(results: Sequence[replies.CalibrationResult], event: replies.EvidenceEvent) -> Table:
+    def row(result: replies.CalibrationResult) -> Sequence[str | Cell]:
         when = "after" if result.data_stamp_ns > event.stamp_ns else "before"
         moved = [
             f"{axis_value(value, axis)} ± {axis_value(sigma, axis, sign=False)}"
@@ -230,7 +218,7 @@ def _results(results: Sequence[CalibrationResult], event: EvidenceEvent) -> Tabl
     )
 
 
-def _refusals(results: Sequence[CalibrationResult]) -> Iterable[Text]:
+def _refusals(results: Sequence[replies.CalibrationResult]) -> Iterable[Text]:
     """Why windows were refused, and which figures missed their limits."""
     for result in results:
         if result.verdict.decision == "accepted":
@@ -255,7 +243,7 @@ def _chain(incident: FetchedIncident) -> Block:
     )
 
 
-def _entries(entries: Sequence[ChainedEntry]) -> Table:
+def _entries(entries: Sequence[replies.ChainedEntry]) -> Table:
     rows = [
         (
             str(item.entry.sequence),
@@ -308,7 +296,7 @@ def _snippets(snippets: Sequence[str]) -> Iterable[Block]:
         yield Table("Every frame of the seconds about the event", ("Recording",), rows)
 
 
-def _now(incident: FetchedIncident, health: HealthReply) -> Text:
+def _now(incident: FetchedIncident, health: replies.HealthReply) -> Text:
     served = "" if incident.extrinsic is None else f" Served: {incident.extrinsic.provenance}."
     why = f" {_reasons_text(health.reasons)}" if health.reasons else ""
     version = "" if incident.status is None else f" The service is coec {incident.status.version}."

@@ -1,7 +1,5 @@
 """LiDAR points drawn on the image they were taken with: what a person looks at to judge an extrinsic."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

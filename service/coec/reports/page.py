@@ -9,8 +9,6 @@ content policy in the head of the page lets no script run but the page's own. Ch
 reverse the order of others, are shown as escapes (`coec.untrusted`).
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re

@@ -1,7 +1,5 @@
 """Pictures of a window for people: points on the image before and after, close-ups, residuals at the result."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 The stamps of all frames are known without loading them; only a few frames, evenly chosen, are loaded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

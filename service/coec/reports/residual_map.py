@@ -6,8 +6,6 @@ shift at which they fit the image best is reported: zero where extrinsic and len
 shifts all cells alike, a wrong lens those at the rim, a translation those with near objects.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import degrees, floor, log10
 

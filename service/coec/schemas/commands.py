@@ -1,7 +1,5 @@
 """Commands on the wire: their names, their arguments, and the form of a command whose sender proves its name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal, get_args

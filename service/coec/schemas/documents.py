@@ -2,8 +2,6 @@
 incident.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -5,8 +5,6 @@ axes rx ry rz tx ty tz about and along the camera axes.
 Angles in degrees, lengths in metres, axes rx ry rz tx ty tz about and along the camera axes.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

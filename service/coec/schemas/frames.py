@@ -3,8 +3,6 @@
 Stamps are sensor time in integer nanoseconds. Numbers in `bin` columns are little-endian.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field

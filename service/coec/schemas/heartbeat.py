@@ -4,8 +4,6 @@ The service publishes it on change and periodically. A Zenoh storage keeps it, s
 vehicle is parked. `read` decodes a word that came over a network, within bounds.
 """
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import msgpack

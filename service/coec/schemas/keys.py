@@ -2,8 +2,6 @@
 built and parsed here and nowhere else; below them, the names of its node, topics, frames and diagnostics on ROS 2.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What all wire models share: frozen, unknown fields ignored, no NaN; and their two encodings."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Annotated, Any, Final, TypeVar

@@ -4,8 +4,6 @@ Conventions: `camera_from_lidar` maps LiDAR coordinates (x forward, y left, z up
 down, z forward). Corrections are about the camera axes. A number that could not be computed is null.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Final, Literal
 
 from pydantic import Field

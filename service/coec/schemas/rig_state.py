@@ -4,8 +4,6 @@ Moves are about a sensor's own axes: a move x (deg, then m) multiplies, from the
 sensor's frame. All times are sensor time; a number that could not be computed is null.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

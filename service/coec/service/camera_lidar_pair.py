@@ -10,8 +10,6 @@ The threads reach each other through the inbox (intake), the recorder's queue an
 results come back through the mailbox, too.
 """
 
-from __future__ import annotations
-
 import logging
 
 from coec.config import CalibrationConfig, Config, PairConfig

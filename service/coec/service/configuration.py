@@ -7,8 +7,6 @@ A changed value is taken over only if everything that depends on it can go on wi
 of windows. Values with which streams, files, networks or sessions were opened stay until those are opened anew.
 """
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

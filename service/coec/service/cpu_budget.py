@@ -26,8 +26,6 @@ later, after further pairs have come. Then it would depend on the machine which 
 has to wait.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -8,8 +8,6 @@ What the configuration gives is used as it is; only what it leaves out is looked
 if `/tf_static` does not connect two frames, or an image has another size than its `CameraInfo`.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import re

@@ -5,8 +5,6 @@ takes what was found, and builds the pairs. Afterwards the thread goes on listen
 they then say something else, that is reported but changes nothing.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -4,8 +4,6 @@ answers for these pairs meanwhile, and hands each over when everything is found.
 Used on the daemon's main thread; the thread of `NominalWatch` looks at what is heard.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Mapping
@@ -19,15 +17,8 @@ from coec.io.rig_files import check_given, rig_of
 from coec.io.system import ServiceThread
 from coec.io.zenoh.bus import Bus, InputSample
 from coec.io.zenoh.ros_node import RosSide
+from coec.service import discovery
 from coec.service.api.pair_answers import PendingPairAnswers
-from coec.service.discovery import (
-    CANNOT_BE_BUILT,
-    DiscoveredPair,
-    DiscoveryStore,
-    completed,
-    info_topic_of,
-    needs_transforms,
-)
 from coec.service.discovery_listener import DiscoveryListener, NominalStatus
 from coec.service.vehicle_context import VehicleContext
 
@@ -83,7 +74,7 @@ class PendingPairs:
             check_given(pair)
         self._requested = {pair.name: pair for pair in config.awaited}
         self._read = config
-        self._store = DiscoveryStore(folder)
+        self._store = discovery.DiscoveryStore(folder)
         earlier = self._store.load(config)
         self._listener = DiscoveryListener(config, earlier)
         self._streams: dict[str, _SharedSubscription] = {}
@@ -97,7 +88,9 @@ class PendingPairs:
 
     def complete(self, config: Config) -> Config:
         """The configuration as it was read, completed by what has been found for pairs that still ask for the same."""
-        return completed(config, {name: discovered.pair for name, discovered in self._store.load(config).items()})
+        return discovery.completed(
+            config, {name: discovered.pair for name, discovered in self._store.load(config).items()}
+        )
 
     def nominal(self, pair: str) -> NominalStatus:
         """Where a pair's nominal calibration comes from. Any thread."""
@@ -121,11 +114,11 @@ class PendingPairs:
         subscribed for as long as the service runs."""
         for thread in self.threads:
             thread.start()
-        if any(needs_transforms(pair) for pair in self._requested.values()):
+        if any(discovery.needs_transforms(pair) for pair in self._requested.values()):
             bus.subscribe_latched(side.input_of_static_transforms(), self._listener.take_transforms)
         infos: dict[str, _SharedSubscription] = {}
         for name, pair in self._requested.items():
-            topic = info_topic_of(pair)
+            topic = discovery.info_topic_of(pair)
             if topic is not None:
                 shared = infos.setdefault(topic, _SharedSubscription())
                 shared.join(name, partial(self._listener.take_info, name))
@@ -152,7 +145,7 @@ class PendingPairs:
             good[name] = discovered.pair
         return good
 
-    def _admit(self, name: str, discovered: DiscoveredPair) -> None:
+    def _admit(self, name: str, discovered: discovery.DiscoveredPair) -> None:
         for place, shared in list(self._streams.items()):
             if shared.leave(name):
                 del self._streams[place]
@@ -164,7 +157,7 @@ class PendingPairs:
     def refuse(self, name: str, why: str) -> None:
         """What was found for a pair cannot be used. The pair is awaited again until something else is heard."""
         _log.error(f"the discovered calibration of a pair cannot be used: {why}", extra={"fields": {"pair": name}})
-        self._listener.end(name, Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {why}."))
+        self._listener.end(name, Reason(discovery.CANNOT_BE_BUILT, f"What was found cannot be used: {why}."))
 
     def renew(self) -> None:
         """Renews the answers; called once a second."""

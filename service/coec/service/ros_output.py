@@ -3,8 +3,6 @@ once a second, whatever else stands still. `/tf_static` gets the served extrinsi
 as calibrated. Pictures are rendered only while somebody subscribes, one at a time.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -2,8 +2,6 @@
 thread that manages a pair.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable

@@ -5,8 +5,6 @@ farthest ahead; the processor budget is earned by it. A replay at ten times the 
 spends ten times as much per second, and makes the same checks as the drive did, on any machine that keeps up.
 """
 
-from __future__ import annotations
-
 import threading
 from bisect import bisect_left
 from collections import deque

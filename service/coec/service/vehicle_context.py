@@ -1,7 +1,5 @@
 """What all pairs of a vehicle share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

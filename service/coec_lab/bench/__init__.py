@@ -5,8 +5,6 @@ Ratios compare the fastest of alternating runs in one process, so that other loa
 possible. Processor time is that of one process alone; round trips and starts are wall-clock time.
 """
 
-from __future__ import annotations
-
 from coec.cli.options import Json
 
 

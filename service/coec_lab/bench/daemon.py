@@ -5,8 +5,6 @@ Processes are real: the daemon (which is also the router), the sensors, and this
 camera with one LiDAR as native frames and as topics of ROS, and whole vehicles: four fisheyes with one LiDAR (four
 pairs), and eight cameras with three LiDARs (twenty-four pairs) in the default configuration."""
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess

@@ -3,8 +3,6 @@
 Times are the fastest of several runs. A first run of each, which may compile, does not count.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Processor time and memory of processes as Linux counts them, of the worker by itself, and of the recorder."""
 
-from __future__ import annotations
-
 import os
 import queue
 import tempfile

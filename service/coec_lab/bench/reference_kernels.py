@@ -1,8 +1,6 @@
 """Two plain forms of equation (1). `coec bench` compares the kernel of `mutual_information` with them, in the same run
 and on the same machine."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

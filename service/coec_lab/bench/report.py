@@ -1,7 +1,5 @@
 """The whole benchmark and its table: each figure next to its required bound."""
 
-from __future__ import annotations
-
 import os
 import platform
 import tempfile

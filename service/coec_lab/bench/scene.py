@@ -2,8 +2,6 @@
 in every direction, so that the depth map of any camera is exact and the true pose is a maximum.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -2,8 +2,6 @@
 the rates of a vehicle, as native frames or as sent by nodes of ROS 2.
 """
 
-from __future__ import annotations
-
 import itertools
 import select
 import sys

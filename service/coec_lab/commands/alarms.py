@@ -1,7 +1,5 @@
 """`coec alarms`: false-alarm rate and detection delay of the monitor, on simulated checks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,8 +1,6 @@
 """The experiment of `coec evaluate --closure A B`: calibrates two sensors independently, and compares the results with
 the pose between them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast

@@ -1,7 +1,5 @@
 """Many simulated drives at once, each in one process on one core; finished ones stay on disk."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """`coec evaluate`: options and their combinations. `starts_experiment` and `closure_experiment` do the work."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, cast
 

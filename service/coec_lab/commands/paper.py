@@ -1,7 +1,5 @@
 """`coec paper`: options. `paper_experiments` does the work."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

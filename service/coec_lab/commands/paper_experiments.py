@@ -1,7 +1,5 @@
 """The experiments of `coec paper`: those of the paper, repeated on a recording, next to the published figures."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace

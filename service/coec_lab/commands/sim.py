@@ -1,7 +1,5 @@
 """`coec sim`: its commands; `drive` and `view` write simulated drives to files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`coec sim rig-drives` and `coec sim rig-moves`: whether a rig identifies the sensors that moved, and no others."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

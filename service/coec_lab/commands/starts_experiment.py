@@ -1,7 +1,5 @@
 """The experiment of `coec evaluate`: one recording with a known pose is solved from many starts around it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`coec demo`: a simulated vehicle is displaced, and the running service detects it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

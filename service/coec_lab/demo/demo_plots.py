@@ -2,8 +2,6 @@
 and point, what its pairs report, and which sensor has moved.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

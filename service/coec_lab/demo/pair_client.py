@@ -1,8 +1,6 @@
 """A client of the service during the demonstration: what it receives, compared with the truth that only the vehicle
 knows, and the outcome: correct before the displacement, an alarm after it, then corrected."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

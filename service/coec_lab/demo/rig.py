@@ -1,8 +1,6 @@
 """`coec demo --rig`: plays the acts one after the other, shows the rig from above, and reports which sensor was
 identified when."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict

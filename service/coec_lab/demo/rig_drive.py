@@ -1,8 +1,6 @@
 """Drives of the demonstration with a rig: scenario, the vehicle that renders them act by act, the client that sends its
 frames and receives the state of the rig, and the outcome: the displaced sensor is identified, and no other ever is."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence

@@ -7,8 +7,6 @@ The streams are drawn, not rendered, because 100 hours of driving are 72 000 che
 assumes: bad checks come in bursts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf, radians
@@ -19,16 +17,7 @@ from numpy.typing import NDArray
 from coec.calibration.baseline import PRIOR_SPREAD_POSE as SPREAD_POSE
 from coec.calibration.baseline import PRIOR_SPREAD_ROTATION as SPREAD_ROTATION
 from coec.calibration.baseline import STREET, UNCOMMISSIONED_BIAS, Accuracy
-from coec.calibration.monitor.change_detector import (
-    ACCUSING,
-    S_PER_H,
-    AlarmLevels,
-    MonitorState,
-    Observation,
-    after_observation,
-    alarm_level,
-    alarm_levels,
-)
+from coec.calibration.monitor import change_detector
 from coec.calibration.monitor.check_verdict import UNCOMMISSIONED
 from coec.calibration.monitor.sequential_tests import FREEDOM
 from coec.config import MonitorConfig
@@ -142,10 +131,10 @@ def measured(config: MonitorConfig, hours: float, steps: int, on_progress: OnPro
 def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarmCount, ...]:
     """Counts how often the evidence of a right mount rises to the level of each stated time. A rise counts once; the
     next can count only after the suspicion is over."""
-    levels = alarm_levels(config)
-    at = [alarm_level(config, stated) for stated in STATED_H]
+    levels = change_detector.alarm_levels(config)
+    at = [change_detector.alarm_level(config, stated) for stated in STATED_H]
     above, alarms = [False] * len(at), [0] * len(at)
-    checks = round(hours * S_PER_H / config.period_s)
+    checks = round(hours * change_detector.S_PER_H / config.period_s)
     for state in _states(_stream(np.random.default_rng(SEED), np.zeros((checks, 6)), config), levels):
         for place, level in enumerate(at):
             if state.evidence >= level and not above[place]:
@@ -170,34 +159,36 @@ def delay(config: MonitorConfig, step_deg: float, steps: int) -> Delay:
 
 def creep(config: MonitorConfig) -> Creep:
     """A mount that turns steadily about a drawn axis from the first check on."""
-    checks = round(CREEP_H * S_PER_H / config.period_s)
-    hours = np.arange(checks) * config.period_s / S_PER_H
+    checks = round(CREEP_H * change_detector.S_PER_H / config.period_s)
+    hours = np.arange(checks) * config.period_s / change_detector.S_PER_H
     suspect, confirmed = [], []
     for index in range(CREEPS):
         rng = np.random.default_rng([SEED, index])
         truth = np.zeros((checks, 6))
         truth[:, :3] = np.radians(CREEP_DEG_PER_H * hours)[:, None] * random_direction(rng)
         first = _first(config, _stream(rng, truth, config), 0)
-        suspect.append(first[0] * config.period_s / S_PER_H)
-        confirmed.append(first[1] * config.period_s / S_PER_H)
+        suspect.append(first[0] * config.period_s / change_detector.S_PER_H)
+        confirmed.append(first[1] * config.period_s / change_detector.S_PER_H)
     return Creep(CREEP_DEG_PER_H, tuple(suspect), tuple(confirmed))
 
 
 def from_start(config: MonitorConfig, off_deg: float, rigs: int) -> FromStart:
     """Rigs that are wrong about drawn axes from the first check on."""
-    requested_s, levels = [], alarm_levels(config)
+    requested_s, levels = [], change_detector.alarm_levels(config)
     for index in range(rigs):
         rng = np.random.default_rng([SEED, round(off_deg * 1000), index, WRONG_CHECKS])
         truth = np.zeros((WRONG_CHECKS, 6))
         truth[:, :3] = radians(off_deg) * random_direction(rng)
         states = enumerate(_states(_stream(rng, truth, config), levels), start=1)
-        requested_s.append(next((check * config.period_s for check, state in states if state.outcome in ACCUSING), inf))
+        requested_s.append(
+            next((check * config.period_s for check, state in states if state.outcome in change_detector.ACCUSING), inf)
+        )
     return FromStart(off_deg, tuple(requested_s))
 
 
-def _first(config: MonitorConfig, stream: Iterator[Observation], after: int) -> tuple[float, float]:
+def _first(config: MonitorConfig, stream: Iterator[change_detector.Observation], after: int) -> tuple[float, float]:
     """Checks from index `after` on until the evidence reached the suspect level and the confirmed level."""
-    levels = alarm_levels(config)
+    levels = change_detector.alarm_levels(config)
     suspect = float("inf")
     for index, state in enumerate(_states(stream, levels)):
         if index < after:
@@ -209,14 +200,18 @@ def _first(config: MonitorConfig, stream: Iterator[Observation], after: int) -> 
     return suspect, float("inf")
 
 
-def _states(stream: Iterator[Observation], levels: AlarmLevels) -> Iterator[MonitorState]:
-    state = MonitorState()
+def _states(
+    stream: Iterator[change_detector.Observation], levels: change_detector.AlarmLevels
+) -> Iterator[change_detector.MonitorState]:
+    state = change_detector.MonitorState()
     for observation in stream:
-        state = after_observation(state, observation, levels)
+        state = change_detector.after_observation(state, observation, levels)
         yield state
 
 
-def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: MonitorConfig) -> Iterator[Observation]:
+def _stream(
+    rng: np.random.Generator, truth: NDArray[np.float64], config: MonitorConfig
+) -> Iterator[change_detector.Observation]:
     """Checks of a mount that is off what is served by `truth` (n, 6), rad and m."""
     turns = Accuracy(np.zeros(6), UNCOMMISSIONED_BIAS, SPREAD_ROTATION)
     shifts = Accuracy(np.zeros(6), UNCOMMISSIONED_BIAS, SPREAD_POSE)
@@ -241,7 +236,7 @@ def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: Monito
     period_ns = round(config.period_s * 1e9)
     for index in range(checks):
         begin_ns = index * period_ns
-        yield Observation(
+        yield change_detector.Observation(
             stamp_ns=begin_ns + period_ns - 1,
             pair_stamps_ns=tuple(begin_ns + pair for pair in range(config.pairs)),
             metrics=(),

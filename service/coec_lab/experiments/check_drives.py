@@ -17,15 +17,9 @@ from numpy.typing import NDArray
 from coec.calibration.baseline import Baseline, learned_hash
 from coec.calibration.commissioning import FAR_RAD, learn_accuracy, learn_limits
 from coec.calibration.frames.pairing import Pairer
+from coec.calibration.monitor import check_verdict
 from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
 from coec.calibration.monitor.check_edges import ROTATION_DOF
-from coec.calibration.monitor.check_verdict import (
-    FALSE_ALARM_RATE,
-    UNCOMMISSIONED,
-    expected_of,
-    faintness,
-    judge_check,
-)
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.solver import prepare_window_data
 from coec.calibration.types import CameraFrame, DepthModel, FramePair, ImageReader, Matrix4, Rig, Silence, Window
@@ -155,10 +149,11 @@ def commissioned(rig: str) -> Baseline:
     depth = open_depth(configuration.depth, LimitsConfig())
     evidence = gather(prepare_window_data(whole, depth, GreyImages(LimitsConfig()), configuration, Silence()), FAR_RAD)
     rotation, pose = learn_accuracy(evidence, stages[0].truth)
-    limits = learn_limits(evidence, stages[0].truth, configuration, (rotation, pose), FALSE_ALARM_RATE)
+    limits = learn_limits(evidence, stages[0].truth, configuration, (rotation, pose), check_verdict.FALSE_ALARM_RATE)
     return Baseline(
         pair=whole.rig.pair, T_camera_lidar=stages[0].truth, rotation=rotation, pose=pose, dof=ROTATION_DOF, limits={},
-        monitor=limits, scene=scene_baseline(evidence.scenes), false_alarm_rate=FALSE_ALARM_RATE, windows=len(stages),
+        monitor=limits, scene=scene_baseline(evidence.scenes),
+        false_alarm_rate=check_verdict.FALSE_ALARM_RATE, windows=len(stages),
         pairs=len(pairs), detected={}, sensors={}, depth_identity=depth.identity,
         config_hash=learned_hash(configuration),
     )  # fmt: skip
@@ -191,7 +186,7 @@ def _failed(row: CheckedDrive, error: CoecError) -> CheckedDrive:
 
 def _checked(stage: _PreparedDrive, drive: CheckDrive, baseline: Baseline | None) -> tuple[CheckedPose, ...]:
     configuration = _configuration()
-    expected = expected_of(baseline)
+    expected = check_verdict.expected_of(baseline)
     starts = range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS)
     windows = [stage.window(stage.pairs[first : first + CHECK_PAIRS]) for first in starts]
     windows_data = [
@@ -270,8 +265,10 @@ def _configuration() -> CalibrationConfig:
 
 
 def _judged(evidence: CheckInput, check: Check, pose: Matrix4, baseline: Baseline | None) -> Judged:
-    seen = judge_check(evidence, check, pose, baseline)
-    faint = faintness(evidence.pairs, check, UNCOMMISSIONED if baseline is None else baseline.monitor)
+    seen = check_verdict.judge_check(evidence, check, pose, baseline)
+    faint = check_verdict.faintness(
+        evidence.pairs, check, check_verdict.UNCOMMISSIONED if baseline is None else baseline.monitor
+    )
     return Judged(
         offset=vector6_of(seen.offset), sigma=vector6_of(seen.sigma), noise=vector6_of(seen.noise),
         place=vector6_of(seen.place), dispersion=seen.dispersion, distance2=seen.distance2,

@@ -32,31 +32,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import poisson_most
-from coec.calibration.monitor.change_detector import (
-    S_PER_H,
-    AlarmLevels,
-    MonitorOutcome,
-    MonitorState,
-    Observation,
-    after_observation,
-    alarm_levels,
-    doubtful_after,
-)
+from coec.calibration.monitor import change_detector
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.config import MonitorConfig
 from coec.reports import console
+from coec_lab.experiments import simulation_schemas
 from coec_lab.experiments.check_drives import CHECK_PAIRS, CHECKS, MOVES, PERIOD_S, RIGHT
 from coec_lab.experiments.detection import CONFIDENCE, interval
-from coec_lab.experiments.simulation_schemas import (
-    CheckedDrive,
-    ChecksReport,
-    HoursStatistics,
-    Judged,
-    MovedStatistics,
-    PlaceStatistics,
-    RigStatistics,
-    TailStatistics,
-)
 
 SETTLED_BEFORE_PLACE = 24
 """Checks of a right mount before a place: two minutes at one every five seconds."""
@@ -87,7 +69,7 @@ BOUND_CONFIDENCE = 0.95
 PLACE_SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
-Alarms = Callable[[Sequence[Judged]], bool]
+Alarms = Callable[[Sequence[simulation_schemas.Judged]], bool]
 """Whether a detector accuses the mount in a sequence of checks."""
 
 
@@ -101,11 +83,11 @@ class PlaceChecks:
             deviations of `place` in such a scene. By the median, one outlying check displaces no place.
     """
 
-    checks: tuple[tuple[Judged, ...], ...]
+    checks: tuple[tuple[simulation_schemas.Judged, ...], ...]
     displacement: NDArray[np.float64]
 
     @classmethod
-    def from_drives(cls, drives: Sequence[Sequence[Judged]]) -> PlaceChecks:
+    def from_drives(cls, drives: Sequence[Sequence[simulation_schemas.Judged]]) -> PlaceChecks:
         """Every drive is one place; drives with fewer than `MIN_CHECKS` clear checks are left out."""
         eligible = tuple(checks for checks in map(_clear, drives) if len(checks) >= MIN_CHECKS)
         far = [float(np.max(np.abs(_centre(checks)) / _place_sigma(checks))) for checks in eligible]
@@ -122,14 +104,14 @@ class Bound:
     half: float | None
 
 
-def _clear(drive: Sequence[Judged]) -> tuple[Judged, ...]:
+def _clear(drive: Sequence[simulation_schemas.Judged]) -> tuple[simulation_schemas.Judged, ...]:
     """The checks of a drive that may accuse."""
-    clear: list[Judged] = []
+    clear: list[simulation_schemas.Judged] = []
     doubtful = 0.0
     for check in drive:
         if not check.causes and not check.faint and doubtful == 0.0:
             clear.append(check)
-        doubtful = doubtful_after(doubtful, bool(check.faint), 1.0)
+        doubtful = change_detector.doubtful_after(doubtful, bool(check.faint), 1.0)
     return tuple(clear)
 
 
@@ -185,7 +167,9 @@ def _accused(places: PlaceChecks, displacement: float, stay_checks: int, alarms:
     return float(np.mean([alarms(_stay(places, displacement, stay_checks, rng)) for _ in range(DRAWS)]))
 
 
-def _stay(places: PlaceChecks, displacement: float, stay_checks: int, rng: np.random.Generator) -> list[Judged]:
+def _stay(
+    places: PlaceChecks, displacement: float, stay_checks: int, rng: np.random.Generator
+) -> list[simulation_schemas.Judged]:
     """Checks of a right mount, followed by checks of a place that is off about or along one axis."""
     checks = places.checks[int(rng.integers(len(places.checks)))]
     offsets = _offsets(checks)
@@ -201,17 +185,17 @@ def _stay(places: PlaceChecks, displacement: float, stay_checks: int, rng: np.ra
     ]
 
 
-def _place_sigma(checks: Sequence[Judged]) -> NDArray[np.float64]:
+def _place_sigma(checks: Sequence[simulation_schemas.Judged]) -> NDArray[np.float64]:
     """(6,) the standard deviation of a place, given the dispersions of its checks."""
     return np.asarray(np.mean([np.array(check.place) * check.dispersion for check in checks], axis=0))
 
 
-def _centre(checks: Sequence[Judged]) -> NDArray[np.float64]:
+def _centre(checks: Sequence[simulation_schemas.Judged]) -> NDArray[np.float64]:
     """(6,) median offset of the checks of a place, so that an outlier does not count."""
     return np.asarray(np.median(_offsets(checks), axis=0))
 
 
-def _offsets(checks: Sequence[Judged]) -> NDArray[np.float64]:
+def _offsets(checks: Sequence[simulation_schemas.Judged]) -> NDArray[np.float64]:
     return np.array([check.offset for check in checks])
 
 
@@ -226,25 +210,27 @@ SEED = 20_230_617
 
 CONFIG = MonitorConfig(period_s=PERIOD_S, pairs=CHECK_PAIRS)
 
-Where = tuple[str, Judged]
+Where = tuple[str, simulation_schemas.Judged]
 """A check and the name of its place."""
 
 
-def report(rows: Sequence[CheckedDrive], resampled_h: float) -> ChecksReport:
+def report(rows: Sequence[simulation_schemas.CheckedDrive], resampled_h: float) -> simulation_schemas.ChecksReport:
     """All figures of the rows."""
-    return ChecksReport(
+    return simulation_schemas.ChecksReport(
         drives=len(rows),
         failed={row.name: row.failure for row in rows if row.failure is not None},
         rigs=tuple(_of_rigs(rows, of_rig, resampled_h) for of_rig in (False, True)),
     )
 
 
-def _of_rigs(rows: Sequence[CheckedDrive], commissioned: bool, resampled_h: float) -> RigStatistics:
+def _of_rigs(
+    rows: Sequence[simulation_schemas.CheckedDrive], commissioned: bool, resampled_h: float
+) -> simulation_schemas.RigStatistics:
     right = {row.name: checks for row in rows if (checks := _checks(row, RIGHT, commissioned))}
     known = [row for row in rows if row.name in right]
     hours = [_hours("rendered", _in_turn(known, right))]
     if known and resampled_h > 0.0:
-        most = round(resampled_h * S_PER_H / PERIOD_S)
+        most = round(resampled_h * change_detector.S_PER_H / PERIOD_S)
         hours.append(_hours("resampled", _at_most(_resampled(known, right), most)))
     settled = PlaceChecks.from_drives([right[row.name] for row in known])
     tails = [one for stay in (CHECKS, PLACE_CHECKS) if (one := _tail(settled, stay)) is not None]
@@ -253,25 +239,31 @@ def _of_rigs(rows: Sequence[CheckedDrive], commissioned: bool, resampled_h: floa
         _place(place, [check for row in known if row.place == place for check in right[row.name]])
         for place in dict.fromkeys(row.place for row in known)
     )
-    return RigStatistics(
+    return simulation_schemas.RigStatistics(
         commissioned=commissioned, moved=tuple(moved), places=places, hours=tuple(hours), tails=tuple(tails)
     )
 
 
-def _checks(row: CheckedDrive, moved: str, commissioned: bool) -> tuple[Judged, ...]:
+def _checks(
+    row: simulation_schemas.CheckedDrive, moved: str, commissioned: bool
+) -> tuple[simulation_schemas.Judged, ...]:
     for pose in row.poses:
         if pose.moved == moved:
             return pose.commissioned if commissioned else pose.uncommissioned
     return ()
 
 
-def _in_turn(rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]]) -> Iterator[list[Where]]:
+def _in_turn(
+    rows: Sequence[simulation_schemas.CheckedDrive], right: dict[str, tuple[simulation_schemas.Judged, ...]]
+) -> Iterator[list[Where]]:
     """One vehicle per rig: all checks of its drives, one drive after the other."""
     for rig in dict.fromkeys(row.rig for row in rows):
         yield [(f"{rig} {row.place}", check) for row in rows if row.rig == rig for check in right[row.name]]
 
 
-def _resampled(rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]]) -> Iterator[list[Where]]:
+def _resampled(
+    rows: Sequence[simulation_schemas.CheckedDrive], right: dict[str, tuple[simulation_schemas.Judged, ...]]
+) -> Iterator[list[Where]]:
     """Vehicles without end, one of each rig in turn, each of which visits one place after the other."""
     rng = np.random.default_rng(SEED)
     rigs = list(dict.fromkeys(row.rig for row in rows))
@@ -297,23 +289,25 @@ def _at_most(vehicles: Iterable[list[Where]], checks: int) -> Iterator[list[Wher
             return
 
 
-def _hours(how: str, vehicles: Iterable[list[Where]]) -> HoursStatistics:
-    levels = alarm_levels(CONFIG)
+def _hours(how: str, vehicles: Iterable[list[Where]]) -> simulation_schemas.HoursStatistics:
+    levels = change_detector.alarm_levels(CONFIG)
     checks = suspicions = 0
     alarmed: list[str] = []
     for driven in vehicles:
-        before = MonitorState()
+        before = change_detector.MonitorState()
         for (where, _), state in zip(driven, states([check for _, check in driven], levels), strict=True):
             checks += 1
             worse = state.outcome is not before.outcome
             suspicions += (
-                worse and state.outcome is MonitorOutcome.SUSPECT and before.outcome is not MonitorOutcome.CONFIRMED
+                worse
+                and state.outcome is change_detector.MonitorOutcome.SUSPECT
+                and before.outcome is not change_detector.MonitorOutcome.CONFIRMED
             )
-            if worse and state.outcome is MonitorOutcome.CONFIRMED:
+            if worse and state.outcome is change_detector.MonitorOutcome.CONFIRMED:
                 alarmed.append(where)
             before = state
-    driven_h = checks * PERIOD_S / S_PER_H
-    return HoursStatistics(
+    driven_h = checks * PERIOD_S / change_detector.S_PER_H
+    return simulation_schemas.HoursStatistics(
         how=how,
         hours=driven_h,
         suspicions=suspicions,
@@ -330,45 +324,48 @@ class _CheckTally:
     blind: int
     weak: int
     undecided: int
-    decided: tuple[Judged, ...]
+    decided: tuple[simulation_schemas.Judged, ...]
 
 
-def _tally(checks: Sequence[Judged]) -> _CheckTally:
+def _tally(checks: Sequence[simulation_schemas.Judged]) -> _CheckTally:
     seeing = [check for check in checks if not check.causes]
     clear = [check for check in seeing if not check.faint]
     decided = tuple(check for check in clear if not check.undecided)
     return _CheckTally(len(checks) - len(seeing), len(seeing) - len(clear), len(clear) - len(decided), decided)
 
 
-def _place(place: str, checks: Sequence[Judged]) -> PlaceStatistics:
+def _place(place: str, checks: Sequence[simulation_schemas.Judged]) -> simulation_schemas.PlaceStatistics:
     tally = _tally(checks)
-    return PlaceStatistics(
+    return simulation_schemas.PlaceStatistics(
         place=place, checks=len(checks), blind=tally.blind, weak=tally.weak, undecided=tally.undecided,
         flagged=sum(check.flagged for check in tally.decided),
     )  # fmt: skip
 
 
-def _tail(places: PlaceChecks, stay_checks: int) -> TailStatistics | None:
+def _tail(places: PlaceChecks, stay_checks: int) -> simulation_schemas.TailStatistics | None:
     """The bound for a vehicle that comes to another place after every `stay_checks` checks."""
-    levels = alarm_levels(CONFIG)
+    levels = change_detector.alarm_levels(CONFIG)
 
-    def alarms(checks: Sequence[Judged]) -> bool:
-        return any(state.outcome is MonitorOutcome.CONFIRMED for state in states(checks, levels))
+    def alarms(checks: Sequence[simulation_schemas.Judged]) -> bool:
+        return any(state.outcome is change_detector.MonitorOutcome.CONFIRMED for state in states(checks, levels))
 
-    estimate = bound(places, stay_checks, S_PER_H / PERIOD_S / stay_checks, alarms)
+    estimate = bound(places, stay_checks, change_detector.S_PER_H / PERIOD_S / stay_checks, alarms)
     if estimate is None:
         return None
-    return TailStatistics(
+    return simulation_schemas.TailStatistics(
         stay_checks=stay_checks, places=len(places.checks), farthest=float(places.displacement.max()),
         accused_at=estimate.half, alarms_per_100_h=estimate.mean, alarms_per_100_h_at_most=estimate.at_most,
     )  # fmt: skip
 
 
 def _moved(
-    name: str, rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]], commissioned: bool
-) -> MovedStatistics:
-    levels = alarm_levels(CONFIG)
-    everything: list[Judged] = []
+    name: str,
+    rows: Sequence[simulation_schemas.CheckedDrive],
+    right: dict[str, tuple[simulation_schemas.Judged, ...]],
+    commissioned: bool,
+) -> simulation_schemas.MovedStatistics:
+    levels = change_detector.alarm_levels(CONFIG)
+    everything: list[simulation_schemas.Judged] = []
     drives = suspected = 0
     delays: list[int] = []
     for place, row in enumerate(rows):
@@ -387,24 +384,26 @@ def _moved(
     clear = tally.decided
     flagged = sum(check.flagged for check in clear)
     low, high = interval(flagged, len(clear)) if clear else (None, None)
-    return MovedStatistics(
+    return simulation_schemas.MovedStatistics(
         moved=name, drives=drives, checks=len(everything), blind=tally.blind, weak=tally.weak,
         undecided=tally.undecided, clear=len(clear), flagged=flagged,
         flagged_low=low, flagged_high=high, suspected=suspected, confirmed=len(delays), delay_checks=tuple(delays),
     )  # fmt: skip
 
 
-def states(checks: Iterable[Judged], levels: AlarmLevels) -> Iterator[MonitorState]:
+def states(
+    checks: Iterable[simulation_schemas.Judged], levels: change_detector.AlarmLevels
+) -> Iterator[change_detector.MonitorState]:
     """The state of the change detector after each check; no two checks share a pair."""
-    state = MonitorState()
+    state = change_detector.MonitorState()
     for number, check in enumerate(checks):
-        state = after_observation(state, _observation(check, number), levels)
+        state = change_detector.after_observation(state, _observation(check, number), levels)
         yield state
 
 
-def _observation(check: Judged, number: int) -> Observation:
+def _observation(check: simulation_schemas.Judged, number: int) -> change_detector.Observation:
     begin_ns = round(number * PERIOD_S * 1e9)
-    return Observation(
+    return change_detector.Observation(
         stamp_ns=begin_ns + CHECK_PAIRS - 1, pair_stamps_ns=tuple(begin_ns + pair for pair in range(CHECK_PAIRS)),
         metrics=(), offset=np.array(check.offset), sigma=np.array(check.sigma), noise=np.array(check.noise),
         place=np.array(check.place), dispersion=check.dispersion, distance2=check.distance2, flagged=check.flagged,
@@ -413,7 +412,7 @@ def _observation(check: Judged, number: int) -> Observation:
     )  # fmt: skip
 
 
-def show(report: ChecksReport) -> None:
+def show(report: simulation_schemas.ChecksReport) -> None:
     """Prints shares of checks and drives by move, then false alarms in hours of driving."""
     for rigs in report.rigs:
         _show(rigs)
@@ -421,7 +420,7 @@ def show(report: ChecksReport) -> None:
         console.show(f"no result: {name}: {failure}", "red")
 
 
-def _show(rigs: RigStatistics) -> None:
+def _show(rigs: simulation_schemas.RigStatistics) -> None:
     console.show("commissioned rigs" if rigs.commissioned else "rigs of which nothing is known", "bold")
     table = console.table(
         "served pose", "checks", "blind", "faint", "undecided", "clear", "flagged", "of clear", "95 %", "drives",

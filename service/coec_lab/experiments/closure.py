@@ -5,8 +5,6 @@ Two cameras A and B beside one LiDAR: T_B_A · T_A_lidar should be T_B_lidar. Tw
 T_B_A⁻¹ should be T_camera_B. The difference is the closure error, ξ about the axes of camera B.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum

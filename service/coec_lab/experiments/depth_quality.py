@@ -5,8 +5,6 @@ the place of its maximum show what the paper's method would make of the network 
 information is as good as its depth).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -15,12 +13,8 @@ from math import degrees, radians
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.objective import mutual_information
 from coec.calibration.objective.landscape import measure_curvature
-from coec.calibration.objective.mutual_information import (
-    SearchBox,
-    build_mutual_information,
-    distance_and_depth,
-)
 from coec.calibration.search.local_search import maximise
 from coec.calibration.solver import WindowData
 from coec.calibration.types import DepthMap, Matrix4, Rig, Silence
@@ -141,9 +135,12 @@ def assess(window_data: WindowData, config: CalibrationConfig, on_progress: Call
         pair_up(xyz_m, depth, rig, reference, config.objective) for xyz_m, depth in zip(clouds, maps, strict=True)
     )
     on_progress(1, "ranks")
-    features = [distance_and_depth(xyz_m, depth, reference) for xyz_m, depth in zip(clouds, maps, strict=True)]
-    box = SearchBox(radians(SEARCH_DEG), 0.0)
-    objective = build_mutual_information(features, rig, reference, box, config.objective)
+    features = [
+        mutual_information.distance_and_depth(xyz_m, depth, reference)
+        for xyz_m, depth in zip(clouds, maps, strict=True)
+    ]
+    box = mutual_information.SearchBox(radians(SEARCH_DEG), 0.0)
+    objective = mutual_information.build_mutual_information(features, rig, reference, box, config.objective)
     search = config.search.model_copy(update={"dof": 3, "rotation_deg": SEARCH_DEG})
     optimum = maximise(objective, reference, search, Silence()).T_camera_lidar
     on_progress(2, "optimum")

@@ -6,8 +6,6 @@ paper's, equation (2). On pairs from which its limits were not learned, the pape
 KITTI-360, because mutual information depends on the scene as much as on the pose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import radians, sqrt

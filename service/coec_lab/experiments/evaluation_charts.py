@@ -2,8 +2,6 @@
 the paper's figures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from math import degrees

@@ -1,7 +1,5 @@
 """Converts the statistics of an evaluation to wire models: degrees instead of radians, null instead of NaN."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from math import degrees

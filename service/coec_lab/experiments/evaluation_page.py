@@ -1,8 +1,6 @@
 """The page of `coec evaluate`: solves from starts all around a known pose, how many found it, and how far off they
 ended."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from coec.reports.charts import Chart, Limit, Series
@@ -10,18 +8,7 @@ from coec.reports.console import AXIS_NAMES, UNITS
 from coec.reports.formatting import count, number, percent
 from coec.reports.page import Block, Cell, Charts, Facts, Page, Section, Table, Text, Tone, VerdictBanner
 from coec.reports.page_parts import DIGITS, SHOWN_UNITS, Provenance, depth_items
-from coec_lab.experiments import evaluation_charts
-from coec_lab.experiments.evaluation_schema import (
-    ComparisonReport,
-    DetectionReport,
-    EvaluationReport,
-    FramesPoint,
-    HalvesReport,
-    NormalisedErrorsReport,
-    SlicePoint,
-    Spread,
-    StepRow,
-)
+from coec_lab.experiments import evaluation_charts, evaluation_schema
 from coec_lab.experiments.evaluation_tables import reference_doubt, setting
 
 ERROR_MEANING = (
@@ -30,7 +17,9 @@ ERROR_MEANING = (
 )
 
 
-def evaluation_page(report: EvaluationReport, ends: Sequence[Block], worst: Sequence[Block], made: Provenance) -> Page:
+def evaluation_page(
+    report: evaluation_schema.EvaluationReport, ends: Sequence[Block], worst: Sequence[Block], made: Provenance
+) -> Page:
     """The page of one method.
 
     Args:
@@ -50,7 +39,7 @@ def evaluation_page(report: EvaluationReport, ends: Sequence[Block], worst: Sequ
     return Page("coec evaluate", title, (_verdict(report),), tuple(sections))
 
 
-def comparison_page(report: ComparisonReport, ends: Sequence[Block], made: Provenance) -> Page:
+def comparison_page(report: evaluation_schema.ComparisonReport, ends: Sequence[Block], made: Provenance) -> Page:
     """The page of several methods side by side, with pictures of where their searches ended. Each method also has a
     page of its own in the folder of its name."""
     rows: list[Sequence[str | Cell]] = [
@@ -86,7 +75,7 @@ def comparison_page(report: ComparisonReport, ends: Sequence[Block], made: Prove
     return Page("coec evaluate", f"Methods side by side on {best.vehicle} / {best.pair}", opening, sections)
 
 
-def detection_table(detection: DetectionReport) -> Table:
+def detection_table(detection: evaluation_schema.DetectionReport) -> Table:
     """Checks after moves of the extrinsic, and how many of them each classifier flags."""
     rows = [
         (
@@ -108,7 +97,7 @@ def detection_table(detection: DetectionReport) -> Table:
     return Table(caption, heads, rows, frozenset(range(1, 6)))
 
 
-def _verdict(report: EvaluationReport) -> VerdictBanner:
+def _verdict(report: evaluation_schema.EvaluationReport) -> VerdictBanner:
     misses = report.verdicts.accepted_misses
     limits = f"{report.hit_rotation_deg:g}°"
     if report.hit_translation_m is not None:
@@ -131,8 +120,8 @@ def _verdict(report: EvaluationReport) -> VerdictBanner:
     return VerdictBanner(tone, "No miss was accepted.", f"{sentence}{lost}")
 
 
-def _spreads(report: EvaluationReport) -> Table:
-    def row(name: str, spread: Spread, unit: str, digits: int) -> tuple[str, ...]:
+def _spreads(report: evaluation_schema.EvaluationReport) -> Table:
+    def row(name: str, spread: evaluation_schema.Spread, unit: str, digits: int) -> tuple[str, ...]:
         return name, *(number(value, digits) for value in (spread.median, spread.p95, spread.max)), unit
 
     rows = [row("Rotation error", report.rotation_deg, "°", 3)]
@@ -142,7 +131,7 @@ def _spreads(report: EvaluationReport) -> Table:
     return Table("All starts, hits and misses", ("", "Median", "95 %", "Largest", "Unit"), rows, frozenset({1, 2, 3}))
 
 
-def _axes(report: EvaluationReport) -> Table:
+def _axes(report: evaluation_schema.EvaluationReport) -> Table:
     columns = (report.bias, report.std, report.rms, report.sigma, report.median, report.from_reference)
     rows = [
         (
@@ -156,7 +145,7 @@ def _axes(report: EvaluationReport) -> Table:
     return Table("Error per axis of the camera", ("Axis", *named, "Unit"), rows, frozenset(range(1, 7)))
 
 
-def _verdicts(report: EvaluationReport) -> Table:
+def _verdicts(report: evaluation_schema.EvaluationReport) -> Table:
     counts = report.verdicts
     rows = (
         (Cell("accepted", tone="good"), str(counts.accepted_hits), str(counts.accepted_misses)),
@@ -165,7 +154,7 @@ def _verdicts(report: EvaluationReport) -> Table:
     return Table("Starts by verdict and by truth", ("Verdict", "Hits", "Misses"), rows, frozenset({1, 2}))
 
 
-def _experiments(report: EvaluationReport) -> list[Section]:
+def _experiments(report: evaluation_schema.EvaluationReport) -> list[Section]:
     sections = []
     hit_deg = report.hit_rotation_deg
     if report.frames:
@@ -190,7 +179,11 @@ def _experiments(report: EvaluationReport) -> list[Section]:
 
 
 def _errors_chart(
-    title: str, x_label: str, at: Sequence[float], points: Sequence[FramesPoint | SlicePoint], hit_deg: float
+    title: str,
+    x_label: str,
+    at: Sequence[float],
+    points: Sequence[evaluation_schema.FramesPoint | evaluation_schema.SlicePoint],
+    hit_deg: float,
 ) -> Chart:
     def series(name: str, values: Sequence[float | None], shape: str = "line") -> Series:
         known = [(x, value) for x, value in zip(at, values, strict=True) if value is not None]
@@ -218,7 +211,9 @@ MOST_TICKS = 8
 """Most points of an axis for which each gets a label; with more, labels would run into each other."""
 
 
-def _points(points: Sequence[FramesPoint | SlicePoint], at: Sequence[float], head: str) -> Table:
+def _points(
+    points: Sequence[evaluation_schema.FramesPoint | evaluation_schema.SlicePoint], at: Sequence[float], head: str
+) -> Table:
     rows = [
         (
             f"{x:g}",
@@ -232,7 +227,7 @@ def _points(points: Sequence[FramesPoint | SlicePoint], at: Sequence[float], hea
     return Table("Rotation errors of all solves", heads, rows, frozenset(range(6)))
 
 
-def _halves(halves: HalvesReport, dof: int) -> Table:
+def _halves(halves: evaluation_schema.HalvesReport, dof: int) -> Table:
     rows = [
         (
             AXIS_NAMES[axis],
@@ -250,7 +245,7 @@ def _halves(halves: HalvesReport, dof: int) -> Table:
     return Table(caption, heads, rows, frozenset(range(1, 5)))
 
 
-def _normalised(report: NormalisedErrorsReport) -> tuple[Block, ...]:
+def _normalised(report: evaluation_schema.NormalisedErrorsReport) -> tuple[Block, ...]:
     rows = [
         (
             name,
@@ -274,7 +269,7 @@ def _normalised(report: NormalisedErrorsReport) -> tuple[Block, ...]:
     return table, Text((nees_text,), quiet=True), evaluation_charts.normalised(report)
 
 
-def _steps(steps: Sequence[StepRow]) -> Table:
+def _steps(steps: Sequence[evaluation_schema.StepRow]) -> Table:
     rows = [
         (
             row.name,
@@ -290,7 +285,7 @@ def _steps(steps: Sequence[StepRow]) -> Table:
     return Table("Windows within which the mount was moved", heads, rows, frozenset(range(1, 9)))
 
 
-def _setting(report: EvaluationReport) -> Facts:
+def _setting(report: evaluation_schema.EvaluationReport) -> Facts:
     box = f"±{report.search_rotation_deg:g}°"
     if report.search_translation_m > 0:
         box += f", ±{report.search_translation_m:g} m"
@@ -309,7 +304,7 @@ def _setting(report: EvaluationReport) -> Facts:
     )
 
 
-def _origin(report: EvaluationReport) -> tuple[tuple[str, str], ...]:
+def _origin(report: evaluation_schema.EvaluationReport) -> tuple[tuple[str, str], ...]:
     return (
         ("Source", report.source),
         ("Window", report.window_id),
@@ -318,7 +313,7 @@ def _origin(report: EvaluationReport) -> tuple[tuple[str, str], ...]:
     )
 
 
-def detection_page(detection: DetectionReport, source: str, made: Provenance) -> Page:
+def detection_page(detection: evaluation_schema.DetectionReport, source: str, made: Provenance) -> Page:
     """How well wrong extrinsics are detected on a recording."""
     checks = sum(row.checks for row in detection.moves)
     sentence = f"{count(checks, 'check')} at the right extrinsic and at moved ones; see which of them are flagged."

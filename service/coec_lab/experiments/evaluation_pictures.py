@@ -1,7 +1,5 @@
 """The pictures of `coec evaluate --output DIR`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import degrees

@@ -1,7 +1,5 @@
 """One recording, one known pose, many starts around it: the flow of an evaluation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from math import degrees, radians
@@ -25,19 +23,8 @@ from coec.recording import CallbackProgress, Recording, fit_camera
 from coec.recording import Window as PublicWindow
 from coec.reports.page_parts import finite_degrees
 from coec.schemas.replies import Vector6
-from coec_lab.experiments import solve_experiments, solve_statistics
+from coec_lab.experiments import evaluation_documents, solve_experiments, solve_statistics
 from coec_lab.experiments.detection import require_enough
-from coec_lab.experiments.evaluation_documents import (
-    angle_spread_of,
-    detection_of,
-    frames_point_of,
-    halves_of,
-    normalised_of,
-    slice_point_of,
-    spread_of,
-    steps_of,
-    verdicts_of,
-)
 from coec_lab.experiments.evaluation_schema import DetectionReport, EvaluationReport, StepRow
 from coec_lab.experiments.solve_experiments import Bench, Stages
 from coec_lab.experiments.solve_statistics import (
@@ -225,9 +212,9 @@ def _try_further(
         done.normalised[OTHER_HALF] = solve_statistics.normalise(solve_statistics.of_differences(halved), independent=1)
     if plan.detection:
         seen = solve_experiments.detected(bench, plan.detection, solve_experiments.CHECKS, stages)
-        done.detection = detection_of(seen, plan.detection, len(bench.window.pairs))
+        done.detection = evaluation_documents.detection_of(seen, plan.detection, len(bench.window.pairs))
     if plan.steps:
-        done.steps = steps_of(solve_experiments.mount_step_trials(bench, plan.steps, stages))
+        done.steps = evaluation_documents.steps_of(solve_experiments.mount_step_trials(bench, plan.steps, stages))
 
 
 def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
@@ -271,26 +258,28 @@ def report_of(
         starts=summary.starts,
         hits=summary.hits,
         hit_rate=summary.hit_rate,
-        rotation_deg=angle_spread_of(summary.rotation_rad),
-        translation_m=spread_of(summary.translation_m),
+        rotation_deg=evaluation_documents.angle_spread_of(summary.rotation_rad),
+        translation_m=evaluation_documents.spread_of(summary.translation_m),
         median=cast("Vector6", finite_degrees(summary.median)),
         bias=finite_degrees(summary.bias),
         std=finite_degrees(summary.std),
         rms=finite_degrees(summary.rms),
         sigma=finite_degrees(summary.sigma),
         from_reference=cast("Vector6", finite_degrees(done.from_reference.error)),
-        solve_s=spread_of(summary.solve_s),
-        evaluations=spread_of(summary.evaluations),
+        solve_s=evaluation_documents.spread_of(summary.solve_s),
+        evaluations=evaluation_documents.spread_of(summary.evaluations),
         classified_correctly=summary.classified_correctly,
-        verdicts=verdicts_of(summary.verdicts),
+        verdicts=evaluation_documents.verdicts_of(summary.verdicts),
         stop_reasons=summary.stop_reasons,
         worst_start=solve_statistics.worst(done.outcomes),
-        frames=tuple(frames_point_of(point) for point in done.frames),
-        slices=tuple(slice_point_of(point) for point in done.slices),
-        halves=None if done.halves is None else halves_of(done.halves),
+        frames=tuple(evaluation_documents.frames_point_of(point) for point in done.frames),
+        slices=tuple(evaluation_documents.slice_point_of(point) for point in done.slices),
+        halves=None if done.halves is None else evaluation_documents.halves_of(done.halves),
         detection=done.detection,
         steps=done.steps,
-        normalised=tuple(normalised_of(against, errors) for against, errors in done.normalised.items()),
+        normalised=tuple(
+            evaluation_documents.normalised_of(against, errors) for against, errors in done.normalised.items()
+        ),
         depth_identity=solved.depth_identity,
         config_hash=solved.config_hash,
         elapsed_s=elapsed_s,

@@ -4,8 +4,6 @@ Angles in degrees, lengths in metres, axes rx ry rz tx ty tz about and along the
 computed is null.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

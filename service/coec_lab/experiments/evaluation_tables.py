@@ -1,7 +1,5 @@
 """The tables of `coec evaluate`: for people, and starts.csv."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Sequence
@@ -13,20 +11,8 @@ from coec.geometry import se3
 from coec.reports import console
 from coec.reports.formatting import count
 from coec.reports.page_parts import finite_degrees
-from coec_lab.experiments import solve_statistics
+from coec_lab.experiments import evaluation_schema, solve_statistics
 from coec_lab.experiments.detection import RIGHT
-from coec_lab.experiments.evaluation_schema import (
-    ClosureReport,
-    ComparisonReport,
-    DetectionReport,
-    EvaluationReport,
-    FramesPoint,
-    HalvesReport,
-    NormalisedErrorsReport,
-    SlicePoint,
-    Spread,
-    StepRow,
-)
 from coec_lab.experiments.solve_statistics import SolveOutcome
 
 CSV_FIGURES = (
@@ -41,7 +27,7 @@ def setting(rotation_deg: float, translation_m: float) -> str:
     return f"{rotation_deg:g}°" + (f" and {translation_m:g} m away" if translation_m > 0 else " away")
 
 
-def reference_doubt(report: EvaluationReport) -> str | None:
+def reference_doubt(report: evaluation_schema.EvaluationReport) -> str | None:
     """Where searches from all around meet beside the source's calibration, and one that began at it ends there, too: a
     sentence that says so, as the misses may be the reference's. None where they do not."""
     difference = [middle - end for middle, end in zip(report.median, report.from_reference, strict=True)]
@@ -56,7 +42,7 @@ def reference_doubt(report: EvaluationReport) -> str | None:
     )
 
 
-def _is_hit(report: EvaluationReport, error: Sequence[float]) -> bool:
+def _is_hit(report: evaluation_schema.EvaluationReport, error: Sequence[float]) -> bool:
     """Whether a vector of six, deg and m, is within what counts as a hit."""
     limit_m = inf if report.hit_translation_m is None else report.hit_translation_m
     return hypot(*error[:3]) < report.hit_rotation_deg and hypot(*error[3:]) < limit_m
@@ -94,7 +80,7 @@ def csv_of(reference: Matrix4, outcomes: Sequence[SolveOutcome]) -> str:
     return text.getvalue()
 
 
-def show_comparison(report: ComparisonReport) -> None:
+def show_comparison(report: evaluation_schema.ComparisonReport) -> None:
     """Prints the methods side by side, and why some are missing."""
     first = next(iter(report.methods.values()))
     console.show(
@@ -116,7 +102,7 @@ def show_comparison(report: ComparisonReport) -> None:
     console.show(_seconds(report.elapsed_s))
 
 
-def show(report: EvaluationReport) -> None:
+def show(report: evaluation_schema.EvaluationReport) -> None:
     """Prints the figures of one method."""
     console.show(
         f"{report.window_id}: {count(report.pairs, 'pair')}, {report.camera_model} camera, objective "
@@ -153,7 +139,7 @@ def show(report: EvaluationReport) -> None:
     console.show(_seconds(report.elapsed_s))
 
 
-def _comparison(report: ComparisonReport) -> list[tuple[str, str, list[str]]]:
+def _comparison(report: evaluation_schema.ComparisonReport) -> list[tuple[str, str, list[str]]]:
     """Rows: name, unit, and one figure per method."""
     methods = list(report.methods.values())
     dof = methods[0].dof
@@ -178,7 +164,7 @@ def _comparison(report: ComparisonReport) -> list[tuple[str, str, list[str]]]:
     return rows
 
 
-def _show_axes(report: EvaluationReport) -> None:
+def _show_axes(report: evaluation_schema.EvaluationReport) -> None:
     columns = ("error", "bias of hits", "std of hits", "rms of hits", "σ claimed", "median of all", "from reference")
     axes = console.table(*columns, "unit", right=range(1, 7))
     for axis in range(report.dof):
@@ -195,7 +181,7 @@ def _show_axes(report: EvaluationReport) -> None:
     console.out.print(axes)
 
 
-def _show_experiments(report: EvaluationReport) -> None:
+def _show_experiments(report: evaluation_schema.EvaluationReport) -> None:
     if report.frames:
         frames = console.table("frames", "subsets", "hits", "median", "p95", "max", "σ claimed", "unit", right=range(7))
         for point in report.frames:
@@ -218,7 +204,7 @@ def _show_experiments(report: EvaluationReport) -> None:
         _show_steps(report.steps)
 
 
-def show_closure(report: ClosureReport) -> None:
+def show_closure(report: evaluation_schema.ClosureReport) -> None:
     """Prints how two calibrations close."""
     console.show(f"A {report.source_a}")
     console.show(f"B {report.source_b}")
@@ -243,7 +229,7 @@ def show_closure(report: ClosureReport) -> None:
     console.show(_seconds(report.elapsed_s))
 
 
-def _show_normalised(errors: NormalisedErrorsReport) -> None:
+def _show_normalised(errors: evaluation_schema.NormalisedErrorsReport) -> None:
     """Prints errors beside what was claimed for them."""
     console.show(f"errors against {errors.against}: {errors.judged} accepted, {errors.refused} refused")
     columns = ("error", "rms", "largest", "σ claimed", "σ / rms", "within 1 σ", "2 σ", "3 σ")
@@ -270,7 +256,7 @@ def _show_normalised(errors: NormalisedErrorsReport) -> None:
         )
 
 
-def show_detection(detection: DetectionReport) -> None:
+def show_detection(detection: evaluation_schema.DetectionReport) -> None:
     """Prints checks of moved extrinsics, and how many of them each classifier flags."""
     table = console.table("extrinsic", "checks", "flagged", "95 %", "undecided", "by equation (2)", right=range(1, 6))
     for row in detection.moves:
@@ -290,7 +276,7 @@ def show_detection(detection: DetectionReport) -> None:
         )
 
 
-def _show_steps(steps: Sequence[StepRow]) -> None:
+def _show_steps(steps: Sequence[evaluation_schema.StepRow]) -> None:
     shares = ("refused for it", "accepted", "accepted and wrong", "time known to 2 s")
     times = ("off by", "told to be within", "and is")
     table = console.table("mount moves by", "windows", *shares, *times, right=range(1, 9))
@@ -304,7 +290,7 @@ def _show_steps(steps: Sequence[StepRow]) -> None:
     console.out.print(table)
 
 
-def _show_halves(halves: HalvesReport, dof: int) -> None:
+def _show_halves(halves: evaluation_schema.HalvesReport, dof: int) -> None:
     console.show(
         f"{count(halves.splits, 'split')} into halves of {count(halves.pairs, 'frame')}: {halves.solved} solved, "
         f"{halves.accepted} accepted on both sides, {halves.hits} hit on both"
@@ -323,14 +309,14 @@ def _show_halves(halves: HalvesReport, dof: int) -> None:
     console.out.print(table)
 
 
-def _errors(point: FramesPoint | SlicePoint) -> list[str]:
+def _errors(point: evaluation_schema.FramesPoint | evaluation_schema.SlicePoint) -> list[str]:
     """Hits, median, 95th percentile, largest and claimed rotation error."""
     errors = point.rotation_deg
     figures = [console.figure(value) for value in (errors.median, errors.p95, errors.max, point.sigma_deg)]
     return [f"{100 * point.hit_rate:.0f} %", *figures]
 
 
-def _add(table: Any, name: str, spread: Spread, unit: str, digits: int) -> None:
+def _add(table: Any, name: str, spread: evaluation_schema.Spread, unit: str, digits: int) -> None:
     figures = [console.figure(value, digits) for value in (spread.median, spread.p95, spread.max)]
     table.add_row(name, *figures, unit)
 

@@ -6,8 +6,6 @@ The claims of an estimate hold if its errors, each divided by the claimed sigma,
 variance one. Errors and sigmas are those of the accepted windows, because only these would be served.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from math import fsum, sqrt

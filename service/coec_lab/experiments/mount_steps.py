@@ -5,8 +5,6 @@ Moving the later sweeps by S⁻¹ is the same as moving the mount by S, but for 
 the camera moves the LiDAR. Sweeps are motion-compensated first, with the mount as it was.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

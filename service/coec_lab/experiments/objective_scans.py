@@ -1,7 +1,5 @@
 """Objectives along each axis about a pose: what a search sees of them from afar and up close."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import radians

@@ -5,8 +5,6 @@ They use mutual information alone and the paper's own classifier, equation (2), 
 with them.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

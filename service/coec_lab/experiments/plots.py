@@ -5,8 +5,6 @@ no display, no window, no global state of matplotlib.
 Colours of errors run from dark (good) to bright (bad) on a logarithmic scale about the limit of a hit.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from math import degrees, erf, pi, sqrt
@@ -22,33 +20,12 @@ from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import PaperLimits
+from coec_lab.experiments import evaluation_charts, solve_statistics
 from coec_lab.experiments.depth_quality import DepthQuality, Pairing
-from coec_lab.experiments.evaluation_charts import (
-    HIT_DEG,
-    LATITUDES_DEG,
-    Places,
-    end_places,
-    latitude_radius,
-    rim_of,
-    start_places,
-)
 from coec_lab.experiments.matrix_statistics import normalised_errors
 from coec_lab.experiments.objective_scans import Scan, Views
 from coec_lab.experiments.paper_figures import MOVES_DEG, FailureFigures
 from coec_lab.experiments.simulation_schemas import MatrixReport, SolveStatistics
-from coec_lab.experiments.solve_statistics import (
-    BIN_EDGES,
-    CONFIDENCES,
-    HIT_M,
-    HIT_RAD,
-    SIGMAS,
-    FrameCountStatistics,
-    NormalisedErrors,
-    SliceStatistics,
-    SolveOutcome,
-    SpreadStatistics,
-    within,
-)
 
 DPI = 110
 
@@ -61,7 +38,9 @@ TICKS = tuple(step * 10.0**decade for decade in range(-4, 3) for step in (1.0, 2
 COLOURS = "plasma"
 
 
-def bullseye(outcomes: Sequence[SolveOutcome], directions: Mapping[str, NDArray[np.float64]], title: str) -> bytes:
+def bullseye(
+    outcomes: Sequence[solve_statistics.SolveOutcome], directions: Mapping[str, NDArray[np.float64]], title: str
+) -> bytes:
     """Left, for each of `directions` (title, (n, 3) unit vectors in camera axes): the start directions, coloured by
     where their solves ended. Right: where they ended, as seen from the reference.
 
@@ -73,19 +52,21 @@ def bullseye(outcomes: Sequence[SolveOutcome], directions: Mapping[str, NDArray[
     for column, (name, unit) in enumerate(directions.items()):
         _plot_starts(_polar(figure, 1, len(directions) + 1, column), name, unit, outcomes, colours)
     axes = _polar(figure, 1, len(directions) + 1, len(directions))
-    _plot_target(axes, outcomes, colours, rim_of(outcomes))
+    _plot_target(axes, outcomes, colours, evaluation_charts.rim_of(outcomes))
     _scale(figure, [axes], colours)
     figure.legend(handles=_legend(outcomes), loc="outside lower center", ncols=4, frameon=False)
     return png(figure)
 
 
-def compared(methods: Mapping[str, Sequence[SolveOutcome]], directions: NDArray[np.float64], title: str) -> bytes:
+def compared(
+    methods: Mapping[str, Sequence[solve_statistics.SolveOutcome]], directions: NDArray[np.float64], title: str
+) -> bytes:
     """A column per method: above, the start directions ((n, 3) unit vectors in camera axes) coloured by where their
     solves ended; below, where they ended. The targets have one radius, that of the worst method."""
     figure = Figure(figsize=(5.6 * len(methods) + 1.0, 11.5), layout="constrained")
     figure.suptitle(title)
     colours = LogNorm(*ERROR_RANGE_DEG, clip=True)
-    rim_deg = max(rim_of(outcomes) for outcomes in methods.values())
+    rim_deg = max(evaluation_charts.rim_of(outcomes) for outcomes in methods.values())
     panels = []
     for column, (name, outcomes) in enumerate(methods.items()):
         hits = sum(outcome.hit for outcome in outcomes)
@@ -100,10 +81,17 @@ def compared(methods: Mapping[str, Sequence[SolveOutcome]], directions: NDArray[
 
 
 def _plot_starts(
-    axes: PolarAxes, name: str, unit: NDArray[np.float64], outcomes: Sequence[SolveOutcome], colours: LogNorm
+    axes: PolarAxes,
+    name: str,
+    unit: NDArray[np.float64],
+    outcomes: Sequence[solve_statistics.SolveOutcome],
+    colours: LogNorm,
 ) -> None:
-    _marks(axes, start_places(unit), outcomes, colours)
-    rings, names = [latitude_radius(ring) for ring in LATITUDES_DEG], [f"{ring:g}°" for ring in LATITUDES_DEG]
+    _marks(axes, evaluation_charts.start_places(unit), outcomes, colours)
+    rings, names = (
+        [evaluation_charts.latitude_radius(ring) for ring in evaluation_charts.LATITUDES_DEG],
+        [f"{ring:g}°" for ring in evaluation_charts.LATITUDES_DEG],
+    )
     axes.set_rgrids(rings, names, angle=100.0, color="grey", fontsize="small")
     axes.set_ylim(0.0, 1.05)
     axes.set_thetagrids([0.0, 90.0, 180.0, 270.0], ["+x", "+y", "-x", "-y"])
@@ -118,9 +106,13 @@ def _scale(figure: Figure, panels: Sequence[PolarAxes], colours: LogNorm) -> Non
     scale.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
 
 
-def _plot_target(axes: PolarAxes, outcomes: Sequence[SolveOutcome], colours: LogNorm, rim_deg: float) -> None:
-    _marks(axes, end_places(outcomes, rim_deg), outcomes, colours)
-    axes.plot(np.linspace(0.0, 2.0 * pi, 181), np.full(181, HIT_DEG), color="tab:green", linewidth=1.2)
+def _plot_target(
+    axes: PolarAxes, outcomes: Sequence[solve_statistics.SolveOutcome], colours: LogNorm, rim_deg: float
+) -> None:
+    _marks(axes, evaluation_charts.end_places(outcomes, rim_deg), outcomes, colours)
+    axes.plot(
+        np.linspace(0.0, 2.0 * pi, 181), np.full(181, evaluation_charts.HIT_DEG), color="tab:green", linewidth=1.2
+    )
     rings = [0.25 * rim_deg, 0.5 * rim_deg, 0.75 * rim_deg, rim_deg]
     axes.set_rgrids(rings, [f"{ring:g}°" for ring in rings], angle=100.0, color="grey", fontsize="small")
     axes.set_ylim(0.0, 1.05 * rim_deg)
@@ -130,7 +122,12 @@ def _plot_target(axes: PolarAxes, outcomes: Sequence[SolveOutcome], colours: Log
     )
 
 
-def _marks(axes: PolarAxes, places: Places, outcomes: Sequence[SolveOutcome], colours: LogNorm) -> None:
+def _marks(
+    axes: PolarAxes,
+    places: evaluation_charts.Places,
+    outcomes: Sequence[solve_statistics.SolveOutcome],
+    colours: LogNorm,
+) -> None:
     angle, radius = places.T
     final_deg = np.degrees([outcome.rotation_rad for outcome in outcomes])
     for hit in (True, False):
@@ -143,7 +140,7 @@ def _marks(axes: PolarAxes, places: Places, outcomes: Sequence[SolveOutcome], co
                 )  # fmt: skip
 
 
-def _legend(outcomes: Sequence[SolveOutcome]) -> list[Line2D]:
+def _legend(outcomes: Sequence[solve_statistics.SolveOutcome]) -> list[Line2D]:
     return [
         Line2D(
             [], [], linestyle="", marker=_marker(hit), markersize=7 if hit else 9, markerfacecolor="lightgrey",
@@ -211,7 +208,9 @@ def landscape(curves: Mapping[str, Views], title: str) -> bytes:
     return png(figure)
 
 
-def error_against_frames(points: Sequence[FrameCountStatistics], with_translation: bool, title: str) -> bytes:
+def error_against_frames(
+    points: Sequence[solve_statistics.FrameCountStatistics], with_translation: bool, title: str
+) -> bytes:
     """Median and 95th percentile of the error over subsets, and the σ that the solves claim, by the number of frames;
     below, the share of hits."""
     frames = [float(point.frames) for point in points]
@@ -220,7 +219,9 @@ def error_against_frames(points: Sequence[FrameCountStatistics], with_translatio
     )
 
 
-def error_against_slice(points: Sequence[SliceStatistics], with_translation: bool, title: str) -> bytes:
+def error_against_slice(
+    points: Sequence[solve_statistics.SliceStatistics], with_translation: bool, title: str
+) -> bytes:
     """Like `error_against_frames`, by the length of the slice, with the number of frames in it."""
     lengths_s = [point.length_s for point in points]
     labels = [f"{point.length_s:.3g} s\n{point.frames:g} fr." for point in points]
@@ -237,7 +238,7 @@ def _plot_scan(axes: Axes, name: str, scan: Scan, lowest: float, height: float) 
 
 
 def _errors(
-    points: Sequence[FrameCountStatistics] | Sequence[SliceStatistics],
+    points: Sequence[solve_statistics.FrameCountStatistics] | Sequence[solve_statistics.SliceStatistics],
     at: Sequence[float],
     labels: Sequence[str],
     what: str,
@@ -249,12 +250,18 @@ def _errors(
     figure.suptitle(title)
     panels = figure.subplots(2, columns, sharex=True, squeeze=False, height_ratios=(3, 1))
     _plot_errors(
-        panels[0, 0], at, [_in_degrees(point.rotation_rad) for point in points], "rotation error, deg", HIT_DEG
+        panels[0, 0],
+        at,
+        [_in_degrees(point.rotation_rad) for point in points],
+        "rotation error, deg",
+        evaluation_charts.HIT_DEG,
     )
     claimed = [degrees(point.sigma_rad) for point in points]
     panels[0, 0].plot(at, claimed, "^:", color="tab:purple", label="σ claimed (root of the three variances), median")
     if with_translation:
-        _plot_errors(panels[0, 1], at, [point.translation_m for point in points], "translation error, m", HIT_M)
+        _plot_errors(
+            panels[0, 1], at, [point.translation_m for point in points], "translation error, m", solve_statistics.HIT_M
+        )
     for upper, lower in zip(panels[0], panels[1], strict=True):
         _tick(upper)
         upper.legend()
@@ -270,7 +277,9 @@ def _errors(
     return png(figure)
 
 
-def _plot_errors(axes: Axes, at: Sequence[float], errors: Sequence[SpreadStatistics], label: str, limit: float) -> None:
+def _plot_errors(
+    axes: Axes, at: Sequence[float], errors: Sequence[solve_statistics.SpreadStatistics], label: str, limit: float
+) -> None:
     axes.plot(at, [error.p95 for error in errors], "s--", label="95th percentile")
     axes.plot(at, [error.median for error in errors], "o-", label="median")
     axes.axhline(limit, color="grey", linewidth=0.8, linestyle=":", label=f"limit of a hit, {limit:g}")
@@ -286,11 +295,11 @@ def _tick(axes: Axes) -> None:
     axes.minorticks_off()
 
 
-def _in_degrees(errors: SpreadStatistics) -> SpreadStatistics:
-    return SpreadStatistics(degrees(errors.median), degrees(errors.p95), degrees(errors.max))
+def _in_degrees(errors: solve_statistics.SpreadStatistics) -> solve_statistics.SpreadStatistics:
+    return solve_statistics.SpreadStatistics(degrees(errors.median), degrees(errors.p95), degrees(errors.max))
 
 
-def normalised(by_reference: Mapping[str, NormalisedErrors], title: str) -> bytes:
+def normalised(by_reference: Mapping[str, solve_statistics.NormalisedErrors], title: str) -> bytes:
     """A row for each, by name: left, errors over claimed standard deviations per axis; right, the share of errors that
     lie in an interval against the share that should, up to 1, 2 and 3 standard deviations.
 
@@ -308,8 +317,8 @@ def normalised(by_reference: Mapping[str, NormalisedErrors], title: str) -> byte
     return png(figure)
 
 
-def _plot_histogram(axes: Axes, errors: NormalisedErrors) -> None:
-    edges = np.array(BIN_EDGES)
+def _plot_histogram(axes: Axes, errors: solve_statistics.NormalisedErrors) -> None:
+    edges = np.array(solve_statistics.BIN_EDGES)
     normal = NormalDist()
     expected = np.diff([0.0, *(normal.cdf(edge) for edge in edges[1:-1]), 1.0])
     axes.stairs(expected, edges, fill=True, color="lightgrey", label="normal distribution")
@@ -322,19 +331,19 @@ def _plot_histogram(axes: Axes, errors: NormalisedErrors) -> None:
     axes.legend(fontsize="small")
 
 
-def _plot_reliability(axes: Axes, errors: NormalisedErrors) -> None:
-    beyond = [2.0 * NormalDist().cdf(limit) - 1.0 for limit in SIGMAS]
-    shares = np.array([*CONFIDENCES, *beyond])
+def _plot_reliability(axes: Axes, errors: solve_statistics.NormalisedErrors) -> None:
+    beyond = [2.0 * NormalDist().cdf(limit) - 1.0 for limit in solve_statistics.SIGMAS]
+    shares = np.array([*solve_statistics.CONFIDENCES, *beyond])
     held = np.concatenate([errors.reliability, errors.coverage])
     order = np.argsort(shares)
     axes.plot([0.0, 1.0], [0.0, 1.0], color="grey", linewidth=0.8, linestyle="--", label="true claims")
     for name, column in zip(AXIS_TITLES, held.T, strict=True):
         if np.isfinite(column).any():
             axes.plot(shares[order], column[order], "o-", markersize=4, linewidth=1.2, label=name)
-    for limit, share in zip(SIGMAS, beyond, strict=True):
+    for limit, share in zip(solve_statistics.SIGMAS, beyond, strict=True):
         axes.axvline(share, color="lightgrey", linewidth=0.8)
         axes.annotate(f"{limit:g} σ", (share, 0.02), fontsize="small", rotation=90)
-    axes.set_xlabel(f"share that should lie within (50 %: {within(0.5):.2f} σ)")
+    axes.set_xlabel(f"share that should lie within (50 %: {solve_statistics.within(0.5):.2f} σ)")
     axes.set_ylabel("share that does")
     axes.set_xlim(0.0, 1.02)
     axes.set_ylim(0.0, 1.02)
@@ -488,7 +497,7 @@ def failure_metrics(figures: Sequence[FailureFigures], limits: PaperLimits, titl
     return png(figure)
 
 
-def drive(runs: Mapping[str, Sequence[tuple[float, SolveOutcome]]], title: str) -> bytes:
+def drive(runs: Mapping[str, Sequence[tuple[float, solve_statistics.SolveOutcome]]], title: str) -> bytes:
     """Errors of roll, pitch and yaw over sensor time (seconds), for several named sets of starts."""
     figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     figure.suptitle(title)
@@ -501,7 +510,9 @@ def drive(runs: Mapping[str, Sequence[tuple[float, SolveOutcome]]], title: str) 
                 seconds, errors, "o", markersize=4, alpha=0.6,
                 label=f"{label}: {errors.mean():+.3f} ± {errors.std():.3f}°",
             )  # fmt: skip
-        axes.axhspan(-degrees(HIT_RAD), degrees(HIT_RAD), color="tab:green", alpha=0.08)
+        axes.axhspan(
+            -degrees(solve_statistics.HIT_RAD), degrees(solve_statistics.HIT_RAD), color="tab:green", alpha=0.08
+        )
         axes.axhline(0.0, color="grey", linewidth=0.8)
         axes.set_ylabel(f"{name} error, deg")
         axes.legend(fontsize="small", loc="upper right")

@@ -7,8 +7,6 @@ All faults of one drive number share a street, so the frames of a sensor that di
 them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property

@@ -3,8 +3,6 @@
 general and right after one of its LiDARs was displaced; and the tables of both rig experiments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import degrees, radians
@@ -13,15 +11,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.rig.attribution import (
-    RigState,
-    SensorHealth,
-    after_edge_observation,
-    after_window,
-    initial,
-    sensors,
-    served,
-)
+from coec.calibration.rig import attribution
 from coec.calibration.rig.joint_estimate import SHAKEN, JointEstimate, PreMoveKnowledge, estimate_jointly
 from coec.calibration.tracker import Measurement, Track, prior_sigma, update_track
 from coec.calibration.types import Matrix4
@@ -147,7 +137,7 @@ AT_S, ALLOWED_S = 90.0, 60.0
 SEED = 18_300_001
 """Any number from which nothing was learned."""
 
-MOVED = frozenset({SensorHealth.CAMERA_MOVED, SensorHealth.LIDAR_MOVED})
+MOVED = frozenset({attribution.SensorHealth.CAMERA_MOVED, attribution.SensorHealth.LIDAR_MOVED})
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,10 +227,10 @@ def simulate_drive(rig: SimulatedRig, fault: RigFault, number: int) -> NamingRes
     at_s = AT_S + float(rng.uniform(0.0, 20.0))
     delay_s: float | None = None if who else 0.0
     wrong = False
-    state = initial(rig.graph)
+    state = attribution.initial(rig.graph)
     lasting = Lasting.of(rig, rng)
     for name, window in windows(rig, before, lasting, rng).items():
-        state = served(state, name, window.T_camera_lidar, window.uncertainty.sigma)
+        state = attribution.served(state, name, window.T_camera_lidar, window.uncertainty.sigma)
     happening = Happening(before, after, bend, at_s, at_s + ALLOWED_S)
     checks = simulate_checks(rig, happening, rng)
     for at, named in _named(rig, state, checks, urgent_evidence(rig, happening, checks, lasting, rng)):
@@ -253,14 +243,17 @@ def simulate_drive(rig: SimulatedRig, fault: RigFault, number: int) -> NamingRes
 
 
 def _named(
-    rig: SimulatedRig, state: RigState, checks: Sequence[TimedEvidence], accepted: Sequence[TimedEvidence]
+    rig: SimulatedRig, state: attribution.RigState, checks: Sequence[TimedEvidence], accepted: Sequence[TimedEvidence]
 ) -> Iterator[tuple[float, set[str]]]:
     """The time, seconds, and the sensors named then, after each look or accepted window that changed the posterior."""
-    updates = [*((timed, after_edge_observation) for timed in checks), *((timed, after_window) for timed in accepted)]
+    updates = [
+        *((timed, attribution.after_edge_observation) for timed in checks),
+        *((timed, attribution.after_window) for timed in accepted),
+    ]
     for (at_s, evidence), after in sorted(updates, key=lambda one: one[0][0]):
         before, state = state, after(state, rig.graph, evidence)
         if state.posterior is not before.posterior:
-            yield at_s, {one.name for one in sensors(state, rig.graph) if one.health in MOVED}
+            yield at_s, {one.name for one in attribution.sensors(state, rig.graph) if one.health in MOVED}
 
 
 def joint_row(rig: SimulatedRig, rigs: int) -> JointRow:

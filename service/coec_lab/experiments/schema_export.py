@@ -1,8 +1,6 @@
 """JSON Schemas of the wire models. `python -m coec_lab.experiments.schema_export DIR` writes them; they are committed
 under `schemas/v1`."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -6,8 +6,6 @@ Angles in degrees, lengths in metres, axes rx ry rz tx ty tz about and along the
 the truth at the last pair. A number that could not be computed is null.
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 from typing import Literal
 

@@ -3,8 +3,6 @@ solves start, and on which frames (the protocol of Borer et al., WACV 2024; METH
 decides a start, so that two evaluations differ only by what they evaluate.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

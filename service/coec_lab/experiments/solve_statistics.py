@@ -19,8 +19,6 @@ eᵀ·C⁻¹·e (NEES), whose mean per axis is 1 (Bar-Shalom, Li, Kirubarajan, "
 navigation", 2001, section 5.4).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -22,20 +22,12 @@ from coec.errors import UsageError
 from coec.geometry.cameras import Camera, build, intrinsics_of, name_of
 from coec.geometry.se3 import inverse, perturb
 from coec.io.recordings.recording_source import MOTION_REACH_NS, SensorMessage, selected_indices
+from coec_lab.simulation import simulated_sensors
 from coec_lab.simulation.faults import Fault, shifted
 from coec_lab.simulation.journey import START_NS, Journey
 from coec_lab.simulation.lidar_model import LIDARS, LidarModel
 from coec_lab.simulation.render import LensProperties
 from coec_lab.simulation.scene import Solid
-from coec_lab.simulation.simulated_sensors import (
-    Optics,
-    SimulatedCamera,
-    SimulatedLidar,
-    SimulatedOdometer,
-    SimulatedSensor,
-    Wire,
-    product,
-)
 from coec_lab.simulation.vehicle_motion import T_ego_lidar, body, workshop_T_camera_lidar
 
 
@@ -47,7 +39,7 @@ class Arrival(NamedTuple):
     number: int
 
 
-def arrivals(streams: Sequence[SimulatedSensor], seconds: float) -> list[Arrival]:
+def arrivals(streams: Sequence[simulated_sensors.SimulatedSensor], seconds: float) -> list[Arrival]:
     """Everything that arrives, in the order of the stamps."""
     plan = []
     for stream, sensor in enumerate(streams):
@@ -148,8 +140,10 @@ class SimulatedDrive:
             go_s=config.go_s, stop_s=config.stop_s,
         )  # fmt: skip
         self._true = workshop_T_camera_lidar()
-        self._turning = SimulatedLidar(
-            self._journey, Wire("lidar", config.lidar_hz, _LIDAR, faults=config.faults), lidar_of(config.lidar),
+        self._turning = simulated_sensors.SimulatedLidar(
+            self._journey,
+            simulated_sensors.Wire("lidar", config.lidar_hz, _LIDAR, faults=config.faults),
+            lidar_of(config.lidar),
             lambda _: T_ego_lidar(),
         )  # fmt: skip
         self._mount()
@@ -158,7 +152,7 @@ class SimulatedDrive:
         """Mounts the camera of the configuration beside the other sensors."""
         config = self.config
         self.camera = camera_of(config.camera, config.half_view_deg)
-        optics = Optics(
+        optics = simulated_sensors.Optics(
             self.camera,
             config.half_view_deg,
             config.camera_delay_s,
@@ -166,15 +160,17 @@ class SimulatedDrive:
             config.depth,
             config.lens,
         )
-        eye = SimulatedCamera(
-            self._journey, Wire("camera", config.camera_hz, _CAMERA, faults=config.faults), optics,
+        eye = simulated_sensors.SimulatedCamera(
+            self._journey, simulated_sensors.Wire("camera", config.camera_hz, _CAMERA, faults=config.faults), optics,
             self._T_ego_camera, Solid(body()),
         )  # fmt: skip
-        odometer = SimulatedOdometer(self._journey, Wire("ego", config.ego_hz, _EGO, faults=config.faults))
-        self._streams: tuple[SimulatedSensor, ...] = (odometer, self._turning, eye)
+        odometer = simulated_sensors.SimulatedOdometer(
+            self._journey, simulated_sensors.Wire("ego", config.ego_hz, _EGO, faults=config.faults)
+        )
+        self._streams: tuple[simulated_sensors.SimulatedSensor, ...] = (odometer, self._turning, eye)
         xi = np.array([*np.deg2rad(config.workshop[:3]), *config.workshop[3:]])
         assumed = _assumed_camera(self.camera, config.intrinsics_off)
-        mask = eye.mask_at(product(T_ego_lidar(), inverse(self._true)))
+        mask = eye.mask_at(simulated_sensors.product(T_ego_lidar(), inverse(self._true)))
         self.rig = Rig("sim", assumed, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask)
 
     def through(self, camera: str | Camera, half_view_deg: float) -> SimulatedDrive:
@@ -243,7 +239,7 @@ class SimulatedDrive:
         return self._streams[entry.stream].frame(entry.number, entry.stamp_ns)
 
     def _T_ego_camera(self, time_s: float) -> Matrix4:
-        return product(T_ego_lidar(), inverse(shifted(self._true, self.config.faults, time_s)))
+        return simulated_sensors.product(T_ego_lidar(), inverse(shifted(self._true, self.config.faults, time_s)))
 
 
 class Rated(Protocol):

@@ -3,8 +3,6 @@
 `KIND:BEGIN[-END][:KEY=VALUE,...]`, seconds from the start of the drive; without an end, to the end of the drive.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, fields

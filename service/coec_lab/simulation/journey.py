@@ -1,8 +1,6 @@
 """The way of a vehicle through a simulated place: where it is, what stands and drives around it, the weather, and what
 its odometer reports. It does not depend on the sensors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import TypeVar

@@ -3,8 +3,6 @@
 LiDAR axes: x forward, y left, z up. The stamp of a sweep is its middle.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol

@@ -2,8 +2,6 @@
 would not share the work.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 from collections import deque

@@ -3,8 +3,6 @@
 Local frames: x forward (cars) or along the street, y left, z up, origin on the ground in the middle.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -27,22 +27,13 @@ from coec.errors import UsageError
 from coec.geometry.cameras import Camera
 from coec.geometry.se3 import inverse, perturb, rotation_exp
 from coec.io.recordings.recording_source import SensorMessage
+from coec_lab.simulation import simulated_sensors
 from coec_lab.simulation.drive import Arrival, arrivals, camera_of, check_rates, needed, seconds_of, stamps_of
 from coec_lab.simulation.faults import Fault, SensorFault, shifted
 from coec_lab.simulation.journey import Journey
 from coec_lab.simulation.lidar_model import LIDARS, LidarModel, Turn, even_deg
 from coec_lab.simulation.render import LensProperties
 from coec_lab.simulation.scene import Solid
-from coec_lab.simulation.simulated_sensors import (
-    Mount,
-    Optics,
-    SimulatedCamera,
-    SimulatedLidar,
-    SimulatedOdometer,
-    SimulatedSensor,
-    Wire,
-    product,
-)
 from coec_lab.simulation.vehicle_motion import whole_body
 
 NEAR = LidarModel(
@@ -219,21 +210,23 @@ class RigDrive:
         )  # fmt: skip
         self._body = Solid(whole_body())
         self._order = (EGO, *self.lidars, *self.cameras)
-        self._eyes: dict[str, SimulatedCamera] = {}
-        self._streams: dict[str, SimulatedSensor] = {
-            EGO: SimulatedOdometer(self._journey, Wire(EGO, config.ego_hz, 0, (), common))
+        self._eyes: dict[str, simulated_sensors.SimulatedCamera] = {}
+        self._streams: dict[str, simulated_sensors.SimulatedSensor] = {
+            EGO: simulated_sensors.SimulatedOdometer(
+                self._journey, simulated_sensors.Wire(EGO, config.ego_hz, 0, (), common)
+            )
         }
         for lidar in layout.lidars:
-            self._streams[lidar.name] = SimulatedLidar(
+            self._streams[lidar.name] = simulated_sensors.SimulatedLidar(
                 self._journey, self._wire(lidar.name, config.lidar_hz), lidar.model, self._mount(lidar.name),
                 delay_s=lidar.phase / config.lidar_hz, own_body=self._body,
             )  # fmt: skip
         for camera in layout.cameras:
-            optics = Optics(
+            optics = simulated_sensors.Optics(
                 self.camera, layout.half_view_deg, camera.phase / config.camera_hz,
                 depth=config.depth, lens=config.lens, rows=config.rows,
             )  # fmt: skip
-            self._eyes[camera.name] = SimulatedCamera(
+            self._eyes[camera.name] = simulated_sensors.SimulatedCamera(
                 self._journey, self._wire(camera.name, config.camera_hz), optics, self._mount(camera.name), self._body
             )
         self._streams |= self._eyes
@@ -298,11 +291,11 @@ class RigDrive:
                 raise UsageError(f"the rig has no {kind} {sensor!r}; it has {', '.join(known)}")
         return SimulatedRigPair(self, camera, lidar)
 
-    def _wire(self, name: str, hz: float) -> Wire:
+    def _wire(self, name: str, hz: float) -> simulated_sensors.Wire:
         number = self._order.index(name)
-        return Wire(name, hz, number, (number,), self._faults[name])
+        return simulated_sensors.Wire(name, hz, number, (number,), self._faults[name])
 
-    def _mount(self, name: str) -> Mount:
+    def _mount(self, name: str) -> simulated_sensors.Mount:
         faults: tuple[Fault, ...] = self._faults[name]
         return lambda time_s: inverse(shifted(self._mounted[name], faults, time_s))
 
@@ -321,7 +314,7 @@ class SimulatedRigPair:
         self._drive = drive
         self._camera, self._lidar = camera, lidar
         T_lidar_ego = drive.T_sensor_ego_nominal(lidar)
-        nominal = product(drive.T_sensor_ego_nominal(camera), inverse(T_lidar_ego))
+        nominal = simulated_sensors.product(drive.T_sensor_ego_nominal(camera), inverse(T_lidar_ego))
         pair = f"{camera}-{lidar}"
         self.rig = Rig(pair, drive.camera, camera, lidar, nominal, T_lidar_ego, mask=drive.mask(camera))
 
@@ -353,7 +346,7 @@ class SimulatedRigPair:
     def truth(self, stamp_ns: int) -> Matrix4:
         """True T_camera_lidar (4, 4) at a time."""
         T_lidar_ego = self._drive.T_sensor_ego(self._lidar, stamp_ns)
-        return product(self._drive.T_sensor_ego(self._camera, stamp_ns), inverse(T_lidar_ego))
+        return simulated_sensors.product(self._drive.T_sensor_ego(self._camera, stamp_ns), inverse(T_lidar_ego))
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
         """See `Recording.messages`."""

@@ -1,7 +1,5 @@
 """The road, and what moves along it: cars on the road, people in a room. Everything follows from the seed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The town of a seed and the part of it around the vehicle, against which rays are cast by Embree."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

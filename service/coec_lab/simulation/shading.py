@@ -4,8 +4,6 @@ Textures are sums of value noise (Perlin, "An image synthesizer", SIGGRAPH 1985,
 in the world. Each octave fades out before a pixel covers its wavelength, so that unresolved detail does not flicker.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The sensors aboard: each makes a frame from its number alone, given the scene around it and the sensor's faults."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -15,20 +13,11 @@ from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFo
 from coec.geometry.cameras import Camera
 from coec.io.images import encode_depth_png, encode_jpeg
 from coec_lab.simulation import faults as wrong
+from coec_lab.simulation import render
 from coec_lab.simulation.faults import Fault, late_s
 from coec_lab.simulation.journey import Journey
 from coec_lab.simulation.lidar_model import LidarModel, Sweep, sweep
 from coec_lab.simulation.mesh import Floats
-from coec_lab.simulation.render import (
-    Exposure,
-    LensProperties,
-    against_the_sun,
-    at_night,
-    dirt_cover,
-    expose,
-    pixel_rays,
-    render_rows,
-)
 from coec_lab.simulation.scene import Solid
 from coec_lab.simulation.shading import around
 from coec_lab.simulation.weather import CLEAR, SHOWER_S, rained_lens, rainy_air
@@ -214,7 +203,7 @@ class Optics:
     delay_s: float
     rolling_shutter_s: float = 0.0
     depth: bool = False
-    lens: LensProperties = field(default_factory=LensProperties)
+    lens: render.LensProperties = field(default_factory=render.LensProperties)
     rows: tuple[float, float] = (0.0, 1.0)
 
     @property
@@ -240,7 +229,7 @@ class SimulatedCamera:
         self.hz = wire.hz
         self._journey, self._wire, self._optics, self._body = journey, wire, optics, own_body
         camera = optics.camera
-        self._rays = pixel_rays(camera, math.radians(optics.half_view_deg))
+        self._rays = render.pixel_rays(camera, math.radians(optics.half_view_deg))
         seen = np.zeros(camera.height * camera.width, bool)
         seen[self._rays.pixel] = True
         self._seen = seen.reshape(camera.height, camera.width)
@@ -283,15 +272,15 @@ class SimulatedCamera:
         T_ego_camera = self.T_ego_camera(time_s)
         exposures = self._rows(time_s, T_ego_camera)
         scene = journey.scene(time_s)
-        radiance = render_rows(scene, optics.camera, exposures, half_view_rad=math.radians(optics.half_view_deg))
+        radiance = render.render_rows(scene, optics.camera, exposures, half_view_rad=math.radians(optics.half_view_deg))
         hidden = self._own_body(T_ego_camera)
         share, lamps = around(scene, exposures[len(exposures) // 2].T_world_camera[:3, 3])
         radiance.linear[hidden] = BODY * (np.float32(share) * np.array(scene.sky.horizon, np.float32) + lamps)
         light = math.prod(fault.light for fault in wrong.now(faults, wrong.Dark, time_s))
-        lens = at_night(optics.lens) if journey.is_night(time_s) else optics.lens
-        lens = against_the_sun(lens) if journey.is_against_the_sun(time_s) else lens
+        lens = render.at_night(optics.lens) if journey.is_night(time_s) else optics.lens
+        lens = render.against_the_sun(lens) if journey.is_against_the_sun(time_s) else lens
         noise = journey.rng(_EXPOSURE, *self._wire.key, index)
-        pixels = expose(radiance.linear, self._seen, lens, noise, light=light, dirt=self._cover(time_s))
+        pixels = render.expose(radiance.linear, self._seen, lens, noise, light=light, dirt=self._cover(time_s))
         size = (optics.camera.width, optics.camera.height)
         image = EncodedImage(ImageFormat.JPEG, *size, encode_jpeg(pixels, optics.lens.jpeg_quality))
         depth = None
@@ -302,7 +291,7 @@ class SimulatedCamera:
             depth = EncodedImage(ImageFormat.PNG, *size, encode_depth_png(code.astype(np.uint16)))
         return CameraFrame(stamp_ns, self._wire.name, image, sequence=index, depth=depth)
 
-    def _rows(self, time_s: float, T_ego_camera: Matrix4) -> list[Exposure]:
+    def _rows(self, time_s: float, T_ego_camera: Matrix4) -> list[render.Exposure]:
         """The parts of a picture's rows, each with the pose of the camera at its time."""
         optics = self._optics
         height, readout_s = optics.camera.height, optics.rolling_shutter_s
@@ -311,7 +300,7 @@ class SimulatedCamera:
         times = time_s + readout_s * ((bounds[:-1] + bounds[1:]) / 2 / height - 0.5)
         poses = self._journey.trip.poses(times)
         return [
-            Exposure(int(first), int(last), product(pose, T_ego_camera), float(at_s))
+            render.Exposure(int(first), int(last), product(pose, T_ego_camera), float(at_s))
             for first, last, pose, at_s in zip(bounds[:-1], bounds[1:], poses, times, strict=True)
         ]
 
@@ -321,7 +310,7 @@ class SimulatedCamera:
         seed = self._journey.seed_of(*self._wire.key)
         if share := max((fault.share for fault in wrong.now(self._wire.faults, wrong.Dirt, time_s)), default=0.0):
             if share not in self._dirt:
-                self._dirt[share] = dirt_cover(self._seen.shape, share, seed)
+                self._dirt[share] = render.dirt_cover(self._seen.shape, share, seed)
             covers.append(self._dirt[share])
         if rain := self._journey.rain(time_s):
             covers.append(rained_lens(self._seen.shape, rain, seed, int(time_s / SHOWER_S)))

@@ -7,8 +7,6 @@ Every stretch follows from the seed and its number alone, so a drive of any leng
 Traffic keeps to the right; `left_m` counts from the centre line; sidewalks begin beyond `Style.half_road_m`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

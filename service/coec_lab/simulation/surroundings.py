@@ -1,8 +1,6 @@
 """Places that a vehicle drives through, each made from a seed: a street, a highway, a parking garage, furnished
 rooms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol

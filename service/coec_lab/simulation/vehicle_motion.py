@@ -1,7 +1,5 @@
 """How the vehicle moves, where its sensors sit, and which parts of its body the camera sees."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise

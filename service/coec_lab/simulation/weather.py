@@ -1,7 +1,5 @@
 """Sun, sky and air of a seed; rain and a low sun: their effects on the air, the light and the lens."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """`python -m coec_lab.training render|train|export`: see the package."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 from itertools import chain

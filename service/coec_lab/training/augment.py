@@ -1,7 +1,5 @@
 """What training does to a frame: cuts, turns and recolours it, and makes the target of its codes. It needs no torch."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

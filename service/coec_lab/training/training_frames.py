@@ -2,8 +2,6 @@
 rendering, because training needs neither rays nor scenes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple

@@ -7,8 +7,6 @@ Everything in a frame that may differ on a real vehicle is drawn anew, so that t
 common (domain randomisation: Tobin et al., IROS 2017).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Motion compensation of a pair: the sweep as it would have been measured at the instant of the exposure."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ Nothing here depends on when or in which interleaving messages arrive, as long a
 because a pair is formed only when later messages can no longer change it. So a replay at any rate forms the same pairs.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Sequence

@@ -11,8 +11,6 @@ contradicts. Therefore the uncertainty of the mount's position is carried into t
 does not count as an observation at all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import fsum, hypot, isnan, nan, radians, sqrt

@@ -19,8 +19,6 @@ An open slice that began before the mount moved mixes two extrinsics, so it is e
 began later is ended as soon as it is enough for a window, or replaced by a short dense one if that comes sooner.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

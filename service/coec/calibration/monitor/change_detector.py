@@ -15,36 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import BaselineDrift, chi2_quantile
-from coec.calibration.monitor.sensor_faults import (
-    BENT_MOUNT,
-    CAUSES,
-    DIRTY_CHECKS,
-    DIRTY_SHARE,
-    LENS_DIRTY,
-    MOUNT_LOOSE,
-    Cause,
-)
-from coec.calibration.monitor.sequential_tests import (
-    AXES,
-    FARTHER,
-    LOOSE_AT,
-    MOST_STEP,
-    WEAK_TIMES,
-    CheckMeasurement,
-    Hypotheses,
-    MountScatter,
-    TestedAxes,
-    Three,
-    after_check,
-    learnt_distance2,
-    plus,
-    three,
-)
+from coec.calibration.monitor import sensor_faults, sequential_tests
 from coec.calibration.types import Metric
 from coec.config import MonitorConfig
 
-ROTATIONS = TestedAxes(three([radians(2.5)] * 3), (three([radians(0.3)] * 3), three([radians(2.0)] * 3)))
-TRANSLATIONS = TestedAxes((0.1, 0.1, 0.1), ((0.03, 0.03, 0.03), (0.1, 0.1, 0.1)))
+ROTATIONS = sequential_tests.TestedAxes(
+    sequential_tests.three([radians(2.5)] * 3),
+    (sequential_tests.three([radians(0.3)] * 3), sequential_tests.three([radians(2.0)] * 3)),
+)
+TRANSLATIONS = sequential_tests.TestedAxes((0.1, 0.1, 0.1), ((0.03, 0.03, 0.03), (0.1, 0.1, 0.1)))
 """For rotations (rad) and translations (m): the reach of bad checks, and the moves that are looked for, the creep of a
 mount and a step. See docs/measured.md."""
 
@@ -69,7 +48,7 @@ AT_ODDS_AT, MOST_AT_ODDS = 1.5, 3.0
 """Number of flagged checks in a row from which checks that do not add up to a move are at odds (reached with two), and
 the most that are counted."""
 
-ASTRAY2 = chi2_quantile(0.95, AXES)
+ASTRAY2 = chi2_quantile(0.95, sequential_tests.AXES)
 """Squared distance between the rotations that the checks have found and those served. Above it, no move but the served
 pose itself is doubted, until a window has vouched for that pose. Of right rigs about which nothing is known one in
 twenty lies above."""
@@ -81,11 +60,11 @@ counted, so that a cause that went away is forgotten after three."""
 ACQUITTAL_PERIODS = 3
 """Periods of the monitor after which an acquitting check no longer vouches for the served extrinsic (ARCHITECTURE)."""
 
-LEARNED2 = chi2_quantile(0.97, AXES)
+LEARNED2 = chi2_quantile(0.97, sequential_tests.AXES)
 """Squared distance, in standard deviations, from where the mount has been so far, beyond which a check does not acquit,
 even if its optimum is no farther off than on rigs about which nothing is known. See docs/measured.md."""
 
-CONTRADICTION2 = chi2_quantile(1.0 - 1e-4, AXES)
+CONTRADICTION2 = chi2_quantile(1.0 - 1e-4, sequential_tests.AXES)
 """Squared distance, in standard deviations of their difference, beyond which two checks of one place contradict each
 other. The scene of a standing vehicle stays, so that only what is new at every check separates them."""
 
@@ -160,7 +139,7 @@ class Observation:
     flagged: bool
     weak: bool
     flagged_by_paper: bool | None
-    causes: tuple[Cause, ...]
+    causes: tuple[sensor_faults.Cause, ...]
     first_derivative: NDArray[np.float64] = field(default_factory=_unknown)
     second_derivative: NDArray[np.float64] = field(default_factory=_unknown)
     drift: BaselineDrift | None = None
@@ -208,7 +187,7 @@ def alarm_level(config: MonitorConfig, hours: float) -> float:
 
 def alarm_levels(config: MonitorConfig) -> AlarmLevels:
     """The levels for the configured hours. No single check reaches any of them."""
-    suspect = max(alarm_level(config, config.hours_between_false_suspicions), MOST_STEP + 1.0)
+    suspect = max(alarm_level(config, config.hours_between_false_suspicions), sequential_tests.MOST_STEP + 1.0)
     return AlarmLevels(suspect, max(alarm_level(config, config.hours_between_false_alarms), suspect + 1.0))
 
 
@@ -217,8 +196,8 @@ class OffsetEstimate:
     """Where a check puts the mount from the served extrinsic on three axes (rad or m), and per axis the variance of
     what separates it from other checks of the same place."""
 
-    mean: Three
-    variance: Three
+    mean: sequential_tests.Three
+    variance: sequential_tests.Three
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +234,7 @@ def _offset(observation: Observation, axes: slice) -> OffsetEstimate | None:
         return None
     # Pairs that were taken before the vehicle stood have the error of another place.
     return OffsetEstimate(
-        measured.offset, measured.noise if observation.stands else plus(measured.noise, measured.place)
+        measured.offset, measured.noise if observation.stands else sequential_tests.plus(measured.noise, measured.place)
     )
 
 
@@ -292,8 +271,8 @@ class MonitorState:
     """
 
     outcome: MonitorOutcome = MonitorOutcome.UNKNOWN
-    turned: Hypotheses = field(default_factory=Hypotheses)
-    shifted: Hypotheses = field(default_factory=Hypotheses)
+    turned: sequential_tests.Hypotheses = field(default_factory=sequential_tests.Hypotheses)
+    shifted: sequential_tests.Hypotheses = field(default_factory=sequential_tests.Hypotheses)
     blind: Mapping[str, float] = field(default_factory=dict)
     dirt: Mapping[str, float] = field(default_factory=dict)
     at_odds: float = 0.0
@@ -306,7 +285,7 @@ class MonitorState:
     acquitted_ns: int | None = None
     unacquitted: int = 0
     standstill: Standstill | None = None
-    scatter: MountScatter = field(default_factory=MountScatter)
+    scatter: sequential_tests.MountScatter = field(default_factory=sequential_tests.MountScatter)
 
     @property
     def evidence(self) -> float:
@@ -322,17 +301,19 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
     stands = observation.pair_stamps_ns[-1] in set(observation.standing_stamps_ns)
     dirt = _dirt_after(state.dirt, observation, fresh)
     codes = {cause.code for cause in observation.causes}
-    if sum(run >= DIRTY_CHECKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
-        codes.add(LENS_DIRTY.code)
+    if sum(run >= sensor_faults.DIRTY_CHECKS for run in dirt.values()) > sensor_faults.DIRTY_SHARE * max(
+        observation.textured, 1
+    ):
+        codes.add(sensor_faults.LENS_DIRTY.code)
     judges = not codes
     scatter = state.scatter
     if judges and fresh > 0.0:
         scatter = scatter.after(measurement_on_axes(observation, ROTATION_AXES, None), ROTATIONS.reach, fresh)
-        if scatter.evidence >= LOOSE_AT:
-            codes.add(MOUNT_LOOSE.code)
+        if scatter.evidence >= sequential_tests.LOOSE_AT:
+            codes.add(sensor_faults.MOUNT_LOOSE.code)
     after = replace(
         state,
-        blind=_explained(state.blind, codes or ({BENT_MOUNT.code} if observation.flagged else ()), fresh),
+        blind=_explained(state.blind, codes or ({sensor_faults.BENT_MOUNT.code} if observation.flagged else ()), fresh),
         dirt=dirt,
         last_stamps_ns=observation.pair_stamps_ns,
         stood=stands,
@@ -365,11 +346,13 @@ def after_window(
     one did: small steps that lag behind a drift show as an offset from it. A window, which averages over a swing, does
     not show that a mount is tight."""
     learned = agrees and state.vouched
-    shifted = Hypotheses(state.shifted.right if learned else None) if solved_translation else state.shifted
+    shifted = (
+        sequential_tests.Hypotheses(state.shifted.right if learned else None) if solved_translation else state.shifted
+    )
     after = MonitorState(
-        turned=Hypotheses(state.turned.right if learned else None),
+        turned=sequential_tests.Hypotheses(state.turned.right if learned else None),
         shifted=shifted,
-        blind={code: weight for code, weight in state.blind.items() if code != BENT_MOUNT.code},
+        blind={code: weight for code, weight in state.blind.items() if code != sensor_faults.BENT_MOUNT.code},
         dirt=state.dirt,
         scatter=replace(state.scatter, before=None, variance=None),
         vouched=True,
@@ -474,11 +457,11 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     turned, shifted, astray2 = state.turned, state.shifted, state.astray2
     measurement = measurement_on_axes(observation, ROTATION_AXES, turned.before)
     if measurement is not None:
-        turned = after_check(turned, measurement, ROTATIONS, fresh, most)
-        astray2 = learnt_distance2(turned, measurement.rig)
+        turned = sequential_tests.after_check(turned, measurement, ROTATIONS, fresh, most)
+        astray2 = sequential_tests.learnt_distance2(turned, measurement.rig)
     measurement = measurement_on_axes(observation, TRANSLATION_AXES, shifted.before)
     if measurement is not None:
-        shifted = after_check(shifted, measurement, TRANSLATIONS, fresh, most)
+        shifted = sequential_tests.after_check(shifted, measurement, TRANSLATIONS, fresh, most)
     step = fresh * (WEAK_SHARE if observation.weak else 1.0)
     # Checks that are all too far off with edges that insist on nothing come from images and sweeps of different times.
     if not observation.flagged and not (observation.undecided and observation.distance2 > 1.0):
@@ -489,7 +472,9 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     return replace(state, turned=turned, shifted=shifted, at_odds=at_odds, astray2=astray2, counted=counted)
 
 
-def measurement_on_axes(observation: Observation, axes: slice, before: Three | None) -> CheckMeasurement | None:
+def measurement_on_axes(
+    observation: Observation, axes: slice, before: sequential_tests.Three | None
+) -> sequential_tests.CheckMeasurement | None:
     """What a check says about three axes; None unless it determines all of them. `before` is the offset of the check
     before it."""
     columns = (observation.offset, observation.sigma, observation.noise, observation.place)
@@ -497,33 +482,33 @@ def measurement_on_axes(observation: Observation, axes: slice, before: Three | N
     if not all(isfinite(value) for value in (*offset, *sigma, *noise, *place)) or min(noise) <= 0.0:
         return None
     scene = observation.dispersion
-    times = max(WEAK_TIMES, scene) if observation.weak else scene
-    farther2 = sum((FARTHER * value) ** 2 for value in offset)
-    return CheckMeasurement(
-        offset=three(offset),
-        noise=three([(times * n) ** 2 + farther2 for n in noise]),
-        place=three([(scene * p) ** 2 for p in place]),
-        street=three([p * p for p in place]),
-        rig=three([max(s * s - n * n, p * p) for s, n, p in zip(sigma, noise, place, strict=True)]),
+    times = max(sequential_tests.WEAK_TIMES, scene) if observation.weak else scene
+    farther2 = sum((sequential_tests.FARTHER * value) ** 2 for value in offset)
+    return sequential_tests.CheckMeasurement(
+        offset=sequential_tests.three(offset),
+        noise=sequential_tests.three([(times * n) ** 2 + farther2 for n in noise]),
+        place=sequential_tests.three([(scene * p) ** 2 for p in place]),
+        street=sequential_tests.three([p * p for p in place]),
+        rig=sequential_tests.three([max(s * s - n * n, p * p) for s, n, p in zip(sigma, noise, place, strict=True)]),
         before=before,
         weak=observation.weak,
     )
 
 
-def diagnose(state: MonitorState) -> Cause | None:
+def diagnose(state: MonitorState) -> sensor_faults.Cause | None:
     """What is wrong, if anything is certain enough: first a cause in the data; a bent mount only once confirmed."""
-    of_data = {code: weight for code, weight in state.blind.items() if code != BENT_MOUNT.code}
+    of_data = {code: weight for code, weight in state.blind.items() if code != sensor_faults.BENT_MOUNT.code}
     total = fsum(of_data.values())
     # Against a mount that moved, causes in the data have to explain as many checks as it does.
-    if total >= BLIND_AT and total >= state.blind.get(BENT_MOUNT.code, 0.0):
+    if total >= BLIND_AT and total >= state.blind.get(sensor_faults.BENT_MOUNT.code, 0.0):
         return leading_cause(of_data)
-    return BENT_MOUNT if state.outcome is MonitorOutcome.CONFIRMED else None
+    return sensor_faults.BENT_MOUNT if state.outcome is MonitorOutcome.CONFIRMED else None
 
 
-def leading_cause(weights: Mapping[str, float]) -> Cause | None:
+def leading_cause(weights: Mapping[str, float]) -> sensor_faults.Cause | None:
     """The cause that explains most checks; of equals the one that hides others. None if nothing needs one."""
     return max(
-        (cause for code, cause in CAUSES.items() if weights.get(code, 0.0) > 0.0),
+        (cause for code, cause in sensor_faults.CAUSES.items() if weights.get(code, 0.0) > 0.0),
         key=lambda cause: weights[cause.code],
         default=None,
     )
@@ -535,7 +520,7 @@ def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: floa
     if observation.textured == 0:
         return dict(dirt)
     dirty = {str(block) for block in observation.dirty}
-    return {block: min(dirt.get(block, 0.0) + fresh, DIRTY_CHECKS + 1.0) for block in sorted(dirty)}
+    return {block: min(dirt.get(block, 0.0) + fresh, sensor_faults.DIRTY_CHECKS + 1.0) for block in sorted(dirty)}
 
 
 def _outcome(before: MonitorOutcome, after: MonitorState, levels: AlarmLevels) -> MonitorOutcome:

@@ -24,21 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import normal_quantile
-from coec.calibration.monitor.check_edges import (
-    NEAR_SHARE,
-    OUTLINE_RAD,
-    REACH_RAD,
-    ROTATION_DOF,
-    PreparedImages,
-    PreparedSweep,
-    ProjectedEdges,
-    outline,
-    placed,
-    prepare_images,
-    prepare_sweep,
-    project_edges,
-    search_local_optima,
-)
+from coec.calibration.monitor import check_edges
 from coec.calibration.monitor.sensor_faults import SceneFacts
 from coec.calibration.objective.landscape import Landscape, axis_derivatives, certainty
 from coec.calibration.objective.mutual_information import Features, SearchBox, build_mutual_information
@@ -77,7 +63,7 @@ class Support:
     @property
     def insists(self) -> bool:
         """Whether the gain is also large enough for another place to be believed instead of the one next to a pose."""
-        return self.gained and self.retained < NEAR_SHARE
+        return self.gained and self.retained < check_edges.NEAR_SHARE
 
 
 def support(there: NDArray[np.float64], expected: NDArray[np.float64]) -> Support:
@@ -110,7 +96,7 @@ class CheckInput:
 
     rig: Rig
     pairs: tuple[FramePair, ...]
-    edges: ProjectedEdges
+    edges: check_edges.ProjectedEdges
     scenes: tuple[SceneFacts, ...]
     features: Callable[[], tuple[Features, ...]]
 
@@ -172,28 +158,34 @@ def gather(data: WindowData, beyond_rad: float = 0.0) -> CheckInput:
     """
     window = data.window
     rig, pose = window.rig, window.T_camera_lidar_start
-    sweeps = [prepare_sweep(pair.lidar) for pair in window.pairs]
-    counted = seen_part(rig, sweeps, pose, OUTLINE_RAD)
-    required = seen_part(rig, sweeps, pose, OUTLINE_RAD + beyond_rad) if beyond_rad > 0.0 else counted
+    sweeps = [check_edges.prepare_sweep(pair.lidar) for pair in window.pairs]
+    counted = seen_part(rig, sweeps, pose, check_edges.OUTLINE_RAD)
+    required = seen_part(rig, sweeps, pose, check_edges.OUTLINE_RAD + beyond_rad) if beyond_rad > 0.0 else counted
     # The third column of a rotation is where it takes the third axis.
     upright = rig.T_camera_lidar_nominal[:2, 2]
-    images = prepare_images(data.greys(), len(window.pairs), rig.camera, rig.mask, upright, counted, required)
-    return join(data, sweeps, images, REACH_RAD + beyond_rad)
+    images = check_edges.prepare_images(
+        data.greys(), len(window.pairs), rig.camera, rig.mask, upright, counted, required
+    )
+    return join(data, sweeps, images, check_edges.REACH_RAD + beyond_rad)
 
 
-def seen_part(rig: Rig, sweeps: Sequence[PreparedSweep], pose: Matrix4, reach_rad: float) -> Rectangle:
+def seen_part(rig: Rig, sweeps: Sequence[check_edges.PreparedSweep], pose: Matrix4, reach_rad: float) -> Rectangle:
     """The part of the images in which the range edges of sweeps lie at poses within `reach_rad` of a pose (4, 4); the
     whole image if there are none."""
-    part = outline(rig.camera, [sweep.edges for sweep in sweeps], pose, reach_rad)
+    part = check_edges.outline(rig.camera, [sweep.edges for sweep in sweeps], pose, reach_rad)
     return Rectangle(0, 0, rig.camera.width, rig.camera.height) if part is None else part
 
 
-def join(data: WindowData, sweeps: Sequence[PreparedSweep], images: PreparedImages, reach_rad: float) -> CheckInput:
+def join(
+    data: WindowData, sweeps: Sequence[check_edges.PreparedSweep], images: check_edges.PreparedImages, reach_rad: float
+) -> CheckInput:
     """Joins what was prepared for two sensors into the input of a check of their pair. Sweeps and images are those of
     the pairs of `sight`, in order. Poses within `reach_rad` of the start of `sight` can be checked."""
     window = data.window
     pose = window.T_camera_lidar_start
-    edges = project_edges(window.rig, window.pairs, sweeps, images, pose, reach_rad, compensated=data.compensated)
+    edges = check_edges.project_edges(
+        window.rig, window.pairs, sweeps, images, pose, reach_rad, compensated=data.compensated
+    )
     scenes = tuple(
         SceneFacts(
             pair.stamp_ns,
@@ -211,9 +203,9 @@ def join(data: WindowData, sweeps: Sequence[PreparedSweep], images: PreparedImag
 def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) -> Check:
     """A check at `pose` (4, 4)."""
     edges = evidence.edges
-    optima = search_local_optima(edges, pose)
+    optima = check_edges.search_local_optima(edges, pose)
     cells = edges.cells(optima.T_rotation)
-    landscape = Landscape.about(cells, optima.T_rotation, tuple(range(ROTATION_DOF)))
+    landscape = Landscape.about(cells, optima.T_rotation, tuple(range(check_edges.ROTATION_DOF)))
     noise = measure_noise(landscape)
     poses = (se3.perturb(pose, expected.rotation), optima.T_pose, se3.perturb(pose, expected.pose))
     at_expected_turn, at_pose, at_expected_pose = cells.at(np.stack(poses))
@@ -238,7 +230,7 @@ def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) 
 
 def _in_view(edges: EdgeFrames, T_camera_lidar: Matrix4) -> int:
     """How many range edges lie in the images."""
-    uv_px, valid = project(edges.camera, placed(edges, T_camera_lidar))
+    uv_px, valid = project(edges.camera, check_edges.placed(edges, T_camera_lidar))
     return int(np.count_nonzero(valid & in_image(edges.camera, uv_px)))
 
 
@@ -262,12 +254,12 @@ class DepthCue:
     @property
     def f1(self) -> float:
         """Largest slope of the rotations, nats per radian."""
-        return float(np.max(np.abs(self.first_derivative[:ROTATION_DOF])))
+        return float(np.max(np.abs(self.first_derivative[: check_edges.ROTATION_DOF])))
 
     @property
     def f2(self) -> float:
         """Least peakedness of the rotations, nats per radian²."""
-        return float(np.min(self.second_derivative[:ROTATION_DOF]))
+        return float(np.min(self.second_derivative[: check_edges.ROTATION_DOF]))
 
 
 def depth_cue(evidence: CheckInput, seen: Check, pose: Matrix4, config: CalibrationConfig) -> DepthCue:
@@ -277,10 +269,10 @@ def depth_cue(evidence: CheckInput, seen: Check, pose: Matrix4, config: Calibrat
         CalibrationError: a frame has no usable depth, or no point can come into view.
     """
     depth = build_mutual_information(
-        evidence.features(), evidence.rig, pose, SearchBox(REACH_RAD, 0.0), config.objective
+        evidence.features(), evidence.rig, pose, SearchBox(check_edges.REACH_RAD, 0.0), config.objective
     )
     first_derivative, second_derivative = axis_derivatives(depth, pose)
-    rotation = config.search.model_copy(update={"dof": ROTATION_DOF})
+    rotation = config.search.model_copy(update={"dof": check_edges.ROTATION_DOF})
     there = polish(depth, seen.T_rotation, rotation, Silence()).T_camera_lidar
     return DepthCue(
         mi=depth.evaluate(pose).mi,

@@ -31,28 +31,14 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import cell_means
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.monitor.sensor_faults import (
-    BAND_RANGE_RAD,
-    BANDS,
-    BLOCK_COLUMNS,
-    BLOCK_ROWS,
-    SECTORS,
-    PictureFacts,
-    SweepFacts,
-)
+from coec.calibration.monitor import sensor_faults
 from coec.calibration.objective.mutual_information import COLUMNS, ROWS, Cells, PointsInView, sectors
 from coec.calibration.search.local_search import POLISH_METRES_PER_RADIAN, Box, maximum_in
 from coec.calibration.types import FramePair, LidarFrame, Matrix4, Rig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, cropped, in_image, pixel_rad, scaled
-from coec.geometry.edges.alignment import (
-    LEAST_SQUARE,
-    EdgeFrames,
-    alignment_of_parts,
-    significances,
-    smooth_significances,
-)
+from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import moved_by, select_separated, unit_ball
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, MEAN_RADIUS_PX, EdgeScales, Rectangle
 from coec.geometry.edges.range_edges import range_edges
@@ -68,23 +54,23 @@ THUMBNAIL_CELL_PX = 8
 """Side, in pixels of the image, of one pixel of the thumbnail by which pictures are compared."""
 
 
-def picture_facts(grey: NDArray[np.uint8]) -> PictureFacts:
+def picture_facts(grey: NDArray[np.uint8]) -> sensor_faults.PictureFacts:
     """The facts of an image, (h, w)."""
     thumbnail = cell_means(grey, THUMBNAIL_CELL_PX).astype(np.float32)
     levels = np.cumsum(level_counts(grey, BRIGHT_STEP))
-    return PictureFacts(
-        gradient=neighbour_differences(grey, BLOCK_ROWS, BLOCK_COLUMNS),
+    return sensor_faults.PictureFacts(
+        gradient=neighbour_differences(grey, sensor_faults.BLOCK_ROWS, sensor_faults.BLOCK_COLUMNS),
         bright=float(np.searchsorted(levels, BRIGHT_SHARE * levels[-1])),
         thumbnail=thumbnail,
         digest=zlib.crc32(thumbnail.data),
     )
 
 
-def sweep_facts(xyz_m: NDArray[np.float32], seen: Bearings, range_edges: int) -> SweepFacts:
+def sweep_facts(xyz_m: NDArray[np.float32], seen: Bearings, range_edges: int) -> sensor_faults.SweepFacts:
     """The facts of a sweep, from its points (N, 3), their bearings and the number of its range edges."""
-    low, high = BAND_RANGE_RAD
-    bands, sectors = grid_counts(seen.elevation, seen.azimuth, low, high, BANDS, SECTORS)
-    return SweepFacts(bands, sectors, range_edges, zlib.crc32(np.ascontiguousarray(xyz_m).data))
+    low, high = sensor_faults.BAND_RANGE_RAD
+    bands, sectors = grid_counts(seen.elevation, seen.azimuth, low, high, sensor_faults.BANDS, sensor_faults.SECTORS)
+    return sensor_faults.SweepFacts(bands, sectors, range_edges, zlib.crc32(np.ascontiguousarray(xyz_m).data))
 
 
 MAX_PIXELS = 2_500_000
@@ -118,7 +104,7 @@ class PreparedSweep:
 
     edges: LidarFrame
     weight: NDArray[np.float32]
-    facts: SweepFacts
+    facts: sensor_faults.SweepFacts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +127,7 @@ class PreparedImages:
         bands: likewise, from fine to coarse; at least two.
     """
 
-    facts: tuple[PictureFacts, ...]
+    facts: tuple[sensor_faults.PictureFacts, ...]
     sharp: MapLevel
     whole: MapLevel
     bands: tuple[MapLevel, ...]
@@ -208,7 +194,7 @@ def prepare_images(
     part = _aligned(required, camera, 2 << coarsest)
     lit = np.ones((part.height, part.width), np.bool_) if mask is None else np.ascontiguousarray(mask[part.slices])
     scales = EdgeScales(lit, finest, coarsest, upright, counted.within(part))
-    facts: list[PictureFacts] = []
+    facts: list[sensor_faults.PictureFacts] = []
     stacks: list[NDArray[np.int8]] = []
     for frame, grey in enumerate(greys):
         if grey.shape != (camera.height, camera.width):
@@ -263,7 +249,7 @@ CELL_STEP = 0.25
 class ProjectedLevel:
     """Range edges on the maps of one level, and the blur of these maps, an angle about the optical axis."""
 
-    frames: EdgeFrames
+    frames: alignment.EdgeFrames
     blur_rad: float
 
 
@@ -309,9 +295,9 @@ class ProjectedEdges:
         sector[seen] = sectors(uv_px[seen])
 
         def at(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-            of_sectors = alignment_of_parts(frames, sector, COLUMNS * ROWS, poses)
+            of_sectors = alignment.alignment_of_parts(frames, sector, COLUMNS * ROWS, poses)
             squares = np.array([float(square.sum()) for square in of_sectors.square])
-            scales = len(frames.maps) / np.sqrt(np.maximum(squares, LEAST_SQUARE))
+            scales = len(frames.maps) / np.sqrt(np.maximum(squares, alignment.LEAST_SQUARE))
             return np.asarray(of_sectors.strength * scales[:, None, None])
 
         points = PointsInView(p_camera[seen], frames.weight[seen].astype(np.float64), self.frame[seen])
@@ -351,7 +337,9 @@ def project_edges(
     xyz_m, weight = np.ascontiguousarray(np.concatenate(points_m).T), np.concatenate(weights)
 
     def projected(level: MapLevel) -> ProjectedLevel:
-        return ProjectedLevel(EdgeFrames(level.camera, xyz_m, weight, first_point, level.maps), level.blur_rad)
+        return ProjectedLevel(
+            alignment.EdgeFrames(level.camera, xyz_m, weight, first_point, level.maps), level.blur_rad
+        )
 
     bands = tuple(projected(band) for band in images.bands)
     return ProjectedEdges(projected(images.sharp), projected(images.whole), bands, tuple(measured))
@@ -361,7 +349,7 @@ _PIXELS_PER_BLUR = 2.0
 """Pixels per blur of the finest band, see `BLUR_SIGMA_PX`."""
 
 
-def placed(frames: EdgeFrames, T_camera_lidar: Matrix4) -> NDArray[np.float64]:
+def placed(frames: alignment.EdgeFrames, T_camera_lidar: Matrix4) -> NDArray[np.float64]:
     """(E, 3) the range edges in the frame of the camera at a pose (4, 4)."""
     xyz_m = frames.xyz_m.astype(np.float64)
     return np.asarray(xyz_m.T @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
@@ -471,15 +459,15 @@ def search_local_optima(edges: ProjectedEdges, pose: Matrix4) -> LocalOptima:
     coarsest, finest, sharp = edges.bands[-1], edges.bands[0], edges.sharp
     settled = se3.axis_steps(finest.blur_rad, POLISH_METRES_PER_RADIAN)
     near = _ascend(sharp.frames, pose, settled[:ROTATION_DOF], TOLERANCE)
-    fair = HOPELESS_SHARE * float(smooth_significances(finest.frames, near.pose[None])[0])
+    fair = HOPELESS_SHARE * float(alignment.smooth_significances(finest.frames, near.pose[None])[0])
     cover = _cover(pose, coarsest.blur_rad)
     thin = coarsest.frames.of_points(thinned(len(coarsest.frames.weight), COVER_POINTS))
-    z = significances(thin, cover)
+    z = alignment.significances(thin, cover)
     z_best = float(z.max())
     # The maximum of the sharpest edges next to the pose may be a ripple on a hill that is whole on the finest band.
     ends = [_ascend(finest.frames, near.pose, settled[:ROTATION_DOF], LEADING_TOLERANCE)]
     separation = MIN_SEPARATION * coarsest.blur_rad
-    z_near = float(significances(thin, near.pose[None])[0])
+    z_near = float(alignment.significances(thin, near.pose[None])[0])
     for number in select_separated(cover, np.argsort(-z, kind="stable"), BEGINNINGS, _trace_of(separation)):
         # A nearer beginning is on the same hill, unless it is higher than the maximum next to the pose. That maximum is
         # then a ripple on the slope, and the finest band, whose reach is a few tenths of a degree, may not lead off it.
@@ -507,7 +495,7 @@ def _contrast(band: ProjectedLevel, pose: Matrix4) -> float:
     turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angle_rad)
     turned[:, 1, 0] = np.sin(angle_rad)
     turned[:, 0, 1] = -turned[:, 1, 0]
-    z = significances(band.frames, np.concatenate([pose[None], pose @ turned]))
+    z = alignment.significances(band.frames, np.concatenate([pose[None], pose @ turned]))
     return float((z[0] - z[1:].mean()) / max(float(z[1:].std()), 1e-9))
 
 
@@ -537,7 +525,7 @@ def _led(bands: tuple[ProjectedLevel, ...], pose: Matrix4) -> _End:
     return end
 
 
-def _ascend(frames: EdgeFrames, start: Matrix4, step: NDArray[np.float64], tolerance: float) -> _End:
+def _ascend(frames: alignment.EdgeFrames, start: Matrix4, step: NDArray[np.float64], tolerance: float) -> _End:
     """The maximum next to a pose, along the first `len(step)` axes of ξ."""
     dof = len(step)
 
@@ -547,13 +535,13 @@ def _ascend(frames: EdgeFrames, start: Matrix4, step: NDArray[np.float64], toler
         return moved_by(start, np.ascontiguousarray(xi[:, :3]), np.ascontiguousarray(xi[:, 3:]))
 
     def scores(points: NDArray[np.float64]) -> list[float]:
-        values: list[float] = smooth_significances(frames, at(points)).tolist()
+        values: list[float] = alignment.smooth_significances(frames, at(points)).tolist()
         return values
 
     reach = ASCENT_STEPS * step
     best, _ = maximum_in(Box(-reach, reach, step, tolerance * step), scores, np.zeros(dof), MAX_EVALUATIONS)
     end = at(best[None])
-    return _End(end[0], float(smooth_significances(frames, end)[0]))
+    return _End(end[0], float(alignment.smooth_significances(frames, end)[0]))
 
 
 def _cover(pose: Matrix4, blur_rad: float) -> NDArray[np.float64]:

@@ -20,8 +20,6 @@ The figures are the paper's three, equation (2), and one that tells more: how ma
 pose and the local optimum.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from enum import StrEnum
@@ -41,6 +39,7 @@ from coec.calibration.baseline import (
 )
 from coec.calibration.frames.motion_compensation import compensate, sensor_twist
 from coec.calibration.frames.window import drives
+from coec.calibration.monitor import sensor_faults
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import (
     AT_POSE,
@@ -55,14 +54,6 @@ from coec.calibration.monitor.check import (
     gather,
 )
 from coec.calibration.monitor.check_edges import MIN_CONTRAST, NEAR_SHARE, POSE_DOF, ROTATION_DOF
-from coec.calibration.monitor.sensor_faults import (
-    EGO_MOTION_WRONG,
-    INTRINSICS_WRONG,
-    TIME_OFFSET,
-    Cause,
-    data_causes,
-    dirty_blocks,
-)
 from coec.calibration.solver import prepare_window_data
 from coec.calibration.types import DepthModel, EgoMotion, FramePair, ImageReader, Matrix4, Metric, Rig, Silence, Window
 from coec.config import CalibrationConfig
@@ -116,7 +107,7 @@ def explained_by_nuisance(
     pose_optimum: Matrix4,
     min_significance: float,
     zooms: Sequence[float] = ZOOMS,
-) -> Cause | None:
+) -> sensor_faults.Cause | None:
     """The clock, ego-motion or focal length that explains the images better than the extrinsic alone; None if none
     does. Clock and ego-motion are tried only if there is enough motion.
 
@@ -147,13 +138,13 @@ def explained_by_nuisance(
 
 def _hypotheses(
     edges: Sequence[FramePair], rig: Rig, level: EdgeFrames, zooms: Sequence[float]
-) -> Iterator[tuple[EdgeFrames, NDArray[np.float64], Cause]]:
+) -> Iterator[tuple[EdgeFrames, NDArray[np.float64], sensor_faults.Cause]]:
     """For each hypothesis the range edges as it places them, the motions (F, 4, 4) that then move the edges of each
     pair, and the cause that it stands for."""
     still = np.tile(np.eye(4), (len(edges), 1, 1))
     for zoom in zooms:
         camera = level.camera._replace(fx=zoom * level.camera.fx, fy=zoom * level.camera.fy)
-        yield replace(level, camera=camera), still, INTRINSICS_WRONG
+        yield replace(level, camera=camera), still, sensor_faults.INTRINSICS_WRONG
     moving = [pair for pair in edges if pair.motion is not None and pair.motion.reaches(MIN_SPEED_MPS)]
     if 2 * len(moving) < len(edges):
         return
@@ -161,9 +152,9 @@ def _hypotheses(
     placed = _placed(edges, rig, level)
     for seconds in OFFSETS_S:
         # Under a constant twist, a later time is one more motion, the same for all points of a sweep.
-        yield placed, np.array([se3.exp(seconds * of_pair) for of_pair in xi]), TIME_OFFSET
+        yield placed, np.array([se3.exp(seconds * of_pair) for of_pair in xi]), sensor_faults.TIME_OFFSET
     for factor in SCALES:
-        yield _placed([_scaled(pair, factor) for pair in edges], rig, level), still, EGO_MOTION_WRONG
+        yield _placed([_scaled(pair, factor) for pair in edges], rig, level), still, sensor_faults.EGO_MOTION_WRONG
 
 
 def _twist(pair: FramePair, rig: Rig) -> NDArray[np.float64]:
@@ -323,8 +314,10 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
     metrics = _metrics(seen, of_rotation, of_pose, limits)
     judgement = opinion(seen, rotation, accuracy, limits)
     faint = faintness(evidence.pairs, seen, limits)
-    causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
-    dirty, textured = ((), 0) if baseline is None or causes else dirty_blocks(evidence.scenes, baseline.scene)
+    causes = sensor_faults.data_causes(evidence.scenes, None if baseline is None else baseline.scene)
+    dirty, textured = (
+        ((), 0) if baseline is None or causes else sensor_faults.dirty_blocks(evidence.scenes, baseline.scene)
+    )
     if not causes and not faint & {Faint.EDGES_IN_VIEW, Faint.INDEPENDENT_SAMPLES}:
         # Few edges fit another clock as well as they fit another mount.
         explained = explained_by_nuisance(

@@ -5,8 +5,6 @@ a covered lens has no gradients, a lost beam no points, and a wrong clock moves 
 vehicle. A cause has to show in most pairs of a check, so that one bad frame is no cause.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,8 +1,6 @@
 """The second witness: range edges of the sweeps laid on edges of the images, at several scales; and how many
 independent frames those of a window are worth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

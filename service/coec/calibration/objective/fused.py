@@ -13,29 +13,12 @@ from math import hypot, radians, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.objective import mutual_information
 from coec.calibration.objective.edges import EdgeCue, in_reach
-from coec.calibration.objective.mutual_information import (
-    COLUMNS,
-    ROWS,
-    Cells,
-    Evaluation,
-    MutualInformation,
-    PointsInView,
-    SearchBox,
-    sectors,
-)
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import in_image
-from coec.geometry.edges.alignment import (
-    LEAST_SQUARE,
-    Alignment,
-    EdgeFrames,
-    alignment_of_parts,
-    alignments,
-    frame_alignment,
-    significances,
-)
+from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import charted_significances
 from coec.geometry.edges.image_edges import VOID
 from coec.geometry.projection import half_field_of_view_rad, project
@@ -48,11 +31,11 @@ OTHER_POSES_RAD = radians(28.0)
 """For the edges these poses come from at least this reach, however small that of the search: nearer to the truth, poses
 share too much of the scene's layout with it to stand for wrong ones."""
 
-NEARBY = SearchBox(radians(10.0), 1.0)
+NEARBY = mutual_information.SearchBox(radians(10.0), 1.0)
 """How far from the pose of their division cells are evaluated: to where the hill certainly drops, and to other summits
 of the basin. Edges that come into view only farther off are in no cell."""
 
-BEYOND = SearchBox(radians(8.0), 0.5)
+BEYOND = mutual_information.SearchBox(radians(8.0), 0.5)
 """How far outside of the reach a polish may end: by its box of four blurs, and by the box of the next level."""
 
 
@@ -81,7 +64,14 @@ class FusedObjective:
     """Standardised edge significance at one blur plus standardised mutual information, for each frame and on
     average."""
 
-    def __init__(self, edges: EdgeFrames, step_rad: float, depth: MutualInformation, of_edges: Scale, of_depth: Scale):
+    def __init__(
+        self,
+        edges: alignment.EdgeFrames,
+        step_rad: float,
+        depth: mutual_information.MutualInformation,
+        of_edges: Scale,
+        of_depth: Scale,
+    ):
         self._edges, self._depth = edges, depth
         self._of_edges, self._of_depth = of_edges, of_depth
         self._step_rad = step_rad
@@ -91,23 +81,23 @@ class FusedObjective:
         """The blur of the edges, or more, because the hill of the sharpest edges has ripples a pixel wide."""
         return self._step_rad
 
-    def with_depth(self, depth: MutualInformation) -> FusedObjective:
+    def with_depth(self, depth: mutual_information.MutualInformation) -> FusedObjective:
         """The same edges with another depth witness, on the same scale."""
         return FusedObjective(self._edges, self._step_rad, depth, self._of_edges, self._of_depth)
 
-    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
+    def evaluate(self, T_camera_lidar: Matrix4) -> mutual_information.Evaluation:
         """The objective at `T_camera_lidar` (4, 4), in standard deviations."""
-        return self._fused(frame_alignment(self._edges, T_camera_lidar), self._depth.evaluate(T_camera_lidar))
+        return self._fused(alignment.frame_alignment(self._edges, T_camera_lidar), self._depth.evaluate(T_camera_lidar))
 
-    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[mutual_information.Evaluation]:
         """The same at each of many poses (K, 4, 4)."""
-        edges, depth = alignments(self._edges, poses), self._depth.evaluate_each(poses)
+        edges, depth = alignment.alignments(self._edges, poses), self._depth.evaluate_each(poses)
         return [self._fused(edges.at(k), of_depth) for k, of_depth in enumerate(depth)]
 
-    def _fused(self, edges: Alignment, depth: Evaluation) -> Evaluation:
+    def _fused(self, edges: alignment.Alignment, depth: mutual_information.Evaluation) -> mutual_information.Evaluation:
         frame_scores = (edges.of_frames - self._of_edges.mean) / self._of_edges.deviation
         frame_scores = frame_scores + (depth.frame_scores - self._of_depth.mean) / self._of_depth.deviation
-        return Evaluation(
+        return mutual_information.Evaluation(
             score=float(frame_scores.mean()),
             frame_scores=frame_scores,
             mi=depth.mi,
@@ -115,7 +105,7 @@ class FusedObjective:
             points_in_view=depth.points_in_view,
         )
 
-    def cells(self, T_camera_lidar: Matrix4) -> Cells:
+    def cells(self, T_camera_lidar: Matrix4) -> mutual_information.Cells:
         """The edges by sectors of the image, and depth, which cannot be divided, as one more sector."""
         every = self._edges
         half_view_rad = half_field_of_view_rad(every.camera, every.maps[0] != VOID)
@@ -128,20 +118,22 @@ class FusedObjective:
         frame = np.repeat(np.arange(len(edges.maps)), np.diff(edges.first_point))
         # Edges outside the image count with the first sector if a step brings them into view.
         sector = np.zeros(len(p_camera), np.uint8)
-        sector[seen] = sectors(uv_px[seen])
+        sector[seen] = mutual_information.sectors(uv_px[seen])
 
         def at(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-            cells = np.empty((len(poses), len(edges.maps), COLUMNS * ROWS + 1))
-            of_sectors = alignment_of_parts(edges, sector, COLUMNS * ROWS, poses)
+            cells = np.empty((len(poses), len(edges.maps), mutual_information.COLUMNS * mutual_information.ROWS + 1))
+            of_sectors = alignment.alignment_of_parts(
+                edges, sector, mutual_information.COLUMNS * mutual_information.ROWS, poses
+            )
             for k, of_depth in enumerate(self._depth.evaluate_each(poses)):
                 square = float(of_sectors.square[k].sum())
-                scale = len(edges.maps) / sqrt(max(square, LEAST_SQUARE)) / self._of_edges.deviation
+                scale = len(edges.maps) / sqrt(max(square, alignment.LEAST_SQUARE)) / self._of_edges.deviation
                 cells[k, :, :-1] = of_sectors.strength[k] * scale
                 cells[k, :, -1] = of_depth.frame_scores / self._of_depth.deviation
             return cells
 
-        points = PointsInView(p_camera[seen], edges.weight[seen].astype(np.float64), frame[seen])
-        return Cells(at, CELL_STEP * self._step_rad, points)
+        points = mutual_information.PointsInView(p_camera[seen], edges.weight[seen].astype(np.float64), frame[seen])
+        return mutual_information.Cells(at, CELL_STEP * self._step_rad, points)
 
 
 class Fusion:
@@ -160,13 +152,21 @@ class Fusion:
     ranking: tuple[FusedObjective, ...]
     settling: tuple[FusedObjective, FusedObjective]
 
-    def __init__(self, edges: EdgeCue, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
+    def __init__(
+        self,
+        edges: EdgeCue,
+        depth: mutual_information.MutualInformation,
+        start: Matrix4,
+        reach: mutual_information.SearchBox,
+    ) -> None:
         self.edges, self.depth, self.start, self.reach = edges, depth, start, reach
         poses = sample_reach(start, reach, OTHER_POSES)
         self._of_depth = Scale.of(np.array([at.score for at in depth.evaluate_each(poses)]))
         of_edges = replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD))
         poses = sample_reach(start, of_edges, OTHER_POSES)
-        seen = SearchBox(of_edges.rotation_rad + BEYOND.rotation_rad, of_edges.translation_m + BEYOND.translation_m)
+        seen = mutual_information.SearchBox(
+            of_edges.rotation_rad + BEYOND.rotation_rad, of_edges.translation_m + BEYOND.translation_m
+        )
         edges = replace(
             edges,
             bands=tuple(in_reach(band, edges.half_view_rad, start, seen) for band in edges.bands),
@@ -178,7 +178,7 @@ class Fusion:
             FusedObjective(band, blur_rad, depth, self._of_bands, self._of_depth)
             for band, blur_rad in reversed(list(zip(edges.bands[:-1], edges.band_blur_rad[:-1], strict=True)))
         )
-        of_whole, of_sharp = (Scale.of(significances(level, poses)) for level in (edges.whole, edges.sharp))
+        of_whole, of_sharp = (Scale.of(alignment.significances(level, poses)) for level in (edges.whole, edges.sharp))
         self.settling = (
             FusedObjective(edges.whole, edges.blur_rad, depth, of_whole, self._of_depth),
             FusedObjective(edges.sharp, edges.blur_rad, depth, of_sharp, self._of_depth),
@@ -187,7 +187,7 @@ class Fusion:
     def edge_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
         """How far the edge witness, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);
         standard deviations."""
-        of_bands = np.stack([significances(band, poses) for band in self.edges.bands], axis=1)
+        of_bands = np.stack([alignment.significances(band, poses) for band in self.edges.bands], axis=1)
         return [self._of_bands.standard(float(np.mean(z))) for z in of_bands]
 
     def edge_contrast(self, T_camera_lidar: Matrix4) -> float:

@@ -13,8 +13,6 @@ such a sensor is that its pair steps otherwise than the rest, and so does a pair
 bent. So if the one LiDAR of a vehicle seems to have moved, a window decides whether a camera moved beside it.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace

@@ -20,15 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import STREET, UNCOMMISSIONED_BIAS
+from coec.calibration.monitor import sequential_tests
 from coec.calibration.monitor.change_detector import ROTATIONS, TRANSLATIONS, Observation, measurement_on_axes
-from coec.calibration.monitor.sequential_tests import (
-    BAD_AFTER_BAD,
-    BAD_SHARE,
-    BAD_SHARE_WEAK,
-    FREEDOM,
-    SAME_AGAIN,
-    SAME_AGAIN_WEAK,
-)
 from coec.calibration.rig.lidar_sampling import KNOWN_BEFORE
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4, Uncertainty
@@ -79,12 +72,16 @@ class EdgeObservation:
     @property
     def log_bad(self) -> float:
         """Logarithm of the share of bad looks among looks such as this."""
-        return log(BAD_SHARE_WEAK if self.weak else BAD_SHARE)
+        return log(sequential_tests.BAD_SHARE_WEAK if self.weak else sequential_tests.BAD_SHARE)
 
     @property
     def log_bad_again(self) -> float:
         """Logarithm of the chance that it is bad in the same place as the look before it, if that one was bad."""
-        return log(BAD_SHARE_WEAK * SAME_AGAIN_WEAK if self.weak else BAD_AFTER_BAD * SAME_AGAIN)
+        return log(
+            sequential_tests.BAD_SHARE_WEAK * sequential_tests.SAME_AGAIN_WEAK
+            if self.weak
+            else sequential_tests.BAD_AFTER_BAD * sequential_tests.SAME_AGAIN
+        )
 
 
 def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -391,7 +388,7 @@ class _Window:
     @property
     def log_bad(self) -> float:
         """Logarithm of the chance that it is bad, times the density of a bad one."""
-        return log(BAD_SHARE) + float(_log_normal(np.diag(REACH[self.axes] ** 2), self.xi))
+        return log(sequential_tests.BAD_SHARE) + float(_log_normal(np.diag(REACH[self.axes] ** 2), self.xi))
 
     @property
     def log_still(self) -> float:
@@ -424,13 +421,13 @@ class _Window:
             covariance=steps.covariance - np.where(fits[:, None, None], 0.5 * (less + np.swapaxes(less, -1, -2)), 0.0),
             observations=steps.observations + fits,
             # Looks that are bad for a while have to have a bad window beside them.
-            log_transient=steps.log_transient + np.where(fits, log(BAD_SHARE), 0.0),
+            log_transient=steps.log_transient + np.where(fits, log(sequential_tests.BAD_SHARE), 0.0),
             log_stepped=steps.log_stepped + np.where(self.after, log_fit, self.log_still),
             log_still=steps.log_still + self.log_still,
         )
 
 
-_LOG_GOOD = log(1.0 - BAD_SHARE)
+_LOG_GOOD = log(1.0 - sequential_tests.BAD_SHARE)
 
 
 def _log_normal(covariance: Array, x: Array) -> Array:
@@ -471,8 +468,13 @@ class _Stack:
         whole = information + np.where(determined, 0.0, 1.0)[:, :, None] * np.eye(6)
         spread = linalg.log_determinant(linalg.cholesky(whole))
         bad = np.exp([observation.log_bad for observation in observations])
-        constant = np.array([lgamma((FREEDOM + d) / 2.0) - lgamma(FREEDOM / 2.0) for d in axes.tolist()])
-        log_good = np.log1p(-bad) + constant - 0.5 * axes * log(FREEDOM * pi) + 0.5 * spread
+        constant = np.array(
+            [
+                lgamma((sequential_tests.FREEDOM + d) / 2.0) - lgamma(sequential_tests.FREEDOM / 2.0)
+                for d in axes.tolist()
+            ]
+        )
+        log_good = np.log1p(-bad) + constant - 0.5 * axes * log(sequential_tests.FREEDOM * pi) + 0.5 * spread
         within = np.where(determined, -0.5 * (offset / REACH) ** 2 - np.log(REACH) - 0.5 * log(2.0 * pi), 0.0)
         share = np.array([observation.share for observation in observations])
         return cls(offset, information, axes, log_good, np.log(bad) + within.sum(axis=1), share)
@@ -482,10 +484,14 @@ class _Stack:
         one; each (T, S, N)."""
         away = self.offset - mean[:, :, None, :]
         q = linalg.squared(self.information, away)
-        log_good = self.log_good - 0.5 * (FREEDOM + self.axes) * np.log1p(q / FREEDOM)
+        log_good = self.log_good - 0.5 * (sequential_tests.FREEDOM + self.axes) * np.log1p(q / sequential_tests.FREEDOM)
         density = np.logaddexp(log_good, self.log_bad)
         good = self.share * np.exp(log_good - density)
-        return self.share * density, good * np.minimum((FREEDOM + self.axes) / (FREEDOM + q), 1.0), good
+        return (
+            self.share * density,
+            good * np.minimum((sequential_tests.FREEDOM + self.axes) / (sequential_tests.FREEDOM + q), 1.0),
+            good,
+        )
 
     def mean(
         self, mask: NDArray[np.bool_], information: Array, moment: Array, extra: ExtraLikelihood | None = None

@@ -12,8 +12,6 @@ long). The priors are no stronger than the knowledge of a workshop and of a data
 determines stays where it was, with a wide covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import radians
@@ -24,15 +22,7 @@ from numpy.typing import NDArray
 from coec.calibration.frames.motion_compensation import sensor_twist
 from coec.calibration.frames.pairing import azimuth_offsets_s
 from coec.calibration.objective.landscape import scatter
-from coec.calibration.rig.lidar_sampling import (
-    KNOWN_BEFORE,
-    LEAST_SHARE,
-    LidarEdge,
-    LidarRig,
-    Met,
-    RangeBias,
-    SweepPair,
-)
+from coec.calibration.rig import lidar_sampling
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Neighbourhood, NeighbourSearch, Reason, SweepTiming
 from coec.geometry import se3
 from coec.geometry.linalg import congruent, eigen, inverted, solved
@@ -79,7 +69,7 @@ class Cloud:
         return np.concatenate(sensor_twist(self.motion, self.T_a_ego))
 
 
-def clouds_of(rig: LidarRig, pair: SweepPair) -> Cloud:
+def clouds_of(rig: lidar_sampling.LidarRig, pair: lidar_sampling.SweepPair) -> Cloud:
     """The points of a pair of sweeps, motion-compensated by the time of each point. Without such times all points of a
     sweep have its stamp; without ego-motion nothing is moved."""
     a, b = pair.a, pair.b
@@ -123,7 +113,9 @@ LEANING = 2.0
 no better than a variance of a dozen neighbours."""
 
 
-def covariance_of(met: Met, weight: Doubles, prior: Doubles, noise_m: float, clouds: Sequence[Cloud]) -> Doubles:
+def covariance_of(
+    met: lidar_sampling.Met, weight: Doubles, prior: Doubles, noise_m: float, clouds: Sequence[Cloud]
+) -> Doubles:
     """The covariance (8, 8) of ξ and of the range biases of a and b.
 
     Args:
@@ -168,7 +160,7 @@ def _reshaped(symmetric: Doubles, of: Callable[[float], float]) -> Doubles:
     return result
 
 
-def _cells(met: Met, score: Doubles) -> Doubles:
+def _cells(met: lidar_sampling.Met, score: Doubles) -> Doubles:
     """(8, pairs, sectors) sums of the score (N, 8) over each pair and sector."""
     azimuth = np.arctan2(met.place[:, 1], met.place[:, 0])
     around = np.minimum(((azimuth / (2 * np.pi) + 0.5) * AZIMUTHS).astype(np.int64), AZIMUTHS - 1)
@@ -205,7 +197,7 @@ THICKEST_M = 0.04
 NARROWEST, NARROWEST_M = 0.15, 0.04
 """A surface is only a strip, from one ring, if the narrower of its two extents is less than this share of the wider
 one, less than this many metres, or no wider than the surface is thick."""
-PRIOR = np.concatenate([KNOWN_BEFORE, [0.03] * 2])
+PRIOR = np.concatenate([lidar_sampling.KNOWN_BEFORE, [0.03] * 2])
 """Prior standard deviations of the mount (rad, m), and of the range biases, from data sheets (m)."""
 NOISE_M = 0.02
 """Standard deviation of a residual for weighing it against the priors; the covariance is computed from the residuals
@@ -214,7 +206,9 @@ LEAST_POINTS = 500
 """An edge needs at least this many points on surfaces, and at least `LEAST_SHARE` of those tried."""
 
 
-def register(rig: LidarRig, pairs: Sequence[SweepPair], search: NeighbourSearch) -> LidarEdge:
+def register(
+    rig: lidar_sampling.LidarRig, pairs: Sequence[lidar_sampling.SweepPair], search: NeighbourSearch
+) -> lidar_sampling.LidarEdge:
     """The pose of b in a that brings the points of b onto the surfaces of a.
 
     Raises:
@@ -233,7 +227,9 @@ def register(rig: LidarRig, pairs: Sequence[SweepPair], search: NeighbourSearch)
         step = _step(met, weight, known)
         T_a_b, bias = se3.perturb(T_a_b, step[:6]), bias + step[6:]
         rests = float(np.abs(step[:3]).max()) < RESTS_RAD and float(np.abs(step[3:]).max()) < RESTS_M
-        if number >= len(REACHES_M) and (rests or len(met.residual) < HOPELESS * LEAST_SHARE * met.tried):
+        if number >= len(REACHES_M) and (
+            rests or len(met.residual) < HOPELESS * lidar_sampling.LEAST_SHARE * met.tried
+        ):
             break
     met = _meet(indexed, T_a_b, bias, REACHES_M[-1])
     weight = _weights(met.residual, max(SCALE_SHARE * REACHES_M[-1], LEAST_SCALE_M))
@@ -242,12 +238,12 @@ def register(rig: LidarRig, pairs: Sequence[SweepPair], search: NeighbourSearch)
     total = float(weight.sum())
     rms_m = float(np.sqrt((weight * met.residual**2).sum() / total)) if total > 0.0 else float("nan")
     longer = np.array([-1.0, 1.0])
-    return LidarEdge(
+    return lidar_sampling.LidarEdge(
         rig=rig,
         T_a_b=T_a_b,
         correction=se3.difference(T_a_b, rig.T_a_b_nominal),
         covariance=covariance[:6, :6],
-        range_bias=RangeBias(float(longer @ bias), float(np.sqrt(longer @ covariance[6:, 6:] @ longer))),
+        range_bias=lidar_sampling.RangeBias(float(longer @ bias), float(np.sqrt(longer @ covariance[6:, 6:] @ longer))),
         rms_m=rms_m,
         points=len(met.residual),
         share=share,
@@ -256,14 +252,14 @@ def register(rig: LidarRig, pairs: Sequence[SweepPair], search: NeighbourSearch)
     )
 
 
-def _reasons(rig: LidarRig, points: int, share: float) -> tuple[Reason, ...]:
-    if points >= LEAST_POINTS and share >= LEAST_SHARE:
+def _reasons(rig: lidar_sampling.LidarRig, points: int, share: float) -> tuple[Reason, ...]:
+    if points >= LEAST_POINTS and share >= lidar_sampling.LEAST_SHARE:
         return ()
     return (
         Reason(
             "lidar_overlap",
             f"{rig.a} and {rig.b} have too little in view in common: {points} points of {rig.b} lie on surfaces of "
-            f"{rig.a}, {100.0 * share:.1f} %; {LEAST_POINTS} and {100.0 * LEAST_SHARE:g} % are needed.",
+            f"{rig.a}, {100.0 * share:.1f} %; {LEAST_POINTS} and {100.0 * lidar_sampling.LEAST_SHARE:g} % are needed.",
         ),
     )
 
@@ -272,7 +268,7 @@ def _weights(residual: Doubles, scale_m: float) -> Doubles:
     return np.asarray(1.0 / (1.0 + (residual / scale_m) ** 2) ** 2)
 
 
-def _step(met: Met, weight: Doubles, known: Doubles) -> Doubles:
+def _step(met: lidar_sampling.Met, weight: Doubles, known: Doubles) -> Doubles:
     """The change (8,) of the unknowns; `known` (8,) is their distance from their priors."""
     weighted = met.jacobian * weight[:, None]
     # einsum without BLAS gives the same bits whatever the number of threads.
@@ -281,7 +277,9 @@ def _step(met: Met, weight: Doubles, known: Doubles) -> Doubles:
     return np.array(solved(information.tolist(), score.tolist()))
 
 
-def _meet(indexed: Sequence[tuple[Cloud, Neighbourhood]], T_a_b: Matrix4, bias: Doubles, reach_m: float) -> Met:
+def _meet(
+    indexed: Sequence[tuple[Cloud, Neighbourhood]], T_a_b: Matrix4, bias: Doubles, reach_m: float
+) -> lidar_sampling.Met:
     """The points of b that lie within reach of a surface of a, at a pose and at the range biases of a and b."""
     parts = []
     tried = 0
@@ -289,9 +287,11 @@ def _meet(indexed: Sequence[tuple[Cloud, Neighbourhood]], T_a_b: Matrix4, bias: 
         tried += len(cloud.raw_b_m)
         parts.append(_meet_one(number, cloud, a, T_a_b, bias, reach_m))
     if not parts:
-        return Met(np.empty(0), np.empty((0, 8)), np.empty((0, 2, 6)), np.empty(0, np.int64), np.empty((0, 3)), tried)
+        return lidar_sampling.Met(
+            np.empty(0), np.empty((0, 8)), np.empty((0, 2, 6)), np.empty(0, np.int64), np.empty((0, 3)), tried
+        )
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    return Met(columns[0], columns[1], columns[2], columns[3].astype(np.int64), columns[4], tried)
+    return lidar_sampling.Met(columns[0], columns[1], columns[2], columns[3].astype(np.int64), columns[4], tried)
 
 
 def _meet_one(

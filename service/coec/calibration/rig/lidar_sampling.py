@@ -6,8 +6,6 @@ time, so that a restarted service and a replay at any rate take the same sweeps.
 sweep of b, once later ones cannot be nearer. Sweeps are large, so only those are kept that may still be taken.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from dataclasses import dataclass
 from math import radians

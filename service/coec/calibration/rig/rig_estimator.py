@@ -14,8 +14,6 @@ Windows of a rig that just moved do not fit those of before. While that is in qu
 once a sensor is named it is a move; only if neither holds do the pairs contradict each other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum

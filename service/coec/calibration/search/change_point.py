@@ -25,8 +25,6 @@ If a single pair of the window lies before or after the change, that pair determ
 the change are also searched for a change, and of all poses found those are taken that explain all pairs best.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -42,15 +40,7 @@ from coec.calibration.solver import WindowData
 from coec.calibration.types import FramePair, Matrix4, MovedWithin
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
-from coec.geometry.edges.alignment import (
-    LEAST_SQUARE,
-    AscentStart,
-    EdgeFrames,
-    Summit,
-    alignments,
-    ascend,
-    significances,
-)
+from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import EdgeCharts, charted_significances
 from coec.geometry.points import thinned
 
@@ -160,11 +150,11 @@ def change_point(edges: EdgeCue, pose: Matrix4) -> ChangePoint | None:
     near = sample_reach(pose, SearchBox(NEAR_BLURS * blur_rad, 0.0), NEAR_POSES)
     far = _put_forward(chart, pose, frames)
     poses = np.concatenate([pose[None], near, *far, *_put_forward_by_ends(chart, band, pose)])
-    early = np.cumsum(alignments(band, poses).of_single_frames, axis=1).T  # (F, K)
+    early = np.cumsum(alignment.alignments(band, poses).of_single_frames, axis=1).T  # (F, K)
     total = early[-1]
     late = total - early
     gains = early[:-1].max(axis=1) + late[:-1].max(axis=1) - total.max()
-    starts = [AscentStart(poses[int(np.argmax(total))], 0, frames)]
+    starts = [alignment.AscentStart(poses[int(np.argmax(total))], 0, frames)]
     sides: list[range] = []
     promising = _promising(gains)
     for last_early in promising:
@@ -172,7 +162,7 @@ def change_point(edges: EdgeCue, pose: Matrix4) -> ChangePoint | None:
             number = STARTS if last - first <= FEW else 1
             best = np.argsort(-of_side[last_early], kind="stable")[:number].tolist()
             sides.append(range(len(starts), len(starts) + number))
-            starts += [AscentStart(poses[k], first, last) for k in best]
+            starts += [alignment.AscentStart(poses[k], first, last) for k in best]
     on_band = [end.pose for end in _ascents(band, starts, blur_rad)]
     again = [replace(start, pose=pose) for start, pose in zip(starts, on_band, strict=True)]
     # The pose for all frames is climbed on the sharpest edges later, beside the poses of the settled sides.
@@ -202,7 +192,9 @@ def _promising(gains: NDArray[np.float64]) -> list[int]:
     return [best] if len(inner) == 0 else list(dict.fromkeys((best, FEW - 1 + int(np.argmax(inner)))))
 
 
-def _settled(sharp: EdgeFrames, splits: Sequence[_Split], T_whole: Matrix4, blur_rad: float) -> list[ChangePoint]:
+def _settled(
+    sharp: alignment.EdgeFrames, splits: Sequence[_Split], T_whole: Matrix4, blur_rad: float
+) -> list[ChangePoint]:
     """The likeliest change next to each split, from the poses that fit its two sides and one (4, 4) that fits all
     frames. All splits take their turns together, so that several climbs run at once."""
     frames, turning = len(sharp.first_point) - 1, dict(enumerate(splits))
@@ -225,7 +217,7 @@ def _settled(sharp: EdgeFrames, splits: Sequence[_Split], T_whole: Matrix4, blur
     # The one pose for all frames is also sought from the poses of the sides, so that it is no worse than theirs.
     final = list(best.values())
     whole = [T_whole, *(T for split in final for T in (split.T_before, split.T_after))]
-    of_whole, *of_sides = _ascents(sharp, [AscentStart(T, 0, frames) for T in whole], blur_rad)
+    of_whole, *of_sides = _ascents(sharp, [alignment.AscentStart(T, 0, frames) for T in whole], blur_rad)
     at_sides = _scores(sharp, whole[1:])
     changes = []
     for place, split in zip(range(0, len(of_sides), 2), final, strict=True):
@@ -234,8 +226,10 @@ def _settled(sharp: EdgeFrames, splits: Sequence[_Split], T_whole: Matrix4, blur
     return changes
 
 
-def _sides(split: _Split, frames: int) -> tuple[AscentStart, AscentStart]:
-    return AscentStart(split.T_before, 0, split.first_late), AscentStart(split.T_after, split.first_late, frames)
+def _sides(split: _Split, frames: int) -> tuple[alignment.AscentStart, alignment.AscentStart]:
+    return alignment.AscentStart(split.T_before, 0, split.first_late), alignment.AscentStart(
+        split.T_after, split.first_late, frames
+    )
 
 
 def _change(
@@ -280,7 +274,7 @@ def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[
     return [cover[selected], *(_about(cover[k]) for k in selected)] if selected else []
 
 
-def _put_forward_by_ends(chart: EdgeCharts, band: EdgeFrames, pose: Matrix4) -> list[NDArray[np.float64]]:
+def _put_forward_by_ends(chart: EdgeCharts, band: alignment.EdgeFrames, pose: Matrix4) -> list[NDArray[np.float64]]:
     """Proposes poses (n, 4, 4) that the first and the last frames fit best, by the chart and then by the band. They are
     searched farther off if these frames do not fit the solved pose."""
     at_pose, selected = scores(band, pose), []
@@ -292,7 +286,7 @@ def _put_forward_by_ends(chart: EdgeCharts, band: EdgeFrames, pose: Matrix4) -> 
         part = chart.of_points(np.flatnonzero((chart.frame >= begin) & (chart.frame < end)))
         best = np.argsort(-charted_significances(part, cover), kind="stable")[:END_CHARTED]
         about = np.concatenate([cover[best], *(_about(cover[k]) for k in best.tolist())])
-        fine = significances(_part(band, begin, end), about)
+        fine = alignment.significances(_part(band, begin, end), about)
         selected.append(about[np.argsort(-fine, kind="stable")[:END_POSES]])
     return selected
 
@@ -303,36 +297,38 @@ def _about(pose: Matrix4) -> NDArray[np.float64]:
     return sample_reach(pose, SearchBox(spacing_rad, 0.0), AROUND_POSES)
 
 
-def scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
+def scores(band: alignment.EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
     """(F,) z of each frame by itself at a pose (4, 4)."""
     return np.asarray(_scores(band, [pose])[0])
 
 
-def _scores(band: EdgeFrames, poses: Sequence[Matrix4]) -> NDArray[np.float64]:
+def _scores(band: alignment.EdgeFrames, poses: Sequence[Matrix4]) -> NDArray[np.float64]:
     """(K, F) z of each frame by itself at each of K poses (4, 4)."""
-    return alignments(band, np.stack(poses)).of_single_frames
+    return alignment.alignments(band, np.stack(poses)).of_single_frames
 
 
 def _support(of_frames: NDArray[np.float64]) -> float:
     """Mean of scores (F,), each weighted by itself; 0 if none is above 0."""
     positive = np.maximum(of_frames, 0.0)
-    return float(np.square(positive).sum() / max(positive.sum(), LEAST_SQUARE))
+    return float(np.square(positive).sum() / max(positive.sum(), alignment.LEAST_SQUARE))
 
 
 def _loss(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """The share of the scores `own` (F,) that is lost if they become `other` (F,), each weighted by itself; 0 if none
     is above 0."""
     positive = np.maximum(own, 0.0)
-    return float((positive * (own - other)).sum() / max(np.square(positive).sum(), LEAST_SQUARE))
+    return float((positive * (own - other)).sum() / max(np.square(positive).sum(), alignment.LEAST_SQUARE))
 
 
-def _ascents(band: EdgeFrames, starts: Sequence[AscentStart], blur_rad: float) -> list[Summit]:
+def _ascents(
+    band: alignment.EdgeFrames, starts: Sequence[alignment.AscentStart], blur_rad: float
+) -> list[alignment.Summit]:
     """The ends of climbs: the poses next to their beginnings at which their frames score most, one axis after the
     other."""
     nowhere, turns = np.eye(4), (*np.eye(6)[:3], *-np.eye(6)[:3])
     steps_rad = [ASCENT_BLURS * blur_rad * 0.5**halved for halved in range(HALVINGS + 1)]
     moves = np.array([[se3.perturb(nowhere, step_rad * turn) for turn in turns] for step_rad in steps_rad])
-    return ascend(band, list(starts), moves)
+    return alignment.ascend(band, list(starts), moves)
 
 
 def _edges_in_reach(edges: Edges, half_view_rad: float, pose: Matrix4) -> Edges:
@@ -340,7 +336,7 @@ def _edges_in_reach(edges: Edges, half_view_rad: float, pose: Matrix4) -> Edges:
     return in_reach(edges.of_points(thinned(len(edges.weight), POINTS)), half_view_rad, pose, SEEN)
 
 
-def _part(frames: EdgeFrames, begin: int, end: int) -> EdgeFrames:
+def _part(frames: alignment.EdgeFrames, begin: int, end: int) -> alignment.EdgeFrames:
     """The frames from `begin` to before `end`."""
     first, last = frames.first_point[begin], frames.first_point[end]
     return replace(

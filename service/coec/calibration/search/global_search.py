@@ -6,8 +6,6 @@ more. The best poses that lie apart climb on ever finer levels with ever more ed
 reach brings into view are left out. Nothing is random: the same input gives the same basins.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import cos, pi, radians
 

@@ -19,8 +19,6 @@ component, counted from the start, is zero. With three degrees of freedom all th
 alone leaves the centre of the start where it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import degrees, radians

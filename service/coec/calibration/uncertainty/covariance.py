@@ -18,8 +18,6 @@ ridge is followed as far as an accepted translation may be off. The mode next to
 found, whatever way the search took, because chance makes several hills if few things are seen again and again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

@@ -10,8 +10,6 @@ A held translation is such an error, too: it was measured once, and not to the l
 fitted to another one is refused if its residual alone makes every result too uncertain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import degrees, hypot, sqrt

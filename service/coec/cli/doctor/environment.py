@@ -3,8 +3,6 @@ compiled), the way to the router (whether it answers, certificates, Zenoh, acces
 reports about itself; and what makes a finding.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -3,8 +3,6 @@
 The service is not disturbed: the doctor has a session of its own, and the service receives the same samples.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from bisect import bisect_left

@@ -1,7 +1,5 @@
 """Shows a recording to viewers, as fast as it was recorded, and a candidate: a calibration that is not served."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time
@@ -19,23 +17,12 @@ from coec.config import LimitsConfig, PairingConfig
 from coec.errors import DecodeError, SourceError
 from coec.geometry import se3
 from coec.geometry.se3 import is_rigid
+from coec.io import viewer_scene
 from coec.io.foxglove import ViewerServer
 from coec.io.recordings.layouts import RecordingSource
 from coec.io.recordings.window_cutting import RECORDED_GAP_S
 from coec.io.serialise import degrees_or_null, matrix_of
 from coec.io.user_files import read_bytes
-from coec.io.viewer_scene import (
-    NOT_SERVED,
-    PICTURE_TOPICS,
-    RECORDED,
-    SILENT,
-    DisplayedPose,
-    PoseAxes,
-    TimelineEntry,
-    TimelineFigure,
-    TitledExtrinsic,
-    picture_of,
-)
 from coec.io.zenoh.player import repeated, shifted
 from coec.schemas.message import from_json
 from coec.schemas.replies import CalibrationResult, MetricReply
@@ -58,9 +45,9 @@ STALE: Final = 3
 """ROS level of an unknown state."""
 
 EXPLANATIONS = {
-    NOT_SERVED: "Nobody serves the pair: its service is down, or its router is.",
-    SILENT: "The service is there, and does not answer.",
-    RECORDED: "A recording: no service looks at it.",
+    viewer_scene.NOT_SERVED: "Nobody serves the pair: its service is down, or its router is.",
+    viewer_scene.SILENT: "The service is there, and does not answer.",
+    viewer_scene.RECORDED: "A recording: no service looks at it.",
 }
 """Explanations of the states that are not states of health."""
 
@@ -140,10 +127,10 @@ class PairOnScreen:
     def _show_picture(self) -> None:
         self._picture_s = time.monotonic()
         requested = self._screen.requested_topics
-        if self._pair is None or not requested & PICTURE_TOPICS:
+        if self._pair is None or not requested & viewer_scene.PICTURE_TOPICS:
             return
         try:
-            picture = picture_of(
+            picture = viewer_scene.picture_of(
                 self._pair, self._rig, self._extrinsics, requested, LimitsConfig(), compensated=self._compensated
             )
         except DecodeError as error:
@@ -161,7 +148,7 @@ def show_recording(playback: Playback, screen: ViewerServer, stop: threading.Eve
         SourceError: a file cannot be read, or no camera frame has a sweep.
     """
     shown = PairOnScreen(playback, screen)
-    shown.rest(lambda: bool(screen.requested_topics & PICTURE_TOPICS), stop)
+    shown.rest(lambda: bool(screen.requested_topics & viewer_scene.PICTURE_TOPICS), stop)
     due_s, before_ns = time.monotonic(), None
     for pair in _pairs(playback):
         # A recording that cannot be read as fast as it was recorded takes longer; nothing is left out.
@@ -200,15 +187,15 @@ def _pairs(playback: Playback) -> Iterator[FramePair]:
         )
 
 
-def moment_of_recording(rig: Rig, served: Matrix4, candidate: Candidate | None) -> TimelineEntry:
+def moment_of_recording(rig: Rig, served: Matrix4, candidate: Candidate | None) -> viewer_scene.TimelineEntry:
     """The line for a recording and a candidate."""
     result = candidate.result if candidate else None
-    return TimelineEntry(
+    return viewer_scene.TimelineEntry(
         pair=rig.pair,
-        state=RECORDED,
+        state=viewer_scene.RECORDED,
         level=STALE,
-        why=" ".join(one.text for one in result.verdict.reasons) if result else EXPLANATIONS[RECORDED],
-        reasons=tuple(one.code for one in result.verdict.reasons) if result else (RECORDED,),
+        why=" ".join(one.text for one in result.verdict.reasons) if result else EXPLANATIONS[viewer_scene.RECORDED],
+        reasons=tuple(one.code for one in result.verdict.reasons) if result else (viewer_scene.RECORDED,),
         provenance="nominal" if np.array_equal(served, rig.T_camera_lidar_nominal) else "restored",
         status=result.status if result else None,
         candidate=candidate is not None,
@@ -221,26 +208,28 @@ def moment_of_recording(rig: Rig, served: Matrix4, candidate: Candidate | None) 
 
 def extrinsics_of_recording(
     rig: Rig, served: Matrix4, candidate: Candidate | None
-) -> dict[DisplayedPose, TitledExtrinsic]:
+) -> dict[viewer_scene.DisplayedPose, viewer_scene.TitledExtrinsic]:
     """The extrinsics that are drawn while a recording is played."""
     return {
-        DisplayedPose.SERVED: TitledExtrinsic(served, "served: when this was recorded"),
-        DisplayedPose.NOMINAL: TitledExtrinsic(rig.T_camera_lidar_nominal, "nominal: of the recording"),
-        DisplayedPose.CANDIDATE: (
-            TitledExtrinsic(candidate.T_camera_lidar, f"candidate: {candidate.result.status}")
+        viewer_scene.DisplayedPose.SERVED: viewer_scene.TitledExtrinsic(served, "served: when this was recorded"),
+        viewer_scene.DisplayedPose.NOMINAL: viewer_scene.TitledExtrinsic(
+            rig.T_camera_lidar_nominal, "nominal: of the recording"
+        ),
+        viewer_scene.DisplayedPose.CANDIDATE: (
+            viewer_scene.TitledExtrinsic(candidate.T_camera_lidar, f"candidate: {candidate.result.status}")
             if candidate
-            else TitledExtrinsic(None, "candidate: none")
+            else viewer_scene.TitledExtrinsic(None, "candidate: none")
         ),
     }
 
 
-def axes_of(values: Sequence[float | None]) -> PoseAxes:
+def axes_of(values: Sequence[float | None]) -> viewer_scene.PoseAxes:
     """Axes from six values, degrees and metres, or from none."""
-    return PoseAxes(**dict(zip(PoseAxes.model_fields, values, strict=False)))
+    return viewer_scene.PoseAxes(**dict(zip(viewer_scene.PoseAxes.model_fields, values, strict=False)))
 
 
-def figures_of(metrics: Mapping[str, MetricReply]) -> tuple[TimelineFigure, ...]:
+def figures_of(metrics: Mapping[str, MetricReply]) -> tuple[viewer_scene.TimelineFigure, ...]:
     return tuple(
-        TimelineFigure(name=name, value=one.value, limit=one.limit, passed=one.passed)
+        viewer_scene.TimelineFigure(name=name, value=one.value, limit=one.limit, passed=one.passed)
         for name, one in sorted(metrics.items())
     )

@@ -20,21 +20,10 @@ from coec.cli.view.recording import EXPLANATIONS, STALE, axes_of, figures_of
 from coec.config import Config, PairConfig
 from coec.errors import DecodeError
 from coec.geometry.se3 import is_rigid
+from coec.io import viewer_scene
 from coec.io.foxglove import ViewerServer
 from coec.io.logs import LossCounter
 from coec.io.serialise import matrix_of
-from coec.io.viewer_scene import (
-    NOT_SERVED,
-    PICTURE_TOPICS,
-    SILENT,
-    DisplayedPose,
-    MissedFrames,
-    PairPicture,
-    StreamAges,
-    TimelineEntry,
-    TitledExtrinsic,
-    picture_of,
-)
 from coec.io.zenoh.bus import StreamInput, input_of
 from coec.schemas.keys import Keys
 from coec.schemas.message import from_msgpack
@@ -115,9 +104,9 @@ class ServiceState:
     def state(self) -> str:
         """State of the pair: that of its health, as long as the service is there and answers."""
         if not self.alive:
-            return NOT_SERVED
+            return viewer_scene.NOT_SERVED
         if self.health is None or self.answer_age_s is None or self.answer_age_s > SILENT_S:
-            return SILENT
+            return viewer_scene.SILENT
         return self.health.state
 
 
@@ -131,7 +120,7 @@ def show_live(session: zenoh.Session, vehicle: VehiclePair, screen: ViewerServer
         with service.listening():
             while not stop.is_set():
                 requested = screen.requested_topics
-                streams.listen(enabled=bool(requested & PICTURE_TOPICS))
+                streams.listen(enabled=bool(requested & viewer_scene.PICTURE_TOPICS))
                 pair = streams.newest(WAIT_S)
                 state = service.update()
                 timeline.update(moment_of_service(name, state, streams.ages_s, streams.not_shown), streams.mute)
@@ -150,11 +139,11 @@ class _Timeline:
     def __init__(self, screen: ViewerServer, pair: str) -> None:
         self._screen = screen
         self._pair = pair
-        self._shown: TimelineEntry | None = None
+        self._shown: viewer_scene.TimelineEntry | None = None
         self._shown_s = -math.inf
         self._mute: tuple[str, ...] = ()
 
-    def update(self, moment: TimelineEntry, mute: tuple[str, ...]) -> None:
+    def update(self, moment: viewer_scene.TimelineEntry, mute: tuple[str, ...]) -> None:
         """Update the present state; `mute` are subscribed keys on which nothing is received."""
         changed = self._shown is None or _essence(self._shown) != _essence(moment)
         if changed or time.monotonic() - self._shown_s >= REPEAT_S:
@@ -167,25 +156,29 @@ class _Timeline:
         self._mute = mute
 
 
-def _picture(pair: FramePair, vehicle: VehiclePair, service: ServiceState, requested: frozenset[str]) -> PairPicture:
+def _picture(
+    pair: FramePair, vehicle: VehiclePair, service: ServiceState, requested: frozenset[str]
+) -> viewer_scene.PairPicture:
     compensated = vehicle.pair.calibration.motion_compensation
     extrinsics = extrinsics_of_service(vehicle.rig, service)
-    return picture_of(pair, vehicle.rig, extrinsics, requested, vehicle.config.limits, compensated=compensated)
+    return viewer_scene.picture_of(
+        pair, vehicle.rig, extrinsics, requested, vehicle.config.limits, compensated=compensated
+    )
 
 
-def _essence(moment: TimelineEntry) -> tuple[object, ...]:
+def _essence(moment: viewer_scene.TimelineEntry) -> tuple[object, ...]:
     """The part of a moment whose change is worth a line in the log."""
     return moment.state, moment.reasons, moment.provenance, moment.candidate
 
 
 def moment_of_service(
     pair: str, service: ServiceState, ages_s: Mapping[str, float | None], not_shown: Counter[tuple[str, str]]
-) -> TimelineEntry:
+) -> viewer_scene.TimelineEntry:
     """The line for a service and its sensors. `ages_s` is the time since a frame was received, by stream; `not_shown`
     counts frames by stream and cause. Figures are the last known ones, whatever the state; `answer_s` is their age."""
     health, extrinsic = service.health, service.extrinsic
     current = health is not None and service.state == health.state
-    return TimelineEntry(
+    return viewer_scene.TimelineEntry(
         pair=pair,
         state=service.state,
         level=health.level if health is not None and current else STALE,
@@ -196,7 +189,7 @@ def moment_of_service(
         status=extrinsic.status if extrinsic else None,
         percent_complete=extrinsic.percent_complete if extrinsic else None,
         candidate=service.candidate is not None,
-        ages=StreamAges(
+        ages=viewer_scene.StreamAges(
             camera_s=ages_s.get("camera"),
             lidar_s=ages_s.get("lidar"),
             ego_s=ages_s.get("ego"),
@@ -209,21 +202,27 @@ def moment_of_service(
         step=axes_of(extrinsic.pending.step or () if extrinsic and extrinsic.pending else ()),
         figures=figures_of(health.metrics if health else {}),
         not_shown=tuple(
-            MissedFrames(stream=stream, cause=cause, count=count)
+            viewer_scene.MissedFrames(stream=stream, cause=cause, count=count)
             for (stream, cause), count in sorted(not_shown.items())
         ),
     )
 
 
-def extrinsics_of_service(rig: Rig, service: ServiceState) -> dict[DisplayedPose, TitledExtrinsic]:
+def extrinsics_of_service(
+    rig: Rig, service: ServiceState
+) -> dict[viewer_scene.DisplayedPose, viewer_scene.TitledExtrinsic]:
     """The extrinsics that are drawn while a service is watched."""
     provenance = service.extrinsic.provenance if service.extrinsic else "not known"
     pending = service.extrinsic.pending if service.extrinsic else None
     waits = pending.waits.code if pending and pending.waits else "waits for apply"
     return {
-        DisplayedPose.SERVED: TitledExtrinsic(service.served, f"served: {provenance}, {service.state}"),
-        DisplayedPose.NOMINAL: TitledExtrinsic(rig.T_camera_lidar_nominal, "nominal: of the configuration"),
-        DisplayedPose.CANDIDATE: TitledExtrinsic(
+        viewer_scene.DisplayedPose.SERVED: viewer_scene.TitledExtrinsic(
+            service.served, f"served: {provenance}, {service.state}"
+        ),
+        viewer_scene.DisplayedPose.NOMINAL: viewer_scene.TitledExtrinsic(
+            rig.T_camera_lidar_nominal, "nominal: of the configuration"
+        ),
+        viewer_scene.DisplayedPose.CANDIDATE: viewer_scene.TitledExtrinsic(
             service.candidate, f"candidate: {'none' if service.candidate is None else waits}"
         ),
     }  # fmt: skip

@@ -11,8 +11,6 @@ branches.
 D. C. Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, in OpenCV's notation.
 """
 
-from __future__ import annotations
-
 import math
 from numbers import Integral, Real
 from typing import NamedTuple, Protocol

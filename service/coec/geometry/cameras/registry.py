@@ -3,8 +3,6 @@ round, and what a camera sees: which pixels exist, how far from the optical axis
 angle that a pixel covers.
 """
 
-from __future__ import annotations
-
 import inspect
 import math
 from collections.abc import Callable, Mapping

@@ -11,8 +11,6 @@ apart for that (`WIDE_RAD`), the last near point stands for the edge. If both ne
 object is thinner than two spacings and makes one edge, a ridge, at the point itself.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

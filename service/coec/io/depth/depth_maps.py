@@ -3,8 +3,6 @@ opened by name or file, or maps that came with the frames. The inference library
 opened or its file is identified, never with this module.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A monocular depth network in an ONNX file, run by onnxruntime: the virtual depth sensor of the method."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Autoware's `sensor_kit_calibration.yaml`: the pose of a camera's body frame (`<camera>/camera_link`) in the kit."""
 
-from __future__ import annotations
-
 from coec.io.exported_extrinsic import ExportedExtrinsic, roll_pitch_yaw, set_yaml_entry, translation_m
 
 ENCODING = "application/yaml"

@@ -1,7 +1,5 @@
 """COLMAP's `rig_config.json`. Remarks are under `coec`, which its readers ignore."""
 
-from __future__ import annotations
-
 from coec.errors import OutputError
 from coec.io.exported_extrinsic import ExportedExtrinsic, json_text, parsed_json, quaternion_wxyz, translation_m
 

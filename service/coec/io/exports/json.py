@@ -1,7 +1,5 @@
 """A plain JSON document of our own."""
 
-from __future__ import annotations
-
 from coec.io.exported_extrinsic import ExportedExtrinsic, json_text, quaternion_xyzw, translation_m
 
 ENCODING = "application/json"

@@ -1,7 +1,5 @@
 """Kalibr's camera chain: intrinsics with `T_cam_lidar` beside them. Models: Kalibr's wiki, "Supported models"."""
 
-from __future__ import annotations
-
 import re
 
 from coec.config import CameraIntrinsics

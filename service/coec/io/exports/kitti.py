@@ -1,7 +1,5 @@
 """`calib_velo_to_cam.txt` of KITTI's raw recordings."""
 
-from __future__ import annotations
-
 from coec.io.exported_extrinsic import ExportedExtrinsic, number_row, utc
 
 ENCODING = "text/plain"

@@ -1,7 +1,5 @@
 """KITTI-360's `calib_cam_to_velo.txt`."""
 
-from __future__ import annotations
-
 from coec.io.exported_extrinsic import ExportedExtrinsic, number_row
 
 ENCODING = "text/plain"

@@ -1,7 +1,5 @@
 """nuScenes' table `calibrated_sensor.json`. Remarks are under `coec`, which its readers ignore."""
 
-from __future__ import annotations
-
 import hashlib
 
 from coec.errors import OutputError

@@ -1,7 +1,5 @@
 """OpenCV's FileStorage (YAML 1.0): a 4×4 matrix, named after its frames."""
 
-from __future__ import annotations
-
 import re
 
 from coec.errors import OutputError

@@ -1,7 +1,5 @@
 """OpenLABEL's coordinate systems. Remarks are under `coec`, which its readers ignore."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from coec.errors import OutputError

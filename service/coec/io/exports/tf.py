@@ -1,7 +1,5 @@
 """A shell script for tf2's `static_transform_publisher`, with one command per transform."""
 
-from __future__ import annotations
-
 import re
 import shlex
 

@@ -1,7 +1,5 @@
 """URDF (and xacro): a fixed joint. Format: http://wiki.ros.org/urdf/XML/joint."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr

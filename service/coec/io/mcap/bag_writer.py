@@ -5,8 +5,6 @@ A snippet has no `rig.json`, which marks windows, so that it is read as a bag, w
 `/tf_static`. The metadata `coec_snippet` say what happened.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress

@@ -4,8 +4,6 @@ The readers of the `mcap` package return short reads as if they were whole, and 
 kB file can become 600 MB). So this module parses the records itself (MCAP specification, "Records").
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterator

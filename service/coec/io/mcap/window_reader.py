@@ -2,8 +2,6 @@
 what they contain; and the attachment with the rig.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,17 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from coec.calibration.types import MOUNT_RAD, CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
 from coec.errors import ConfigError, DecodeError, SourceError, WindowError
-from coec.io.mcap.reader import (
-    Channel,
-    McapAttachment,
-    McapDamagedError,
-    McapMessage,
-    Metadata,
-    Record,
-    Schema,
-    read_attachment,
-    read_records,
-)
+from coec.io.mcap import reader
 from coec.io.mcap.writer import CHUNK_BYTES
 from coec.io.rig_files import matrix_rows, rig_from_json, rig_to_json, rigid_matrix
 from coec.io.ros import message_decoding, messages
@@ -146,24 +134,24 @@ class WindowContent:
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
     carried_over: dict[str, str] = field(default_factory=dict)
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, reader.Schema] = field(default_factory=dict)
+    channels: dict[int, reader.Channel] = field(default_factory=dict)
     parts: dict[PairKey, _Parts] = field(default_factory=dict)
 
-    def add(self, record: Record) -> PairKey | None:
+    def add(self, record: reader.Record) -> PairKey | None:
         """Adds a record. Returns the place of the pair that it completes; None if it completes none."""
         match record:
-            case Schema():
+            case reader.Schema():
                 self.schemas[record.schema_id] = record
-            case Channel():
+            case reader.Channel():
                 self.channels[record.channel_id] = record
-            case McapAttachment():
+            case reader.McapAttachment():
                 self.attachments[record.name] = record.data
-            case Metadata() if record.name == METADATA:
+            case reader.Metadata() if record.name == METADATA:
                 self.metadata = record.values
-            case Metadata() if record.name == CARRIED_OVER:
+            case reader.Metadata() if record.name == CARRIED_OVER:
                 self.carried_over = record.values
-            case McapMessage():
+            case reader.McapMessage():
                 return self._add_message(record)
         return None
 
@@ -193,7 +181,7 @@ class WindowContent:
             camera = CameraFrame(camera.stamp_ns, camera.frame_id, camera.image, depth=parts.depth.image)
         return FramePair(camera, parts.lidar, parts.motion)
 
-    def _add_message(self, message: McapMessage) -> PairKey | None:
+    def _add_message(self, message: reader.McapMessage) -> PairKey | None:
         channel = self.channels.get(message.channel_id)
         schema = None if channel is None else self.schemas.get(channel.schema_id)
         if channel is None or schema is None or schema.name not in _FRAME_TYPES:
@@ -297,9 +285,9 @@ def metadata_of(path: Path) -> dict[str, str]:
     """
     for record in records_of(path):
         match record:
-            case Metadata() if record.name == METADATA:
+            case reader.Metadata() if record.name == METADATA:
                 return record.values
-            case McapMessage():
+            case reader.McapMessage():
                 break
     return {}
 
@@ -311,14 +299,14 @@ def is_window(path: Path) -> bool:
         SourceError: unreadable, cut off or damaged, so that it cannot be decided.
     """
     try:
-        return read_attachment(path, RIG) is not None
+        return reader.read_attachment(path, RIG) is not None
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror}") from error
-    except McapDamagedError as error:
+    except reader.McapDamagedError as error:
         raise SourceError(error.of(path)) from error
 
 
-def records_of(path: Path, max_unpacked_bytes: int | None = None) -> Iterator[Record]:
+def records_of(path: Path, max_unpacked_bytes: int | None = None) -> Iterator[reader.Record]:
     """The records of a window's file; those before an error are sound.
 
     Raises:
@@ -326,23 +314,23 @@ def records_of(path: Path, max_unpacked_bytes: int | None = None) -> Iterator[Re
     """
     try:
         with path.open("rb") as stream:
-            yield from read_records(stream, max_unpacked_bytes=max_unpacked_bytes)
+            yield from reader.read_records(stream, max_unpacked_bytes=max_unpacked_bytes)
     except OSError as error:
         raise WindowError(f"cannot read {path}: {error.strerror}") from error
-    except McapDamagedError as error:
+    except reader.McapDamagedError as error:
         raise WindowError(_damage(path, error)) from error
 
 
 def _attachment(path: Path, name: str) -> bytes | None:
     try:
-        return read_attachment(path, name)
+        return reader.read_attachment(path, name)
     except OSError as error:
         raise WindowError(f"cannot read {path}: {error.strerror}") from error
-    except McapDamagedError as error:
+    except reader.McapDamagedError as error:
         raise WindowError(_damage(path, error)) from error
 
 
-def _damage(path: Path, error: McapDamagedError) -> str:
+def _damage(path: Path, error: reader.McapDamagedError) -> str:
     message = error.of(path)
     return f"{message}; the daemon does so for its own at start" if error.is_mcap else message
 

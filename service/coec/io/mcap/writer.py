@@ -5,8 +5,6 @@ The writer of the `mcap` package compresses either all chunks of a file or none,
 messages and chunks are written here; the other records are those of the package (MCAP specification, "Records").
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import os

@@ -3,8 +3,6 @@
 A bag is read through once for its index (`index`); each message is read again when it is its turn.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,30 +13,9 @@ from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.mcap.window_reader import is_window, read_window
-from coec.io.recordings.bag_index import (
-    CLOUD_TYPES,
-    IMAGE_TYPES,
-    VEHICLE,
-    BagIndex,
-    CloudDecoder,
-    MessageLocation,
-    build_index,
-    motion_topic,
-    motions_of_transforms,
-    rig_of_bag,
-)
+from coec.io.recordings import bag_index, recording_source
 from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
 from coec.io.recordings.cloud_files import measured_from
-from coec.io.recordings.recording_source import (
-    MOTION_REACH_NS,
-    FramewiseRecording,
-    RecordedFrame,
-    RecordingSource,
-    SensorMessage,
-    SourceSpec,
-    is_bag,
-    selected_indices,
-)
 from coec.io.ros.topics import TopicInfo, TopicMessage
 
 _EGO, _LIDAR, _CAMERA = 0, 1, 2
@@ -52,7 +29,7 @@ _ADVICE = {
 }
 
 
-def open_bag(spec: SourceSpec) -> RecordingSource:
+def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSource:
     """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]
     [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N]`.
 
@@ -77,11 +54,14 @@ def open_bag(spec: SourceSpec) -> RecordingSource:
     query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame", "moving", "time", "lidar_source")
     if not query and spec.path.suffix == ".mcap" and is_window(spec.path):
         return _window_recording(spec.path)
-    clouds, frames = CloudDecoder.from_query(query.get("time"), query.get("lidar_source")), _frames(query.get("moving"))
+    clouds, frames = (
+        bag_index.CloudDecoder.from_query(query.get("time"), query.get("lidar_source")),
+        _frames(query.get("moving")),
+    )
     storage = open_storage(spec.path)
-    index = build_index(storage, clouds)
-    camera_topic = index.topic(IMAGE_TYPES, query.get("camera"), "camera")
-    lidar_topic = index.topic(CLOUD_TYPES, query.get("points"), "points")
+    index = bag_index.build_index(storage, clouds)
+    camera_topic = index.topic(bag_index.IMAGE_TYPES, query.get("camera"), "camera")
+    lidar_topic = index.topic(bag_index.CLOUD_TYPES, query.get("points"), "points")
     with storage.open() as reader:
         streams = _streams(index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")))
         camera = _load(storage, reader, streams.camera[0], clouds)
@@ -94,18 +74,20 @@ def open_bag(spec: SourceSpec) -> RecordingSource:
     T_cloud_lidar = index.transform(cloud.frame_id, lidar_frame)
     if T_cloud_lidar is None:
         raise SourceError(f"{spec.path}: /tf_static does not connect {cloud.frame_id!r} and {lidar_frame!r}")
-    rig = rig_of_bag(index, query.get("intrinsics"), camera_topic, camera, lidar_frame, motion)
+    rig = bag_index.rig_of_bag(index, query.get("intrinsics"), camera_topic, camera, lidar_frame, motion)
     name = f"{spec.path.name}{camera_topic}"
     return BagRecording(name, rig, rig.T_camera_lidar_nominal, storage, streams, T_cloud_lidar, clouds)
 
 
-def _window_recording(path: Path) -> FramewiseRecording:
+def _window_recording(path: Path) -> recording_source.FramewiseRecording:
     window, configuration = read_window(path)
 
-    def frame_of(pair: FramePair) -> RecordedFrame:
-        return RecordedFrame(pair.camera.stamp_ns, lambda: pair.camera, pair.lidar.stamp_ns, lambda: pair.lidar)
+    def frame_of(pair: FramePair) -> recording_source.RecordedFrame:
+        return recording_source.RecordedFrame(
+            pair.camera.stamp_ns, lambda: pair.camera, pair.lidar.stamp_ns, lambda: pair.lidar
+        )
 
-    return FramewiseRecording(
+    return recording_source.FramewiseRecording(
         window.window_id,
         window.rig,
         window.T_camera_lidar_start,
@@ -123,13 +105,13 @@ class PairStreams:
         moved: the motion itself, instead of `motion`, if it was taken from transforms; ascending by stamp.
     """
 
-    camera: list[MessageLocation]
-    lidar: list[MessageLocation]
-    motion: list[MessageLocation]
+    camera: list[bag_index.MessageLocation]
+    lidar: list[bag_index.MessageLocation]
+    motion: list[bag_index.MessageLocation]
     moved: tuple[EgoMotion, ...] = ()
 
     @property
-    def motions(self) -> list[MessageLocation | EgoMotion]:
+    def motions(self) -> list[bag_index.MessageLocation | EgoMotion]:
         """`motion` or `moved`, whichever is not empty."""
         return [*self.motion, *self.moved]
 
@@ -151,7 +133,7 @@ class BagRecording:
     storage: BagStorage
     streams: PairStreams
     T_cloud_lidar: Matrix4
-    clouds: CloudDecoder
+    clouds: bag_index.CloudDecoder
     configuration: CalibrationConfig | None = None
 
     @property
@@ -169,15 +151,21 @@ class BagRecording:
         """See `Recording`."""
         return tuple(motion.stamp_ns for motion in self.streams.motions)
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[recording_source.SensorMessage]:
         """See `Recording.messages`. With chosen camera frames, only the sweep nearest to each of them comes."""
-        selected = [self.streams.camera[index] for index in selected_indices(cameras, len(self.streams.camera))]
+        selected = [
+            self.streams.camera[index] for index in recording_source.selected_indices(cameras, len(self.streams.camera))
+        ]
         sweeps = self.streams.lidar
         motions = self.streams.motions
         if cameras is not None:
             sweeps = sorted({min(sweeps, key=lambda place: abs(place.stamp_ns - c.stamp_ns)) for c in selected})
-            motions = [m for m in motions if any(abs(m.stamp_ns - c.stamp_ns) <= MOTION_REACH_NS for c in selected)]
-        queue: list[tuple[int, int, int, MessageLocation | EgoMotion]] = [
+            motions = [
+                m
+                for m in motions
+                if any(abs(m.stamp_ns - c.stamp_ns) <= recording_source.MOTION_REACH_NS for c in selected)
+            ]
+        queue: list[tuple[int, int, int, bag_index.MessageLocation | EgoMotion]] = [
             (item.stamp_ns, kind, number, item)
             for kind, items in ((_EGO, motions), (_LIDAR, sweeps), (_CAMERA, selected))
             for number, item in enumerate(items)
@@ -195,21 +183,23 @@ class BagRecording:
 
 
 def _streams(
-    index: BagIndex, reader: BagReader, camera: str, lidar: str, motion: tuple[tuple[str, str], str | None]
+    index: bag_index.BagIndex, reader: BagReader, camera: str, lidar: str, motion: tuple[tuple[str, str], str | None]
 ) -> PairStreams:
     """The streams of the pair. `motion`: the vehicle's frames, and the topic that was asked for."""
     frames, requested = motion
-    motion_source = motion_topic(index, reader, frames, requested)
+    motion_source = bag_index.motion_topic(index, reader, frames, requested)
     places = index.streams[motion_source].ordered() if motion_source in index.streams else []
     moved = (
-        motions_of_transforms(index, reader, motion_source, frames) if motion_source is not None and not places else ()
+        bag_index.motions_of_transforms(index, reader, motion_source, frames)
+        if motion_source is not None and not places
+        else ()
     )
     for topic in (camera, lidar):
         _require_stamps(index, topic)
     return PairStreams(index.streams[camera].ordered(), index.streams[lidar].ordered(), places, moved)
 
 
-def _require_stamps(index: BagIndex, topic: str) -> None:
+def _require_stamps(index: bag_index.BagIndex, topic: str) -> None:
     """Raises SourceError if all messages of a topic have one stamp."""
     stamps_ns = {place.stamp_ns for place in index.streams[topic].locations}
     count = len(index.streams[topic].locations)
@@ -223,7 +213,7 @@ def _require_stamps(index: BagIndex, topic: str) -> None:
 
 def _frames(text: str | None) -> tuple[str, str]:
     if text is None:
-        return VEHICLE
+        return bag_index.VEHICLE
     parent, comma, child = text.partition(",")
     if not (parent and comma and child):
         raise UsageError(
@@ -232,7 +222,9 @@ def _frames(text: str | None) -> tuple[str, str]:
     return parent, child
 
 
-def _load(storage: BagStorage, reader: BagReader, place: MessageLocation, clouds: CloudDecoder) -> SensorMessage:
+def _load(
+    storage: BagStorage, reader: BagReader, place: bag_index.MessageLocation, clouds: bag_index.CloudDecoder
+) -> recording_source.SensorMessage:
     data = reader.read(place.at)
     try:
         return clouds.decode(place.type_name, data)
@@ -273,14 +265,14 @@ class BagTopics:
                     yield TopicMessage(place.logged_ns, place.topic, type_name, reader.read(place.at))
 
 
-def open_topics(spec: SourceSpec) -> BagTopics:
+def open_topics(spec: recording_source.SourceSpec) -> BagTopics:
     """Opens the topics of a bag or of a recorded window.
 
     Raises:
         UsageError: the source is no bag, or has a query, which cannot choose topics.
         SourceError: the bag is cut off or damaged, or a topic has messages of two types.
     """
-    if not is_bag(spec):
+    if not recording_source.is_bag(spec):
         raise UsageError(f"{spec.text} is no bag")
     spec.only()
     storage = open_storage(spec.path)

@@ -22,16 +22,7 @@ from coec.config import CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Poi
 from coec.errors import ConfigError, DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage
 from coec.io.rig_files import camera_of, load_mask, rigid_matrix
-from coec.io.ros import message_decoding, messages
-from coec.io.ros.camera_info import (
-    CameraInfoContent,
-    CameraInfoIntrinsics,
-    decode_info,
-    info_of_yaml,
-    info_topic,
-    intrinsics_of_info,
-    is_rectified,
-)
+from coec.io.ros import camera_info, message_decoding, messages
 from coec.io.ros.transforms import MovingFrame, StaticTransforms, bare, decode_static_transforms, frames_in
 from coec.io.user_files import expand_home
 from coec.schemas.keys import TF_STATIC
@@ -123,7 +114,7 @@ class BagIndex:
     path: Path
     clouds: CloudDecoder
     streams: dict[str, TopicStream] = field(default_factory=dict)
-    infos: dict[str, CameraInfoContent] = field(default_factory=dict)
+    infos: dict[str, camera_info.CameraInfoContent] = field(default_factory=dict)
     transforms: StaticTransforms = field(default_factory=StaticTransforms)
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
 
@@ -182,7 +173,7 @@ class BagIndex:
                 stamp_ns = self._stamp_of_points(entry)
             stream.locations.append(MessageLocation(stamp_ns, entry.place, name))
         elif name == messages.CAMERA_INFO and entry.topic not in self.infos:
-            self.infos[entry.topic] = self._decoded(entry, decode_info)
+            self.infos[entry.topic] = self._decoded(entry, camera_info.decode_info)
         elif name == messages.TF and entry.topic == TF_STATIC:
             self._decoded(entry, lambda data: self.transforms.add(decode_static_transforms(data)))
         elif name == messages.TF:
@@ -235,7 +226,7 @@ def with_ros_camera_info(document: Any, path: Path, rectified: bool) -> Any:
         ConfigError: the named file cannot be read.
         ValidationError: its name is no path.
     """
-    whole = info_of_yaml(document) is not None
+    whole = camera_info.info_of_yaml(document) is not None
     camera = document if whole else document.get("camera") if isinstance(document, dict) else None
     if isinstance(camera, str):
         path = path.parent / _PATH.validate_python(camera)
@@ -243,10 +234,10 @@ def with_ros_camera_info(document: Any, path: Path, rectified: bool) -> Any:
             raise SourceError(f"camera: there is no file {path}; give the lens here, or name a camera_info.yaml")
         camera = load_yaml(path)
     try:
-        info = info_of_yaml(camera)
+        info = camera_info.info_of_yaml(camera)
         if info is None:
             return document
-        intrinsics = intrinsics_of_info(info, rectified=rectified).intrinsics.model_dump(exclude_none=True)
+        intrinsics = camera_info.intrinsics_of_info(info, rectified=rectified).intrinsics.model_dump(exclude_none=True)
     except SourceError as error:
         raise SourceError(f"{path}, a CameraInfo: {error}") from error
     return {"camera": intrinsics} if whole else {**document, "camera": intrinsics}
@@ -287,7 +278,7 @@ def rig_of_bag(
         else:
             path = expand_home(intrinsics)
             document = IntrinsicsFile.model_validate(
-                with_ros_camera_info(load_yaml(path), path, is_rectified(image_topic))
+                with_ros_camera_info(load_yaml(path), path, camera_info.is_rectified(image_topic))
             )
             camera = camera_of(document.camera)
             if document.T_camera_lidar is not None:
@@ -321,18 +312,18 @@ def rig_of_bag(
     )
 
 
-def _lens(index: BagIndex, info: CameraInfoContent, image_topic: str) -> CameraInfoIntrinsics:
+def _lens(index: BagIndex, info: camera_info.CameraInfoContent, image_topic: str) -> camera_info.CameraInfoIntrinsics:
     try:
-        return intrinsics_of_info(info, rectified=is_rectified(image_topic))
+        return camera_info.intrinsics_of_info(info, rectified=camera_info.is_rectified(image_topic))
     except SourceError as error:
         raise SourceError(f"the camera info of {index.path}: {error}; give ?intrinsics=FILE") from error
 
 
-def _info(index: BagIndex, requested: str | None, camera_frame: str, image_topic: str) -> CameraInfoContent:
+def _info(index: BagIndex, requested: str | None, camera_frame: str, image_topic: str) -> camera_info.CameraInfoContent:
     """The camera info that was asked for, else the one beside the images, of the camera's frame, or the only one."""
     if requested is not None:
         return index.infos[requested]
-    of_images = index.infos.get(info_topic(image_topic))
+    of_images = index.infos.get(camera_info.info_topic(image_topic))
     if of_images is not None:
         return of_images
     matching = [info for info in index.infos.values() if bare(info.frame_id) == camera_frame]

@@ -8,8 +8,6 @@ Files that are packed as a whole (`compression_mode: FILE`) are unpacked into th
 when the recording is no longer used.
 """
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import tempfile

@@ -4,8 +4,6 @@ binary_compressed, with bounds on every size; `pypcd4` allocates what a header c
 Rows with a non-finite coordinate are dropped together with their intensity, ring and time.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

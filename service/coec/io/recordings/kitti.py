@@ -8,8 +8,6 @@ facing forward"). Without `timestamps.txt`, consecutive frame numbers count as 0
 Extrinsics: T_camera_lidar = [I | K⁻¹ p] · R_rect_00 · Tr_velo_to_cam, with P_rect_k = [K | p] (development kit).
 """
 
-from __future__ import annotations
-
 import re
 from datetime import UTC, datetime
 from functools import partial

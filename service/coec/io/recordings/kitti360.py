@@ -12,8 +12,6 @@ T_camera_lidar = R_rect_k · T_pose_camk⁻¹ · T_pose_cam0 · T_velo_cam0⁻¹
 column of P_rect_01 is *not* added: it refers to camera 0, and the baseline is in T_pose_cam1 already.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from functools import partial
 from pathlib import Path
@@ -25,22 +23,8 @@ from coec.calibration.types import EgoMotion, Matrix4, Rig, SweepTiming
 from coec.config import parse_yaml
 from coec.errors import ConfigError, SourceError
 from coec.geometry import cameras, se3
+from coec.io.recordings import kitti
 from coec.io.recordings.cloud_files import load_cloud
-from coec.io.recordings.kitti import (
-    NS_PER_S,
-    homogeneous,
-    load_camera,
-    load_image,
-    median_period_s,
-    numbered_files,
-    numbers_of,
-    read_numbers,
-    read_stamps,
-    read_text,
-    rigid,
-    select_one,
-    stamp_of,
-)
 from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
 
 PERSPECTIVE = {"image_00": "00", "image_01": "01"}
@@ -71,27 +55,29 @@ def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
     images_root = root / "data_2d_raw"
     if not images_root.is_dir():
         raise SourceError(f"{root} is not a KITTI-360 root: it has no folder data_2d_raw")
-    drive = select_one(sorted(p.name for p in images_root.iterdir() if p.is_dir()), query.get("drive"), "drive", root)
+    drive = kitti.select_one(
+        sorted(p.name for p in images_root.iterdir() if p.is_dir()), query.get("drive"), "drive", root
+    )
     camera = query.get("camera", "image_00")
     if camera not in (*PERSPECTIVE, *FISHEYE):
         raise SourceError(f"KITTI-360 has no camera {camera}; there are {', '.join((*PERSPECTIVE, *FISHEYE))}")
     rectified = camera in PERSPECTIVE
-    images = numbered_files(images_root / drive / camera / ("data_rect" if rectified else "data_rgb"), ".png")
+    images = kitti.numbered_files(images_root / drive / camera / ("data_rect" if rectified else "data_rgb"), ".png")
     velodyne = root / "data_3d_raw" / drive / "velodyne_points"
-    clouds = numbered_files(velodyne / "data", ".bin")
+    clouds = kitti.numbered_files(velodyne / "data", ".bin")
     indices = sorted(images.keys() & clouds.keys())
     if not indices:
         raise SourceError(f"{root}: no frame of {drive} has both an image of {camera} and a Velodyne scan")
     stamps_path = _stamps_path(images_root / drive, camera, velodyne)
-    stamps_ns = read_stamps(stamps_path)
+    stamps_ns = kitti.read_stamps(stamps_path)
     depths = _depth_maps(root, camera, query.get("depth"))
     frames = []
     for index in indices:
-        stamp_ns = stamp_of(stamps_ns, index, stamps_path)
+        stamp_ns = kitti.stamp_of(stamps_ns, index, stamps_path)
         frames.append(
             RecordedFrame(
                 stamp_ns,
-                partial(load_camera, stamp_ns, camera, images[index], depths.get(index)),
+                partial(kitti.load_camera, stamp_ns, camera, images[index], depths.get(index)),
                 stamp_ns,
                 partial(load_cloud, stamp_ns, LIDAR_FRAME, clouds[index]),
             )
@@ -102,8 +88,8 @@ def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
     T_camera_lidar = se3.inverse(T_lidar_pose @ T_pose_cam[camera])
     if rectified:
         T_camera_lidar = _rectification(calibration, PERSPECTIVE[camera]) @ T_camera_lidar
-    T_camera_lidar = rigid(T_camera_lidar)
-    image = load_image(images[indices[0]])
+    T_camera_lidar = kitti.rigid(T_camera_lidar)
+    image = kitti.load_image(images[indices[0]])
     rig = Rig(
         pair=camera,
         camera=_perspective(calibration, PERSPECTIVE[camera], image.width, image.height)
@@ -113,9 +99,9 @@ def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
         lidar_frame=LIDAR_FRAME,
         T_camera_lidar_nominal=T_camera_lidar,
         T_lidar_ego=np.eye(4),
-        sweep=SweepTiming(median_period_s(stamps_ns, NOMINAL_PERIOD_S), sign=-1, stamp_azimuth_rad=0.0),
+        sweep=SweepTiming(kitti.median_period_s(stamps_ns, NOMINAL_PERIOD_S), sign=-1, stamp_azimuth_rad=0.0),
     )
-    motions = _motions(root / "data_poses" / drive / "poses.txt", indices, stamps_ns, rigid(T_lidar_pose))
+    motions = _motions(root / "data_poses" / drive / "poses.txt", indices, stamps_ns, kitti.rigid(T_lidar_pose))
     return FramewiseRecording(f"kitti360/{drive}/{camera}", rig, T_camera_lidar, tuple(frames), motions)
 
 
@@ -133,41 +119,41 @@ def _depth_maps(root: Path, camera: str, requested: str | None) -> dict[int, Pat
     folder = root / (requested or f"stereo_disparity_{camera.removeprefix('image_')}")
     if requested is None and not folder.is_dir():
         return {}
-    return numbered_files(folder, ".png")
+    return kitti.numbered_files(folder, ".png")
 
 
 def _camera_poses(calibration: Path) -> dict[str, Matrix4]:
     """T_pose_camera of the four unrectified cameras."""
     path = calibration / "calib_cam_to_pose.txt"
-    numbers = read_numbers(path)
-    return {name: homogeneous(numbers_of(path, numbers, name, 12)) for name in (*PERSPECTIVE, *FISHEYE)}
+    numbers = kitti.read_numbers(path)
+    return {name: kitti.homogeneous(kitti.numbers_of(path, numbers, name, 12)) for name in (*PERSPECTIVE, *FISHEYE)}
 
 
 def _velo_from_cam0(calibration: Path) -> Matrix4:
     path = calibration / "calib_cam_to_velo.txt"
     try:
-        rows = np.array([float(value) for value in read_text(path).split()])
+        rows = np.array([float(value) for value in kitti.read_text(path).split()])
     except ValueError as error:
         raise SourceError(f"{path}: expected 12 numbers ({error})") from error
     if rows.size != 12:
         raise SourceError(f"{path}: expected 12 numbers, found {rows.size}")
-    return homogeneous(rows)
+    return kitti.homogeneous(rows)
 
 
 def _rectification(calibration: Path, number: str) -> Matrix4:
     path = calibration / "perspective.txt"
-    return homogeneous(numbers_of(path, read_numbers(path), f"R_rect_{number}", 9))
+    return kitti.homogeneous(kitti.numbers_of(path, kitti.read_numbers(path), f"R_rect_{number}", 9))
 
 
 def _perspective(calibration: Path, number: str, width: int, height: int) -> cameras.Camera:
     path = calibration / "perspective.txt"
-    P = numbers_of(path, read_numbers(path), f"P_rect_{number}", 12).reshape(3, 4)
+    P = kitti.numbers_of(path, kitti.read_numbers(path), f"P_rect_{number}", 12).reshape(3, 4)
     return cameras.build("pinhole", width=width, height=height, fx=P[0, 0], fy=P[1, 1], cx=P[0, 2], cy=P[1, 2])
 
 
 def _fisheye(path: Path) -> cameras.Camera:
     """MEI intrinsics as OpenCV's FileStorage writes them: YAML after a separate line `%YAML:1.0`."""
-    text = read_text(path)
+    text = kitti.read_text(path)
     if text.startswith("%YAML"):
         text = text.partition("\n")[2]
     try:
@@ -207,7 +193,7 @@ def _read_poses(path: Path, frames: int) -> tuple[list[int], NDArray[np.float64]
     """Frame numbers (ascending) and T_world_pose (M, 4, 4)."""
     numbers: list[int] = []
     rows: list[list[float]] = []
-    for line_number, line in enumerate(read_text(path).splitlines(), start=1):
+    for line_number, line in enumerate(kitti.read_text(path).splitlines(), start=1):
         fields = line.split()
         if not fields:
             continue
@@ -241,8 +227,8 @@ def _twist_at(
         return None
 
     def mean_twist(a: int, b: int) -> tuple[NDArray[np.float64], float]:
-        seconds = (stamps_ns[numbers[b]] - stamps_ns[numbers[a]]) / NS_PER_S
-        return se3.log(rigid(se3.inverse(poses[a]) @ poses[b])) / seconds, seconds
+        seconds = (stamps_ns[numbers[b]] - stamps_ns[numbers[a]]) / kitti.NS_PER_S
+        return se3.log(kitti.rigid(se3.inverse(poses[a]) @ poses[b])) / seconds, seconds
 
     chord, gap_s = mean_twist(before, after)
     if gap_s > MAX_POSE_GAP_S and float(np.linalg.norm(chord[3:])) * gap_s > MAX_GAP_MOTION_M:

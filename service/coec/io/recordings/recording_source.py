@@ -2,8 +2,6 @@
 the grammar of a SOURCE argument, `[layout:]path[?key=value&…]`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

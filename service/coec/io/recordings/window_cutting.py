@@ -2,8 +2,6 @@
 recording that holds more than the window.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ to the rectified one (the message's definition). A lens of an unknown model, or 
 refused with a reason instead of guessing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final

@@ -4,8 +4,6 @@ Every length in a message is only a claim of the sender, so that it is checked b
 it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Final

@@ -2,8 +2,6 @@
 transforms, and `/diagnostics` with the only mapping from health, or from a result, to ROS levels and values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -21,18 +19,7 @@ from coec.geometry.cameras.base import CommonIntrinsics
 from coec.geometry.cameras.kannala_brandt import fit_kannala_brandt
 from coec.geometry.se3 import quaternion_xyzw_from_rotation
 from coec.io.images import BYTES_PER_PIXEL
-from coec.io.ros import point_clouds
-from coec.io.ros.messages import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    DIAGNOSTICS,
-    IMAGE,
-    IMU,
-    ODOMETRY,
-    POINT_CLOUD,
-    TF,
-    serialized,
-)
+from coec.io.ros import messages, point_clouds
 from coec.schemas import replies
 from coec.schemas.keys import sensor_status_name, status_name
 from coec.schemas.replies import ROS_LEVELS, CalibrationResult, HealthReply, MetricReply
@@ -210,7 +197,9 @@ def encode_image(frame: CameraFrame) -> tuple[str, bytes]:
     """Type name and message: `CompressedImage` for JPEG and PNG, `Image` for raw pixels."""
     image = frame.image
     if image.format not in BYTES_PER_PIXEL:
-        return COMPRESSED_IMAGE, _encode_compressed(frame.stamp_ns, frame.frame_id, image.format.value, image.data)
+        return messages.COMPRESSED_IMAGE, _encode_compressed(
+            frame.stamp_ns, frame.frame_id, image.format.value, image.data
+        )
     raw = ros.sensor_msgs__msg__Image(
         header=_header(frame.stamp_ns, frame.frame_id),
         height=image.height,
@@ -220,7 +209,7 @@ def encode_image(frame: CameraFrame) -> tuple[str, bytes]:
         step=image.width * BYTES_PER_PIXEL[image.format],
         data=np.frombuffer(image.data, np.uint8),
     )
-    return IMAGE, serialized(raw, IMAGE)
+    return messages.IMAGE, messages.serialized(raw, messages.IMAGE)
 
 
 def encode_depth(stamp_ns: int, frame_id: str, depth: EncodedImage) -> bytes:
@@ -237,20 +226,20 @@ def _encode_compressed(stamp_ns: int, frame_id: str, form: str, data: bytes) -> 
     message = ros.sensor_msgs__msg__CompressedImage(
         header=_header(stamp_ns, frame_id), format=form, data=np.frombuffer(data, np.uint8)
     )
-    return serialized(message, COMPRESSED_IMAGE)
+    return messages.serialized(message, messages.COMPRESSED_IMAGE)
 
 
 def encode_cloud(frame: LidarFrame) -> bytes:
     """`PointCloud2` that decodes to an equal sweep."""
-    return serialized(point_clouds.message_of(frame), POINT_CLOUD)
+    return messages.serialized(point_clouds.message_of(frame), messages.POINT_CLOUD)
 
 
 def encode_motion(motion: EgoMotion) -> tuple[str, bytes]:
     """Type name and message: `Odometry`, or `Imu` if the linear velocity is not known. Either decodes to an equal
     motion."""
     if motion.linear_mps is None:
-        return IMU, _encode_imu(motion)
-    return ODOMETRY, _encode_odometry(motion, motion.linear_mps)
+        return messages.IMU, _encode_imu(motion)
+    return messages.ODOMETRY, _encode_odometry(motion, motion.linear_mps)
 
 
 def _encode_imu(motion: EgoMotion) -> bytes:
@@ -265,7 +254,7 @@ def _encode_imu(motion: EgoMotion) -> bytes:
         linear_acceleration=ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0),
         linear_acceleration_covariance=unknown,
     )
-    return serialized(message, IMU)
+    return messages.serialized(message, messages.IMU)
 
 
 def _encode_odometry(motion: EgoMotion, linear_mps: tuple[float, float, float]) -> bytes:
@@ -289,7 +278,7 @@ def _encode_odometry(motion: EgoMotion, linear_mps: tuple[float, float, float]) 
             covariance=np.zeros(36),
         ),
     )
-    return serialized(message, ODOMETRY)
+    return messages.serialized(message, messages.ODOMETRY)
 
 
 MAX_RESIDUAL_PX: Final = 0.5
@@ -346,7 +335,7 @@ def encode_camera_info(rig: Rig, stamp_ns: int) -> bytes:
         binning_y=0,
         roi=ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, False),
     )
-    return serialized(message, CAMERA_INFO)
+    return messages.serialized(message, messages.CAMERA_INFO)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -373,7 +362,7 @@ def encode_transforms(frames: Sequence[PlacedFrame], stamp_ns: int) -> bytes:
                 ),
             )
         )
-    return serialized(ros.tf2_msgs__msg__TFMessage(transforms=transforms), TF)
+    return messages.serialized(ros.tf2_msgs__msg__TFMessage(transforms=transforms), messages.TF)
 
 
 def encode_tf_static(rig: Rig, T_camera_lidar: Matrix4, stamp_ns: int) -> bytes:
@@ -394,7 +383,7 @@ def encode_diagnostics(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> b
         for status in statuses
     ]
     message = ros.diagnostic_msgs__msg__DiagnosticArray(header=_header(stamp_ns, ""), status=array)
-    return serialized(message, DIAGNOSTICS)
+    return messages.serialized(message, messages.DIAGNOSTICS)
 
 
 def _header(stamp_ns: int, frame_id: str) -> ros.std_msgs__msg__Header:

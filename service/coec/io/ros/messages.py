@@ -3,8 +3,6 @@ stamp, frame id, fields of a cloud) is read with bounds before a decoder builds 
 are those of Humble, which are the same up to Lyrical for these types.
 """
 
-from __future__ import annotations
-
 import struct
 from typing import Any, Final, TypeVar
 

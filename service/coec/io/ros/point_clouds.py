@@ -17,8 +17,6 @@ Most programs that join clouds write no such field. Autoware's `concatenate_data
 elevation, distance, time_stamp) holds them. A `laser_id` or `channel` is the number of a beam, not of a LiDAR.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final

@@ -10,8 +10,6 @@ the twist between them is log(T₁⁻¹·T₂)/dt, in the vehicle's frame. It is
 error is of second order in dt at the middle between the two poses, and that middle is its stamp.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -2,8 +2,6 @@
 commands whose sender and service authenticate each other.
 """
 
-from __future__ import annotations
-
 import getpass
 import json
 import re

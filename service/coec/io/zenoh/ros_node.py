@@ -7,8 +7,6 @@ are counted and left out.
 Checked on the wire against rmw_zenoh_cpp 0.6.7. Encodings stay unset, as ROS nodes leave them.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import Counter

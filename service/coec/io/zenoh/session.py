@@ -6,8 +6,6 @@ Zenoh's own waiting (`connect/timeout_ms`) is switched off. With any other value
 endpoint alone until the time is over, whatever other endpoints there are, and with -1 it never returns (Zenoh 1.10).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

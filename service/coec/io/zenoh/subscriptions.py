@@ -2,8 +2,6 @@
 every change, and heartbeats of many vehicles (published, queried, and liveliness tokens).
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 import time

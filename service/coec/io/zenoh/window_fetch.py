@@ -4,8 +4,6 @@ The received part lies beside the final file, under a name that holds the expect
 another process on another day, goes on from there, and pieces of two versions of a window never mix in one file.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -3,8 +3,6 @@ has it carried out. One thread. Who may give which command is checked for each c
 through (`config.AuthorityConfig`).
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping

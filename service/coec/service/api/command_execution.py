@@ -8,8 +8,6 @@ the number of their buckets is bounded, and those without one share a common buc
 for each command ends up in the common one.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -5,8 +5,6 @@ Every family is declared once, in `FAMILIES`. Both this text and the documentati
 these declarations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -6,8 +6,6 @@ too many connections the oldest is dropped. Requests are not kept. Only their me
 servers of `http.server` have a thread for each connection and bound neither its duration nor the size of a head.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -4,8 +4,6 @@ when it has changed, because thousands make a megabyte. Pictures are rendered on
 thread of the service is held up; the latest ones are cached.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter, OrderedDict

@@ -5,8 +5,6 @@ the router. `docs/operations.md` and the advice of `coec doctor` are made from t
 `docs/operations.md` and the advice of `coec doctor` are made from this one table.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Answers about the rig, from a snapshot that the rig's thread made. For any thread."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import degrees, isfinite, sqrt
 from typing import cast

@@ -1,7 +1,5 @@
 """The routes of a vehicle: which function answers which key (CONTRACT, "Keys")."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

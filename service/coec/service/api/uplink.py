@@ -3,8 +3,6 @@ evidence, which is limited to so many bytes a second in the long run, whoever re
 when it changes, from time to time, and at the end.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

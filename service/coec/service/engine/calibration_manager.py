@@ -5,8 +5,6 @@ Only this thread changes the state of a pair. Answers come through the mailbox a
 questions were asked (`queue`). What an answer changes in the choice of further pairs goes to the stream as an effect.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ Health is green only because something was checked and found right, never becaus
 keeps checks from being completed, known or not, shows here in the same way: no completed check comes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from coec.calibration.monitor.change_detector import ACQUITTAL_PERIODS

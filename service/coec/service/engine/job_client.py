@@ -3,8 +3,6 @@ windows for its stream and its recorder, and pictures for the evidence of an inc
 windows before and after the incident, each at the extrinsic that was served and at the one that holds since.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

@@ -7,8 +7,6 @@ Only sensor time decides which sweeps are taken, and from when their result coun
 same at any rate. The rig waits for everything that counts by its sensor time (`runtime.rig.order`).
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -17,31 +15,16 @@ from itertools import combinations
 
 import numpy as np
 
+from coec.calibration.rig import lidar_sampling
 from coec.calibration.rig.edge_observations import determined_covariance, observation_of_registration, window_of
 from coec.calibration.rig.graph import Edge
-from coec.calibration.rig.lidar_sampling import (
-    LEAST_SHARE,
-    LidarRig,
-    MissedSweep,
-    SampledSweeps,
-    SweepSampler,
-    SweepSet,
-)
 from coec.calibration.rig.rig_estimator import EdgeWindow
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, Rig
 from coec.config import LidarEdgesConfig, PairConfig
 from coec.io import nearest_neighbours
 from coec.io.rig_files import rig_of
 from coec.service.cpu_budget import Budget
-from coec.service.engine.rig_estimator_thread import (
-    LidarPairReport,
-    LidarPairStatus,
-    LidarState,
-    Registration,
-    RigEstimatorThread,
-    graph_of,
-    sensors_of,
-)
+from coec.service.engine import rig_estimator_thread
 from coec.service.ingest.decoder import EGO, LIDAR, Frame
 from coec.service.ingest.intake import Intake, SensorStream
 from coec.service.timing import NS_PER_S
@@ -94,10 +77,10 @@ class LidarPairPlan:
     why_not: Reason | None
 
     @property
-    def rig(self) -> LidarRig:
+    def rig(self) -> lidar_sampling.LidarRig:
         """The two LiDARs as input of a registration."""
         a, b = self.a, self.b
-        return LidarRig(a.name, b.name, self.edge.T_a_b, a.rig.T_lidar_ego, a.rig.sweep, b.rig.sweep)
+        return lidar_sampling.LidarRig(a.name, b.name, self.edge.T_a_b, a.rig.T_lidar_ego, a.rig.sweep, b.rig.sweep)
 
 
 def plan_lidar_pairs(pairs: Iterable[PairConfig], period_s: float) -> tuple[LidarPairPlan, ...]:
@@ -110,7 +93,7 @@ def plan_lidar_pairs(pairs: Iterable[PairConfig], period_s: float) -> tuple[Lida
     rigs = {pair.name: (pair, rig_of(pair)) for pair in pairs}
     lidars: dict[str, LidarOfPair] = {}
     for pair, rig in rigs.values():
-        name = sensors_of(pair)[1]
+        name = rig_estimator_thread.sensors_of(pair)[1]
         lidars.setdefault(name, LidarOfPair(name, pair, rig))
     if len(lidars) < 2:
         return ()
@@ -130,7 +113,7 @@ def _places(pairs: Mapping[str, tuple[PairConfig, Matrix4]]) -> dict[str, Mappin
     """T_sensor_origin (4, 4) by origin and sensor, for sensors that are joined by pairs; empty if there are more
     sensors than a rig may have."""
     try:
-        graph = graph_of(pairs, ())
+        graph = rig_estimator_thread.graph_of(pairs, ())
     except ValueError:
         return {}
     return {sensor.name: graph.joined_to(sensor.name) for sensor in graph.sensors}
@@ -197,7 +180,7 @@ class LidarPairStream:
         intake: Intake,
         worker: Worker,
         budget: Budget,
-        rig: RigEstimatorThread,
+        rig: rig_estimator_thread.RigEstimatorThread,
     ):
         a, b = lidars.a.pair, lidars.b.pair
         assert a.ego is not None
@@ -213,7 +196,7 @@ class LidarPairStream:
         self._worker = worker
         self._budget = budget
         self._rig = rig
-        self._sampler = SweepSampler(
+        self._sampler = lidar_sampling.SweepSampler(
             period_s,
             a.pairing.motion_tolerance_s,
             a.pairing.max_stamp_jump_s,
@@ -221,13 +204,13 @@ class LidarPairStream:
             timed_a=a.lidar.sweep is not None,
             timed_b=b.lidar.sweep is not None,
         )
-        self._sweep_sets: deque[SweepSet] = deque()
+        self._sweep_sets: deque[lidar_sampling.SweepSet] = deque()
         self._pending: deque[_PendingRegistration] = deque()
         self._losses: Counter[str] = Counter()
         self._resting = 0
         self._missed = ""
         self._tried_ns: int | None = None
-        rig.join_lidars(LidarPairStatus(lidars.edge), lambda: self.unanswered == 0)
+        rig.join_lidars(rig_estimator_thread.LidarPairStatus(lidars.edge), lambda: self.unanswered == 0)
         budget.join_checks(self._name, period_s)
         intake.join(self)
 
@@ -257,9 +240,9 @@ class LidarPairStream:
         assert isinstance(frame, EgoMotion)
         self._hold(self._sampler.push_motion(frame))
 
-    def _hold(self, sampled: SampledSweeps) -> None:
+    def _hold(self, sampled: lidar_sampling.SampledSweeps) -> None:
         for one in sampled:
-            if isinstance(one, MissedSweep):
+            if isinstance(one, lidar_sampling.MissedSweep):
                 self._miss(one)
                 continue
             self._missed = ""
@@ -269,11 +252,11 @@ class LidarPairStream:
                 self._losses["superseded" if self._tried_ns is None else "not_afforded"] += 1
             self._tried_ns = None
 
-    def _miss(self, missed: MissedSweep) -> None:
+    def _miss(self, missed: lidar_sampling.MissedSweep) -> None:
         """No look was possible; reports the cause to the rig if it is new."""
         if missed.cause != self._missed:
             self._missed = missed.cause
-            report = LidarPairReport(missed.stamp_ns, None, (MISSED[missed.cause],), self._lost())
+            report = rig_estimator_thread.LidarPairReport(missed.stamp_ns, None, (MISSED[missed.cause],), self._lost())
             self._rig.put(self._name, missed.stamp_ns + COUNTS_AFTER_NS, report)
 
     # --- turns ------------------------------------------------------------------------------------------------------
@@ -307,7 +290,7 @@ class LidarPairStream:
     def tick(self, *, waiting: bool) -> None:
         """Does nothing: nothing here waits for a clock."""
 
-    def _submit(self, sweep_set: SweepSet) -> None:
+    def _submit(self, sweep_set: lidar_sampling.SweepSet) -> None:
         pending = _PendingRegistration(
             sweep_set.stamp_ns + COUNTS_AFTER_NS, sweep_set.start_ns, sweep_set.stamp_ns, self._lost()
         )
@@ -335,19 +318,21 @@ class LidarPairStream:
         waits = any(pending.rests is None and pending.due_ns <= now_ns for pending in self._pending)
         self._rig.report_time(self._name, now_ns, waits=waits)
 
-    def _report_of(self, pending: _PendingRegistration, outcome: JobOutcome) -> tuple[LidarPairReport, int]:
+    def _report_of(
+        self, pending: _PendingRegistration, outcome: JobOutcome
+    ) -> tuple[rig_estimator_thread.LidarPairReport, int]:
         """The outcome of a look, and how many looks are to be left out after it."""
         answer = outcome.answer
         if not isinstance(answer, Registered):
             reasons = () if outcome.reason is None else (outcome.reason,)
-            return LidarPairReport(pending.stamp_ns, None, reasons, pending.losses), 0
+            return rig_estimator_thread.LidarPairReport(pending.stamp_ns, None, reasons, pending.losses), 0
         if answer.reasons:
-            rests = RESTS if answer.share < LEAST_SHARE else 0
-            return LidarPairReport(pending.stamp_ns, None, answer.reasons, pending.losses), rests
+            rests = RESTS if answer.share < lidar_sampling.LEAST_SHARE else 0
+            return rig_estimator_thread.LidarPairReport(pending.stamp_ns, None, answer.reasons, pending.losses), rests
         covariance = determined_covariance(answer.covariance)
         if covariance is None:
-            return LidarPairReport(pending.stamp_ns, None, (WEAK,), pending.losses), 0
-        registration = Registration(
+            return rig_estimator_thread.LidarPairReport(pending.stamp_ns, None, (WEAK,), pending.losses), 0
+        registration = rig_estimator_thread.Registration(
             observation_of_registration(self._name, pending.stamp_ns, answer.T_a_b, covariance),
             EdgeWindow(window_of(pending.stamp_ns, answer.T_a_b, covariance), pending.start_ns),
             answer.range_bias,
@@ -355,7 +340,7 @@ class LidarPairStream:
             answer.points,
             answer.share,
         )
-        return LidarPairReport(pending.stamp_ns, registration, (), pending.losses), 0
+        return rig_estimator_thread.LidarPairReport(pending.stamp_ns, registration, (), pending.losses), 0
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
@@ -378,7 +363,12 @@ class LidarPairs:
     """
 
     def __init__(
-        self, config: LidarEdgesConfig, intake: Intake, worker: Worker, budget: Budget, rig: RigEstimatorThread
+        self,
+        config: LidarEdgesConfig,
+        intake: Intake,
+        worker: Worker,
+        budget: Budget,
+        rig: rig_estimator_thread.RigEstimatorThread,
     ) -> None:
         self._period_s = config.period_s
         self._intake = intake
@@ -403,6 +393,11 @@ class LidarPairs:
             if why_not is None:
                 LidarPairStream(lidars, self._period_s, self._intake, self._worker, self._budget, self._rig)
                 continue
-            self._rig.join_lidars(LidarPairStatus(lidars.edge, LidarState.NOT_MEASURED, (why_not,)), lambda: True)
+            self._rig.join_lidars(
+                rig_estimator_thread.LidarPairStatus(
+                    lidars.edge, rig_estimator_thread.LidarState.NOT_MEASURED, (why_not,)
+                ),
+                lambda: True,
+            )
             if why_not is NOT_INSTALLED:
                 self.problem = why_not

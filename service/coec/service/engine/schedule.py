@@ -25,8 +25,6 @@ rate.
 The order does not wait for a pair whose streams have stopped.
 """
 
-from __future__ import annotations
-
 import heapq
 import threading
 from collections import Counter, deque

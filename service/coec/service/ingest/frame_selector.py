@@ -4,8 +4,6 @@ The decision depends only on sensor time and on earlier questions: before a pair
 by its stamp has taken effect. So a replay of a drive gives the same windows and checks, at any rate and on any machine.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import deque

@@ -11,8 +11,6 @@ would only share the same second. Frames are handed on without a lock. And every
 which they came. Nothing here waits: not for the disk, not for the worker, not for another pair.
 """
 
-from __future__ import annotations
-
 import itertools
 import logging
 import threading

@@ -2,8 +2,6 @@
 reports on the streams of the pair.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Mapping

@@ -2,8 +2,6 @@
 that the store does not know yet, a few MB at a time, for their digests.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import logging

@@ -7,8 +7,6 @@ Beside each recording lies a description (`.json`), so that a listing opens no r
 bytes. No snippet is begun if the disk has too little room, because windows come first.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

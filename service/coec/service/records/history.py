@@ -32,8 +32,6 @@ they came.
 Only the newest are kept. No decision depends on them, so a line that cannot be read is left out.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -4,8 +4,6 @@ Each event has a folder with `event.json` and the pictures. The windows themselv
 are protected from removal. If there are too many events, the oldest is dropped, and its windows lose that protection.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import threading

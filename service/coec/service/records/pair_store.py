@@ -6,8 +6,6 @@ Then all books are put on the disk. Only the thread that decides about the pair 
 immutable.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import Counter

@@ -7,8 +7,6 @@ version of the software: an edge, or the move of a sensor, that cannot be read f
 The file's classes are the form of the file and no copy of others: they bound everything that is read.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 from dataclasses import replace

@@ -11,8 +11,6 @@ A part that cannot be read falls back alone, and never to something better than 
 holds, an unreadable health is `unknown` at best, and a suspicion outlives the evidence for it.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Mapping

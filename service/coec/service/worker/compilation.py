@@ -11,8 +11,6 @@ kernels do not count, because they come with these. Kernels are compiled for the
 only by the model of the lens.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Mapping

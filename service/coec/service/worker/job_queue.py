@@ -7,8 +7,6 @@ rest.
 A commissioning takes minutes and is done in slices: it comes back after each and goes on only when nothing else waits.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass

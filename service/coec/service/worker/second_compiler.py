@@ -7,8 +7,6 @@ work beforehand. If nothing has to be compiled, no second process starts.
 Started as `python -m coec.service.worker.second_compiler PARENT`, with the configuration on its standard input.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -6,8 +6,6 @@ solve can reach the part that answers queries. Jobs wait here, in the service (`
 most one job with it, and every job gets its outcome whatever happens to the worker.
 """
 
-from __future__ import annotations
-
 import logging
 import sys
 import threading
@@ -23,25 +21,10 @@ from coec.calibration.types import Reason
 from coec.config import WorkerConfig
 from coec.io.system import ServiceThread
 from coec.service.timing import LONG_S, Histogram
+from coec.service.worker import worker_jobs
 from coec.service.worker.child_process import Child, ChildError, Fault
 from coec.service.worker.compilation import STALLED_S, Compilation, Compiling
 from coec.service.worker.job_queue import WORKER_FAILED, InProgress, JobQueue, Ticket
-from coec.service.worker.worker_jobs import (
-    IDLE,
-    PREFETCH,
-    START,
-    Answer,
-    Cost,
-    Fate,
-    Kind,
-    MalformedAnswerError,
-    Prefetch,
-    Underway,
-    WorkerJob,
-    cost_of,
-    number_of,
-    read_answer,
-)
 
 _log = logging.getLogger(__name__)
 
@@ -56,11 +39,11 @@ FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.5, 30.0
 and ended without a single answer is started again after the first pause."""
 
 
-SENT_AGAIN = (Kind.SOLVE, Kind.COMMISSION)
+SENT_AGAIN = (worker_jobs.Kind.SOLVE, worker_jobs.Kind.COMMISSION)
 """Jobs that may be sent more than once: to another worker, or for the next slice."""
 
 
-NOT_WHILE_COMPILING = (Kind.CHECK, Kind.REGISTER)
+NOT_WHILE_COMPILING = (worker_jobs.Kind.CHECK, worker_jobs.Kind.REGISTER)
 """Jobs that are refused while the worker `warms_up`: their data would be minutes old at the answer."""
 
 
@@ -104,7 +87,7 @@ class SupervisorStatus:
     in_progress: InProgress | None
     waiting: Mapping[str, int]
     commissionings: Mapping[str, str]
-    outcomes: Mapping[Fate, int]
+    outcomes: Mapping[worker_jobs.Fate, int]
     losses: Mapping[str, int]
     faults: Mapping[Fault, int]
 
@@ -131,7 +114,7 @@ class Worker:
         config: WorkerConfig,
         settings: str,
         command: Sequence[str] = (sys.executable, "-m", "coec.service.worker.worker_main"),
-        pay: Callable[[Cost], None] = lambda _: None,
+        pay: Callable[[worker_jobs.Cost], None] = lambda _: None,
     ) -> None:
         """`settings` is the JSON of the `Config` that every process gets. `command` starts a process; two arguments are
         added: the descriptor of its socket and the id of this process. `pay` is called with all processor time that the
@@ -177,7 +160,7 @@ class Worker:
             queue.stop(self._now_s())
             self._condition.notify_all()
 
-    def submit(self, job: WorkerJob) -> None:
+    def submit(self, job: worker_jobs.WorkerJob) -> None:
         """Queues a job; `job.done` will be called once, perhaps before this returns."""
         compiling = self._compilation.status if self.warms_up and job.kind in NOT_WHILE_COMPILING else None
         with self._locked_queue() as queue:
@@ -196,7 +179,7 @@ class Worker:
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Queues the depth inference of a camera frame (native msgpack). It only saves time, so it may be dropped."""
         with self._locked_queue() as queue:
-            queue.prefetch(Prefetch(pair, frame))
+            queue.prefetch(worker_jobs.Prefetch(pair, frame))
             self._condition.notify_all()
 
     @property
@@ -251,7 +234,7 @@ class Worker:
             yield self._queue
             finished = self._queue.drain()
         for job, outcome in finished:
-            if outcome.fate is Fate.RESULT:
+            if outcome.fate is worker_jobs.Fate.RESULT:
                 self.jobs_took.add(outcome.elapsed_s, job.kind.value)
             try:
                 job.done(outcome)
@@ -294,7 +277,7 @@ class Worker:
             try:
                 self._await_ready(child)
             finally:
-                self._pay(Cost(START, "", child.taken_s()))
+                self._pay(worker_jobs.Cost(worker_jobs.START, "", child.taken_s()))
             reached = _Reached.READY
             while not self.thread.stopping:
                 if self._take_turn(child):
@@ -340,20 +323,20 @@ class Worker:
             if not self._is_warm:
                 self._warm_up_further(child)
             return False
-        kind = ticket.work.kind if isinstance(ticket.work, WorkerJob) else None
-        timeout_s = ticket.work.timeout_s if isinstance(ticket.work, WorkerJob) else None
-        self._pay(Cost(IDLE, "", child.taken_s()))
+        kind = ticket.work.kind if isinstance(ticket.work, worker_jobs.WorkerJob) else None
+        timeout_s = ticket.work.timeout_s if isinstance(ticket.work, worker_jobs.WorkerJob) else None
+        self._pay(worker_jobs.Cost(worker_jobs.IDLE, "", child.taken_s()))
         try:
             self._send(child, ticket)
             sent_s = self._now_s()
             message = self._next_message(child, timeout_s or self._config.timeout_s)
         finally:
-            self._pay(cost_of(ticket.work, child.taken_s()))
+            self._pay(worker_jobs.cost_of(ticket.work, child.taken_s()))
         if message is None:
             return False
-        self.work_took.add(self._now_s() - sent_s, PREFETCH if kind is None else kind.value)
+        self.work_took.add(self._now_s() - sent_s, worker_jobs.PREFETCH if kind is None else kind.value)
         answer = _checked_answer(message, ticket.number, kind)
-        if isinstance(answer, Underway):
+        if isinstance(answer, worker_jobs.Underway):
             self._log_progress(ticket.work.pair, answer)
         with self._locked_queue() as queue:
             queue.answered(answer, self._now_s())
@@ -365,7 +348,7 @@ class Worker:
         try:
             message = self._next_message(child, self._config.timeout_s)
         finally:
-            self._pay(Cost(START, "", child.taken_s()))
+            self._pay(worker_jobs.Cost(worker_jobs.START, "", child.taken_s()))
         match message:
             case None:
                 return
@@ -374,7 +357,7 @@ class Worker:
                 return
         raise ChildError(Fault.MALFORMED_ANSWER, "sent an unexpected message during its warm-up")
 
-    def _log_progress(self, pair: str, reached: Underway) -> None:
+    def _log_progress(self, pair: str, reached: worker_jobs.Underway) -> None:
         """Logs how far a commissioning is, once per stage."""
         with self._condition:
             before = self._queue.commissionings.get(pair)
@@ -399,7 +382,7 @@ class Worker:
                 with self._locked_queue() as queue:
                     queue.answered(Reason("unsendable", f"The worker {error}."), self._now_s())
             raise
-        if isinstance(ticket.work, WorkerJob) and ticket.work.kind not in SENT_AGAIN:
+        if isinstance(ticket.work, worker_jobs.WorkerJob) and ticket.work.kind not in SENT_AGAIN:
             ticket.work.body.clear()  # frees the frames of a check, 15 MB, which are not sent twice
         with self._locked_queue() as queue:
             queue.sent(self._now_s())
@@ -463,20 +446,22 @@ class Worker:
 def _request_message(ticket: Ticket) -> dict[str, Any]:
     """The message to the worker."""
     work = ticket.work
-    if isinstance(work, Prefetch):
-        return {"id": ticket.number, "kind": PREFETCH, "pair": work.pair, "frame": work.frame}
+    if isinstance(work, worker_jobs.Prefetch):
+        return {"id": ticket.number, "kind": worker_jobs.PREFETCH, "pair": work.pair, "frame": work.frame}
     return {**work.body, "id": ticket.number, "kind": work.kind.value, "pair": work.pair}
 
 
-def _checked_answer(message: Mapping[str, Any], number: int, kind: Kind | None) -> Answer | Underway | Reason | None:
+def _checked_answer(
+    message: Mapping[str, Any], number: int, kind: worker_jobs.Kind | None
+) -> worker_jobs.Answer | worker_jobs.Underway | Reason | None:
     """The answer to the question of this number and kind.
 
     Raises:
         ChildError: the answer is to another question, or not of the documented form.
     """
     try:
-        if number_of(message) != number:
+        if worker_jobs.number_of(message) != number:
             raise ChildError(Fault.STRAY_ANSWER, "replied to another request")
-        return read_answer(message, kind)
-    except MalformedAnswerError as error:
+        return worker_jobs.read_answer(message, kind)
+    except worker_jobs.MalformedAnswerError as error:
         raise ChildError(Fault.MALFORMED_ANSWER, f"sent a malformed reply: {error}") from error

@@ -3,8 +3,6 @@ turned into work, and its end into an answer. A refusal is an answer, too: a win
 example. No process, no socket.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence

@@ -3,8 +3,6 @@ a check needs comes first, because windows take longer to come. The kernels that
 extracted take half of the compiling time; `late_kernels` runs each of them on tiny inputs.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -30,15 +28,7 @@ from coec.calibration.types import (
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry.cameras import Camera, scaled
-from coec.geometry.edges.alignment import (
-    AscentStart,
-    EdgeFrames,
-    alignment_of_parts,
-    alignments,
-    alignments_of_late,
-    ascend,
-    significances,
-)
+from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import charted_significances, edge_charts, pattern_search, select_separated
 from coec.geometry.mutual_information import BinnedFrames, information_of_each, mutual_information, share_of_pixels
 from coec.geometry.projection import project
@@ -62,26 +52,26 @@ def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
     binned = _binned(camera)
     values = np.ones((camera.height, camera.width), np.float32)
     return (
-        lambda: ascend(edges, [AscentStart(pose, 0, 1)], pose[None, None]),
-        lambda: alignments_of_late(edges, point, point, point.T, two),
+        lambda: alignment.ascend(edges, [alignment.AscentStart(pose, 0, 1)], pose[None, None]),
+        lambda: alignment.alignments_of_late(edges, point, point, point.T, two),
         lambda: pattern_search(charts, two, steps, 1, pose, reach),
         lambda: charted_significances(charts, two),
         lambda: information_of_each(binned, two),
         lambda: mutual_information(binned, pose),
         lambda: share_of_pixels(values, values > 0.0, np.ones(1, np.float32)),
-        lambda: significances(edges, two),
+        lambda: alignment.significances(edges, two),
         lambda: sample_reach(pose, SearchBox(0.1, 0.0), 8),
         lambda: select_separated(two, np.arange(2), 1, 3.0),
-        lambda: alignments(edges, two),
-        lambda: alignment_of_parts(edges, np.zeros(1, np.uint8), 1, two),
+        lambda: alignment.alignments(edges, two),
+        lambda: alignment.alignment_of_parts(edges, np.zeros(1, np.uint8), 1, two),
         lambda: project(camera, np.ones((1, 3))),
     )
 
 
-def one_edge(camera: Camera) -> EdgeFrames:
+def one_edge(camera: Camera) -> alignment.EdgeFrames:
     """Input with one range edge, and an image without edges."""
     maps = np.zeros((1, camera.height, camera.width), np.int8)
-    return EdgeFrames(camera, np.ones((3, 1), np.float32), np.ones(1, np.float32), np.array([0, 1]), maps)
+    return alignment.EdgeFrames(camera, np.ones((3, 1), np.float32), np.ones(1, np.float32), np.array([0, 1]), maps)
 
 
 def _binned(camera: Camera) -> BinnedFrames:
@@ -125,7 +115,7 @@ def warm_up_solve(rig: Rig, calibration: CalibrationConfig, images: GreyImages) 
         calibrate(invented_window(rig), _Ramp(), images, _short(calibration), Silence())
     # These two kernels compute the uncertainty of a result, and an invented window need not give a result.
     project(rig.camera, np.ones((1, 3)))
-    alignment_of_parts(one_edge(rig.camera), np.zeros(1, np.uint8), 1, np.eye(4)[None])
+    alignment.alignment_of_parts(one_edge(rig.camera), np.zeros(1, np.uint8), 1, np.eye(4)[None])
     yield
 
 

@@ -4,8 +4,6 @@ Started as `python -m coec.service.worker.worker_main SOCKET PARENT`; see `link`
 ignores the signals that are meant for the service, and answers every question under its number: see `dispatch`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import logging
