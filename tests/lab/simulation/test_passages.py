@@ -16,6 +16,8 @@ from coec_lab.simulation.street import sample_style
 from coec_lab.simulation.vehicle_motion import P_EGO_LIDAR_M, Pace
 from lab.simulation.test_drive import fingerprint, pictures, pixels, share_consistent, small, sweeps
 
+pytestmark = pytest.mark.usefixtures("streets")
+
 
 @cache
 def at_20_s(*faults: str) -> tuple[NDArray[np.int64], LidarFrame]:

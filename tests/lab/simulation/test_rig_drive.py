@@ -27,6 +27,8 @@ from coec_lab.simulation.simulated_sensors import NEAREST_M
 from coec_lab.simulation.source import open_rig
 from coec_lab.simulation.vehicle_motion import whole_body
 
+pytestmark = pytest.mark.usefixtures("streets")
+
 WORDS = "rig=four-fisheyes&seed=4&seconds=0.5&camera=fisheye128&camera_hz=2&lidar_hz=2&ego_hz=20"
 
 

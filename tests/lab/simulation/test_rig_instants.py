@@ -13,6 +13,8 @@ import numpy as np
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec_lab.simulation.rig_drive import RigDrive, RigDriveConfig, instants, pair_of
 
+pytestmark = pytest.mark.usefixtures("streets")
+
 SMALL = RigDriveConfig(seed=4, seconds=3.0, camera="fisheye64", ego_hz=20.0)
 
 

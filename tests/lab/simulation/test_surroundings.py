@@ -13,6 +13,8 @@ from coec_lab.simulation.faults import OffsetDrift, late_s
 from coec_lab.simulation.vehicle_motion import P_EGO_LIDAR_M
 from lab.simulation.test_drive import pictures, pixels, share_consistent, small, sweeps
 
+pytestmark = pytest.mark.usefixtures("streets")
+
 
 @pytest.mark.parametrize(
     ("scene", "half_m", "high_m"), [("garage", 8.6, 2.9), ("room", 6.0, 3.3), ("highway", None, None)]
