@@ -60,7 +60,10 @@ def test_processes_of_a_pool_have_the_layer_of_the_program(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     "choice",
-    [{"NUMBA_THREADING_LAYER": "workqueue"}, {"NUMBA_THREADING_LAYER_PRIORITY": "workqueue omp tbb"}],
+    [
+        {"NUMBA_THREADING_LAYER": "workqueue"},
+        pytest.param({"NUMBA_THREADING_LAYER_PRIORITY": "workqueue omp tbb"}, marks=pytest.mark.slow),
+    ],
     ids=lambda choice: next(iter(choice)),
 )
 def test_a_layer_that_the_user_chooses_wins(choice: dict[str, str]) -> None:

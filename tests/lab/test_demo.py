@@ -28,6 +28,8 @@ from coec_lab.demo.pair_report import demo_page
 from reports.pages import MADE
 from support.messages import status_reply
 
+pytestmark = pytest.mark.usefixtures("streets")
+
 KNOCK_S, MAX_ERROR_DEG = pair_drive.KNOCK_S, pair_drive.MAX_ERROR_DEG
 
 START = Moment(

@@ -38,6 +38,8 @@ from coec_lab.simulation.rig_drive import RigDrive, RigDriveConfig
 from service.api.test_metrics import a_health
 from support.messages import moved_lidar_reply, reply_before_checks
 
+pytestmark = pytest.mark.usefixtures("streets")
+
 LIDAR, CAMERA = SCENARIO.acts
 SENSORS = ("front", "left", "rear", "right", "roof")
 KNOCK_S = SCENARIO.knock_s

@@ -16,6 +16,8 @@ from coec.errors import OutputError
 from coec.io import user_files
 from coec.io.recordings.layouts import open_lidars, open_source
 
+pytestmark = pytest.mark.usefixtures("streets")
+
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 SHORT = ("--seed", 4, "--seconds", 0.6, "--camera", "fisheye96", "--lidar", 16, "--camera-hz", 5, "--lidar-hz", 5)

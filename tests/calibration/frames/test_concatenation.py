@@ -38,7 +38,7 @@ def noisy(seed: int) -> LidarFrame:
 @pytest.mark.parametrize(
     "poses", [(ROOF_POSE, LEFT), (LEFT, RIGHT), (HERE, LEFT), (LEFT, HERE), (ROOF_POSE, LEFT, RIGHT)], ids=range(5)
 )
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_several_lidars_in_one_cloud_are_told_with_their_places(
     poses: tuple[NDArray[np.float64], ...], seed: int
 ) -> None:

@@ -55,7 +55,7 @@ def truth(drive: DisplacedRigDrive, camera: str, mounts: Mounts, stamp_ns: int) 
 def drawn(number: int) -> RigDriveRow:
     """Looks as those of a drive that was rendered: at the truth, but for noise."""
     drive, rng, looks = DisplacedRigDrive(number, CAMERA), np.random.default_rng(number), []
-    for turn in range(CHECK_PAIRS, round((drive.at_s + 30.0) / TURN_S)):
+    for turn in range(CHECK_PAIRS, round((drive.at_s + 22.0) / TURN_S)):
         stamps_ns = tuple(START_NS + round((turn - k) * TURN_S * 1e9) for k in range(CHECK_PAIRS, 0, -1))
         for camera in due(turn, drive.right.cameras):
             served, noise = drive.served[f"{camera}-{LIDAR}"], NOISE * rng.normal(size=6)
